@@ -82,33 +82,37 @@ nvidia-cuda-runtime==13.0.96 --hash=sha256:7f82250d7782aa23b6cfe765ecc7db554bd3c
 nvidia-cuda-cupti==13.0.85 --hash=sha256:4eb01c08e859bf924d222250d2e8f8b8ff6d3db4721288cf35d14252a4d933c8
 END
     mkdir "$work/tmp"
-    TMPDIR="$work/tmp" PYTHONDONTWRITEBYTECODE=1 PIP_REQUIRE_VIRTUALENV=0 \
+    # Errors are held in memory: on a full disk there is no file to put them in.
+    local errors
+    { errors=$(TMPDIR="$work/tmp" PYTHONDONTWRITEBYTECODE=1 PIP_REQUIRE_VIRTUALENV=0 \
         python3 -m pip download --disable-pip-version-check --no-cache-dir --no-deps --require-hashes \
         --only-binary=:all: --implementation cp --python-version 311 --abi cp311 --abi none \
         --platform manylinux_2_28_x86_64 --platform manylinux_2_25_x86_64 \
         --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 \
-        --requirement "$work/requirements.txt" --dest "$work/wheels" >&2 2>"$work/errors.txt" ||
-        explain_failed_download
+        --requirement "$work/requirements.txt" --dest "$work/wheels" 2>&1 >&3) ||
+        explain_failed_download "$errors"; } 3>&2
     rm -rf "$work/tmp"
 }
 
 explain_failed_download() {
-    local errors
-    errors=$(<"$work/errors.txt")
+    local errors=$1
     case $errors in
         *"DO NOT MATCH THE HASHES"*)
             fail "a downloaded wheel does not have the pinned hash; it was thrown away: run again, and if it happens again look at what your proxy or package mirror serves" ;;
         *"No space left"* | *"Disk quota exceeded"*)
-            fail "the disk of $repository filled up during the download: free $NEEDED_MB MB and run again" ;;
+            fail "the disk filled up during the download: free $NEEDED_MB MB on the file system of $repository and run again" ;;
+        *Retrying* | *onnection* | *Timeout*)
+            fail "pip could not reach its package index: check the network and pip's proxy or mirror settings, then run again" ;;
         *)
-            fail "pip could not download libtorch ($(tail -n 1 "$work/errors.txt")): check the network and pip's proxy or mirror settings, then run again" ;;
+            fail "pip could not download libtorch (${errors##*$'\n'}): put this right, then run again" ;;
     esac
 }
 
 # libtorch.so itself is an empty shell that names libtorch_cuda.so: a link to the CPU library takes its place. The link named
 # libgomp.so lets "-lgomp" find the one OpenMP runtime that libtorch_cpu.so uses too.
 unpack() {
-    PYTHONDONTWRITEBYTECODE=1 python3 - "$work/wheels" "$work/libtorch" 2>"$work/errors.txt" <<'END' ||
+    local errors
+    errors=$(PYTHONDONTWRITEBYTECODE=1 python3 - "$work/wheels" "$work/libtorch" 2>&1 <<'END'
 import os, pathlib, shutil, sys, zipfile
 
 wheels, target = map(pathlib.Path, sys.argv[1:])
@@ -141,7 +145,7 @@ if missing:
 os.symlink("libtorch_cpu.so", target / "lib" / "libtorch.so")
 os.symlink("libgomp.so.1", target / "lib" / "libgomp.so")
 END
-        fail "could not unpack libtorch ($(tail -n 1 "$work/errors.txt")): free $NEEDED_MB MB on the file system of $repository if it is full, and run again"
+    ) || fail "could not unpack libtorch (${errors##*$'\n'}): free $NEEDED_MB MB on the file system of $repository if it is full, and run again"
     printf '%s\n' "$BUILD_VERSION" >"$work/libtorch/build-version"
 }
 
