@@ -1,1 +1,35 @@
-//! Placeholder, replaced in the first build-up.
+//! The contract between Skein's processes.
+//!
+//! Everything that two processes must agree on is defined here, and nothing else: who flies what ([`ticket`]), what a flown step looks like on the
+//! wire ([`transition`]), what a policy snapshot contains ([`snapshot`]), the iceoryx2 services that carry them ([`services`]), the configuration of a
+//! run ([`config`]) and the files it leaves ([`run`], [`evaluation`], [`summary`]). It knows neither libtorch nor the physics engine, so that every
+//! process can afford to depend on it.
+
+pub mod config;
+pub mod evaluation;
+pub mod ids;
+pub mod logging;
+pub mod progress;
+pub mod run;
+pub mod seeds;
+pub mod services;
+pub mod snapshot;
+pub mod status;
+pub mod summary;
+pub mod ticket;
+pub mod transition;
+
+/// Version of everything in this crate that crosses a process boundary; part of every service's attributes, so that a process of another version is
+/// refused when it opens a service.
+pub const PROTOCOL_VERSION: u32 = 1;
+
+/// Width of the depth image in pixels (paper, section 3.3).
+pub const IMAGE_WIDTH: usize = 128;
+/// Height of the depth image in pixels (paper, section 3.3).
+pub const IMAGE_HEIGHT: usize = 72;
+/// Pixels, and bytes, of one 8-bit depth image.
+pub const IMAGE_PIXELS: usize = IMAGE_WIDTH * IMAGE_HEIGHT;
+/// Length of the VAE's latent code (paper, section 3.3).
+pub const LATENT: usize = 32;
+/// Length of an action: lateral and vertical velocity, each in [-1, 1].
+pub const ACTION: usize = 2;

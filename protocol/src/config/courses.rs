@@ -1,0 +1,50 @@
+//! `[courses]`.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Invalid, require};
+
+/// `[courses]`: what is flown through. Paths are relative to the configuration file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CoursesSection {
+    /// The course training flies.
+    pub training: PathBuf,
+    /// Share of training flights flown on a generated course instead, a new one each, in [0, 1]. Default 0: the training course only, as in the paper.
+    pub generated_share: f64,
+    /// The courses of the final evaluation, in the order of its table. The first is the one snapshots are confirmed on.
+    pub evaluation: Vec<PathBuf>,
+}
+
+impl Default for CoursesSection {
+    fn default() -> Self {
+        let shipped = |name: &str| PathBuf::from("courses").join(name);
+        Self {
+            training: shipped("training.toml"),
+            generated_share: 0.0,
+            evaluation: ["training.toml", "rearranged_34125.toml", "rearranged_53412.toml", "non_rectangular.toml"]
+                .map(shipped)
+                .to_vec(),
+        }
+    }
+}
+
+impl CoursesSection {
+    pub(super) fn validate(&self) -> Result<(), Invalid> {
+        require(
+            (0.0..=1.0).contains(&self.generated_share),
+            "courses.generated_share",
+            self.generated_share,
+            "is outside [0, 1]: it is a share of the training flights",
+        )?;
+        require(!self.evaluation.is_empty(), "courses.evaluation", "[]", "is empty: no snapshot could be confirmed")?;
+        require(
+            self.evaluation.len() <= 64,
+            "courses.evaluation",
+            self.evaluation.len(),
+            "lists more than 64 courses: tickets could not number them",
+        )
+    }
+}

@@ -1,0 +1,39 @@
+//! `[evaluation]`.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Invalid, require};
+
+/// `[evaluation]`: flights without exploration noise, from the start of level 1.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EvaluationSection {
+    /// Flights per course in the final evaluation (paper: 100). Default 100.
+    pub flights: u64,
+    /// Flights that confirm a candidate for the best snapshot, on the first evaluation course. Default 20.
+    pub confirm_flights: u64,
+    /// Training flights over which walls passed are averaged to find candidates (paper: 50). Default 50.
+    pub window_flights: u64,
+    /// Training flights between two candidates at least. Default 50.
+    pub every_flights: u64,
+}
+
+impl Default for EvaluationSection {
+    fn default() -> Self {
+        Self { flights: 100, confirm_flights: 20, window_flights: 50, every_flights: 50 }
+    }
+}
+
+impl EvaluationSection {
+    pub(super) fn validate(&self) -> Result<(), Invalid> {
+        for (key, value) in [
+            ("evaluation.flights", self.flights),
+            ("evaluation.confirm_flights", self.confirm_flights),
+            ("evaluation.window_flights", self.window_flights),
+            ("evaluation.every_flights", self.every_flights),
+        ] {
+            require((1..=1_000_000).contains(&value), key, value, "is outside 1..=1000000")?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,204 @@
+//! Reading a configuration file, with overrides, and writing it back.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use toml::{Table, Value};
+
+use super::{Config, Invalid};
+
+/// Why a configuration cannot be used. Every variant names the file or the override it came from.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("cannot read the configuration {}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The file is not TOML.
+    #[error("{} is not valid TOML: {source}", path.display())]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// Where and why.
+        #[source]
+        source: Box<toml::de::Error>,
+    },
+    /// A key is unknown or has a value of the wrong kind.
+    #[error("{}: {message}", path.display())]
+    Key {
+        /// The file.
+        path: PathBuf,
+        /// Which key, and what was expected.
+        message: String,
+    },
+    /// A value makes no sense.
+    #[error("{}: {source}", path.display())]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// Which key, and why.
+        #[source]
+        source: Invalid,
+    },
+    /// An override cannot be understood.
+    #[error("--set {text}: {problem}; write it as section.key=value")]
+    Override {
+        /// The override as given.
+        text: String,
+        /// What is wrong with it.
+        problem: String,
+    },
+}
+
+impl Config {
+    /// Reads `path`, applies `overrides` (`section.key=value`, the value in TOML's notation or a bare word) and validates the result. Course paths
+    /// become relative to the working directory.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names file, key, value and remedy.
+    pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let text =
+            fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+        let mut table: Table = toml::from_str(&text)
+            .map_err(|source| ConfigError::Syntax { path: path.to_owned(), source: Box::new(source) })?;
+        for text in overrides {
+            apply_override(&mut table, text)?;
+        }
+        let mut config = from_table(table)
+            .map_err(|message| ConfigError::Key { path: path.to_owned(), message })?;
+        config.validate().map_err(|source| ConfigError::Invalid { path: path.to_owned(), source })?;
+        let directory = path.parent().unwrap_or(Path::new(""));
+        let courses = &mut config.courses;
+        for course in courses.evaluation.iter_mut().chain([&mut courses.training]) {
+            *course = directory.join(&*course);
+        }
+        Ok(config)
+    }
+
+    /// The whole configuration as TOML, defaults included.
+    pub fn to_toml(&self) -> String {
+        toml::to_string_pretty(self).expect("every field of the configuration is representable in TOML")
+    }
+}
+
+/// Deserializes section by section, so that an error names its section: the parser itself only knows the key.
+fn from_table(mut table: Table) -> Result<Config, String> {
+    let mut config = Config::default();
+    fn section<T: serde::de::DeserializeOwned>(table: &mut Table, name: &str, into: &mut T) -> Result<(), String> {
+        if let Some(value) = table.remove(name) {
+            *into = value.try_into().map_err(|error: toml::de::Error| {
+                format!("[{name}] {}", error.to_string().trim_end().replace('\n', " "))
+            })?;
+        }
+        Ok(())
+    }
+    section(&mut table, "run", &mut config.run)?;
+    section(&mut table, "courses", &mut config.courses)?;
+    section(&mut table, "learning", &mut config.learning)?;
+    section(&mut table, "sac", &mut config.sac)?;
+    section(&mut table, "vae", &mut config.vae)?;
+    section(&mut table, "replay", &mut config.replay)?;
+    section(&mut table, "evaluation", &mut config.evaluation)?;
+    section(&mut table, "checkpoints", &mut config.checkpoints)?;
+    section(&mut table, "transport", &mut config.transport)?;
+    section(&mut table, "simulator", &mut config.simulator)?;
+    match table.keys().next() {
+        None => Ok(config),
+        Some(unknown) => Err(format!(
+            "unknown section [{unknown}]; known are run, courses, learning, sac, vae, replay, evaluation, checkpoints, transport, simulator"
+        )),
+    }
+}
+
+fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
+    let fail = |problem: &str| ConfigError::Override { text: text.to_owned(), problem: problem.to_owned() };
+    let (path, value) = text.split_once('=').ok_or_else(|| fail("has no `=`"))?;
+    let (sections, key) = path.trim().rsplit_once('.').ok_or_else(|| fail("names no section"))?;
+    let mut target = table;
+    for section in sections.split('.') {
+        target = target
+            .entry(section)
+            .or_insert_with(|| Value::Table(Table::new()))
+            .as_table_mut()
+            .ok_or_else(|| fail("names a value where a section is expected"))?;
+    }
+    target.insert(key.to_owned(), parse_value(value.trim()));
+    Ok(())
+}
+
+/// A value in TOML's notation, or else the text itself: `--set run.device=cpu` needs no quotes.
+fn parse_value(text: &str) -> Value {
+    toml::from_str::<Table>(&format!("value = {text}"))
+        .ok()
+        .and_then(|mut table| table.remove("value"))
+        .unwrap_or_else(|| Value::String(text.to_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Device, TargetEntropy};
+
+    fn load(text: &str, overrides: &[&str]) -> Result<Config, String> {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("test.toml");
+        fs::write(&path, text).unwrap();
+        let overrides: Vec<_> = overrides.iter().map(ToString::to_string).collect();
+        Config::load(&path, &overrides).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn an_empty_file_is_the_defaults_and_they_are_valid() {
+        let mut config = load("", &[]).unwrap();
+        config.courses = Config::default().courses;
+        assert_eq!(config, Config::default());
+    }
+
+    #[test]
+    fn a_written_configuration_reads_back_the_same() {
+        let mut config = Config::default();
+        config.sac.target_entropy = TargetEntropy::Nats(-1.5);
+        config.run.device = Device::Cuda(3);
+        let read: Config = toml::from_str(&config.to_toml()).unwrap();
+        assert_eq!(read, config);
+        assert_eq!(read.digest(), config.digest());
+    }
+
+    #[test]
+    fn course_paths_are_relative_to_the_file() {
+        let config = load("[courses]\ntraining = \"a/b.toml\"", &[]).unwrap();
+        assert!(config.courses.training.is_absolute() && config.courses.training.ends_with("a/b.toml"));
+    }
+
+    #[test]
+    fn overrides_take_toml_and_bare_words() {
+        let config = load("", &["run.seed=7", "run.device=cuda:1", "simulator.vehicle.preset=point"]).unwrap();
+        assert_eq!(config.run.seed, 7);
+        assert_eq!(config.run.device, Device::Cuda(1));
+        assert_eq!(config.simulator["vehicle"]["preset"].as_str(), Some("point"));
+    }
+
+    #[test]
+    fn errors_name_file_key_and_remedy() {
+        for (text, overrides, expected) in [
+            ("[run]\nsed = 1", vec![], vec!["test.toml", "[run]", "unknown field `sed`", "seed"]),
+            ("[rum]", vec![], vec!["test.toml", "unknown section [rum]", "run"]),
+            ("[run]\nseed = \"x\"", vec![], vec!["test.toml", "[run]", "seed"]),
+            ("", vec!["seed=1"], vec!["--set seed=1", "section.key=value"]),
+            ("", vec!["run.seed"], vec!["--set run.seed", "no `=`"]),
+            ("[learning]\nwarmup_steps = 200000", vec![], vec!["learning.warmup_steps = 200000", "replay.capacity"]),
+            ("[run]\ndevice = \"gpu\"", vec![], vec!["gpu", "cuda:N"]),
+            ("[sac]\ndiscount = nan", vec![], vec!["sac.discount = NaN"]),
+        ] {
+            let error = load(text, &overrides).unwrap_err();
+            for part in expected {
+                assert!(error.contains(part), "`{error}` does not mention `{part}`");
+            }
+        }
+    }
+}

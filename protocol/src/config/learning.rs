@@ -1,0 +1,119 @@
+//! `[learning]`.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Invalid, require};
+use crate::{ACTION, LATENT};
+
+/// `[learning]`: delayed learning.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LearningSection {
+    /// Flights flown with one frozen snapshot before the networks are updated. 1 is the paper's delayed learning. Default 10.
+    pub flights_per_epoch: u64,
+    /// Epochs a snapshot is behind when it is flown: 0 flies the newest; 1 lets actors fly while the learner updates. Default 0.
+    pub policy_lag: u64,
+    /// SAC updates per environment step, done at the end of the epoch. Default 0.5.
+    pub updates_per_step: f64,
+    /// Environment steps flown at random before the first update (paper: 2000). Default 2000.
+    pub warmup_steps: usize,
+    /// Flights before training starts from the next level (paper: 10). Default 10.
+    pub flights_per_level: u64,
+    /// What the policy sees. Default `latent`, as in the paper.
+    pub observation: Observation,
+}
+
+impl Default for LearningSection {
+    fn default() -> Self {
+        Self {
+            flights_per_epoch: 10,
+            policy_lag: 0,
+            updates_per_step: 0.5,
+            warmup_steps: 2000,
+            flights_per_level: 10,
+            observation: Observation::Latent,
+        }
+    }
+}
+
+impl LearningSection {
+    pub(super) fn validate(&self) -> Result<(), Invalid> {
+        require(
+            (1..=10_000).contains(&self.flights_per_epoch),
+            "learning.flights_per_epoch",
+            self.flights_per_epoch,
+            "is outside 1..=10000: the learner holds an epoch in memory before it learns from it",
+        )?;
+        require(
+            self.policy_lag <= 1,
+            "learning.policy_lag",
+            self.policy_lag,
+            "is above 1: flying two epochs behind gains nothing over one, whose updates already overlap the flying",
+        )?;
+        require(
+            (0.0..=100.0).contains(&self.updates_per_step),
+            "learning.updates_per_step",
+            self.updates_per_step,
+            "is outside [0, 100]",
+        )?;
+        require(
+            self.flights_per_level >= 1,
+            "learning.flights_per_level",
+            self.flights_per_level,
+            "is below 1: no flight could start",
+        )
+    }
+}
+
+/// What the policy and the critic see of the world, in this order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Observation {
+    /// The latent code of the depth image alone (the paper's state).
+    #[serde(rename = "latent")]
+    Latent,
+    /// The latent code and the vehicle's own lateral and vertical velocity in m/s: with a sluggish vehicle one image is not a state.
+    #[serde(rename = "latent+velocity")]
+    LatentVelocity,
+    /// The above and the previous action.
+    #[serde(rename = "latent+velocity+action")]
+    LatentVelocityAction,
+}
+
+impl Observation {
+    /// Length of the observation vector.
+    pub fn len(self) -> usize {
+        match self {
+            Self::Latent => LATENT,
+            Self::LatentVelocity => LATENT + 2,
+            Self::LatentVelocityAction => LATENT + 2 + ACTION,
+        }
+    }
+
+    /// Never: every observation holds the latent code.
+    pub fn is_empty(self) -> bool {
+        false
+    }
+
+    /// Writes the observation vector: `latent` `[32]`, `velocity_mps` the vehicle's forward, left and up velocity, `previous_action` zero at take-off.
+    ///
+    /// Actor and learner both build observations with this function only.
+    ///
+    /// # Panics
+    /// When `into` is not [`Observation::len`] long.
+    pub fn write(
+        self,
+        latent: &[f32; LATENT],
+        velocity_mps: &[f32; 3],
+        previous_action: &[f32; ACTION],
+        into: &mut [f32],
+    ) {
+        assert_eq!(into.len(), self.len(), "an observation has a fixed length");
+        into[..LATENT].copy_from_slice(latent);
+        if self != Self::Latent {
+            into[LATENT..LATENT + 2].copy_from_slice(&velocity_mps[1..]);
+        }
+        if self == Self::LatentVelocityAction {
+            into[LATENT + 2..].copy_from_slice(previous_action);
+        }
+    }
+}

@@ -1,0 +1,112 @@
+//! The configuration of a run: one file, one struct, one section each.
+//!
+//! Every key has a default beside its documentation, unknown keys are refused, and [`Config::validate`] says which key is wrong, why, and what would
+//! happen. The `[simulator]` section belongs to the simulator and is passed on untouched: this crate does not know physics.
+
+mod courses;
+mod evaluation;
+mod file;
+mod learning;
+mod replay;
+mod run;
+mod sac;
+mod transport;
+mod vae;
+
+use serde::{Deserialize, Serialize};
+use xxhash_rust::xxh3::xxh3_64;
+
+pub use courses::CoursesSection;
+pub use evaluation::EvaluationSection;
+pub use file::ConfigError;
+pub use learning::{LearningSection, Observation};
+pub use replay::{ReplaySection, SuccessRule};
+pub use run::{CheckpointSection, Device, RunSection};
+pub use sac::{SacSection, TargetEntropy};
+pub use transport::TransportSection;
+pub use vae::VaeSection;
+
+/// Everything that determines a run.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Seed, length, device.
+    pub run: RunSection,
+    /// What is flown through.
+    pub courses: CoursesSection,
+    /// Delayed learning: epochs, lag, warm-up, updates.
+    pub learning: LearningSection,
+    /// Soft actor-critic.
+    pub sac: SacSection,
+    /// Variational auto-encoder.
+    pub vae: VaeSection,
+    /// Split replay buffer.
+    pub replay: ReplaySection,
+    /// Evaluation flights.
+    pub evaluation: EvaluationSection,
+    /// What is stored, and when.
+    pub checkpoints: CheckpointSection,
+    /// Limits and deadlines between the processes; without influence on what is learned.
+    pub transport: TransportSection,
+    /// Vehicle, camera, reward, course generator: see the simulator's `SimulatorSettings`.
+    pub simulator: toml::Table,
+}
+
+impl Config {
+    /// Checks every key, and keys against each other.
+    ///
+    /// # Errors
+    /// [`Invalid`] names the first key found wrong, its value, the bound and the consequence.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        self.run.validate()?;
+        self.courses.validate()?;
+        self.learning.validate()?;
+        self.sac.validate()?;
+        self.vae.validate()?;
+        self.replay.validate()?;
+        self.evaluation.validate()?;
+        self.checkpoints.validate()?;
+        self.transport.validate()?;
+        require(
+            self.learning.warmup_steps <= self.replay.capacity,
+            "learning.warmup_steps",
+            self.learning.warmup_steps,
+            format!("exceeds replay.capacity = {}: the learner would wait for ever", self.replay.capacity),
+        )?;
+        require(
+            self.sac.batch_size <= self.learning.warmup_steps.max(1),
+            "sac.batch_size",
+            self.sac.batch_size,
+            format!(
+                "exceeds learning.warmup_steps = {}: the first update would have too few transitions to draw from",
+                self.learning.warmup_steps
+            ),
+        )
+    }
+
+    /// Fingerprint of everything in the configuration; processes of one run compare it.
+    pub fn digest(&self) -> u64 {
+        xxh3_64(self.to_toml().as_bytes())
+    }
+}
+
+/// A key whose value makes no sense.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{key} = {value} {problem}")]
+pub struct Invalid {
+    /// `section.key`.
+    pub key: &'static str,
+    /// The value found.
+    pub value: String,
+    /// The bound and what its violation would lead to.
+    pub problem: String,
+}
+
+pub(crate) fn require(
+    holds: bool,
+    key: &'static str,
+    value: impl std::fmt::Display,
+    problem: impl Into<String>,
+) -> Result<(), Invalid> {
+    if holds { Ok(()) } else { Err(Invalid { key, value: value.to_string(), problem: problem.into() }) }
+}

@@ -1,0 +1,117 @@
+//! `[run]` and `[checkpoints]`.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Invalid, require};
+
+/// `[run]`: seed, length, device.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RunSection {
+    /// Everything random in the run derives from it. Default 1.
+    pub seed: u64,
+    /// Training flights in the whole run. Default 2000.
+    pub flights: u64,
+    /// Where the learner computes: `cpu` or `cuda:N`. Default `cpu`.
+    pub device: Device,
+    /// Threads of the learner's tensor operations. Part of the result: another count sums in another order. Default 2.
+    pub learner_threads: usize,
+}
+
+impl Default for RunSection {
+    fn default() -> Self {
+        Self { seed: 1, flights: 2000, device: Device::Cpu, learner_threads: 2 }
+    }
+}
+
+impl RunSection {
+    pub(super) fn validate(&self) -> Result<(), Invalid> {
+        require(self.flights >= 1, "run.flights", self.flights, "is below 1: nothing would be flown")?;
+        require(self.flights < 1 << 62, "run.flights", self.flights, "is not below 2^62: flight numbers would run out")?;
+        require(
+            (1..=256).contains(&self.learner_threads),
+            "run.learner_threads",
+            self.learner_threads,
+            "is outside 1..=256: the tensor library takes no such thread count",
+        )
+    }
+}
+
+/// A device the learner can compute on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Device {
+    /// The processor.
+    Cpu,
+    /// The CUDA device of this number.
+    Cuda(usize),
+}
+
+impl fmt::Display for Device {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Cpu => f.write_str("cpu"),
+            Self::Cuda(number) => write!(f, "cuda:{number}"),
+        }
+    }
+}
+
+impl FromStr for Device {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let unknown = || format!("device `{text}` is neither `cpu` nor `cuda:N`");
+        match text {
+            "cpu" => Ok(Self::Cpu),
+            _ => {
+                let number = text.strip_prefix("cuda:").ok_or_else(unknown)?;
+                number.parse().map(Self::Cuda).map_err(|_| unknown())
+            }
+        }
+    }
+}
+
+impl TryFrom<String> for Device {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+impl From<Device> for String {
+    fn from(device: Device) -> Self {
+        device.to_string()
+    }
+}
+
+/// `[checkpoints]`: what is stored, and when.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CheckpointSection {
+    /// Training flights between two checkpoints; one more is written at the end. Default 500.
+    pub every_flights: u64,
+    /// Checkpoints kept; older ones are removed. Default 2.
+    pub keep: usize,
+}
+
+impl Default for CheckpointSection {
+    fn default() -> Self {
+        Self { every_flights: 500, keep: 2 }
+    }
+}
+
+impl CheckpointSection {
+    pub(super) fn validate(&self) -> Result<(), Invalid> {
+        require(
+            self.every_flights >= 1,
+            "checkpoints.every_flights",
+            self.every_flights,
+            "is below 1: no flight would ever complete the interval",
+        )?;
+        require(self.keep >= 1, "checkpoints.keep", self.keep, "is below 1: every checkpoint would be removed at once")
+    }
+}

@@ -1,0 +1,79 @@
+//! `[transport]`.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Invalid, require};
+
+/// `[transport]`: limits and deadlines between the processes. Nothing here influences what is learned.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TransportSection {
+    /// Actors that may be attached at one time. Default 64.
+    pub max_actors: usize,
+    /// Records of the longest possible flight: its steps and the closing record. Bounds the shared memory of an actor, 9.4 KiB a record. Default 256.
+    pub max_records_per_flight: usize,
+    /// Tickets an actor holds at one time; 2 keep it busy while the learner takes a flight in. Default 2.
+    pub tickets_per_actor: usize,
+    /// Seconds without a record or a sign of life after which an actor's tickets are issued again. Default 5.
+    pub actor_silence_secs: f64,
+    /// Seconds a ticket may take before it is issued again. Default 60.
+    pub flight_deadline_secs: f64,
+    /// Seconds without a sign of life from the learner after which an actor gives up. Default 30.
+    pub learner_silence_secs: f64,
+}
+
+impl Default for TransportSection {
+    fn default() -> Self {
+        Self {
+            max_actors: 64,
+            max_records_per_flight: 256,
+            tickets_per_actor: 2,
+            actor_silence_secs: 5.0,
+            flight_deadline_secs: 60.0,
+            learner_silence_secs: 30.0,
+        }
+    }
+}
+
+impl TransportSection {
+    /// Interval of the signs of life that both sides give, well below either silence limit.
+    pub fn heartbeat(&self) -> Duration {
+        Duration::from_secs_f64(self.actor_silence_secs.min(self.learner_silence_secs) / 8.0)
+    }
+
+    pub(super) fn validate(&self) -> Result<(), Invalid> {
+        require(
+            (1..=1024).contains(&self.max_actors),
+            "transport.max_actors",
+            self.max_actors,
+            "is outside 1..=1024: each actor takes a slot in every shared-memory service",
+        )?;
+        require(
+            (2..=65_536).contains(&self.max_records_per_flight),
+            "transport.max_records_per_flight",
+            self.max_records_per_flight,
+            "is outside 2..=65536: a flight has at least one step and its closing record",
+        )?;
+        require(
+            (1..=16).contains(&self.tickets_per_actor),
+            "transport.tickets_per_actor",
+            self.tickets_per_actor,
+            "is outside 1..=16: the subscriber's buffer holds as many whole flights of every actor",
+        )?;
+        for (key, secs) in [
+            ("transport.actor_silence_secs", self.actor_silence_secs),
+            ("transport.flight_deadline_secs", self.flight_deadline_secs),
+            ("transport.learner_silence_secs", self.learner_silence_secs),
+        ] {
+            require(
+                (0.1..=86_400.0).contains(&secs),
+                key,
+                secs,
+                "is outside [0.1, 86400]: a peer would be given up at once, or never",
+            )?;
+        }
+        Ok(())
+    }
+}

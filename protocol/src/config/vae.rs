@@ -1,0 +1,63 @@
+//! `[vae]`.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Invalid, require};
+
+/// `[vae]`: the variational auto-encoder (paper, section 3.3), trained together with the agent and then frozen.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct VaeSection {
+    /// Environment steps during which the VAE is trained; then it is frozen and stored latents are recomputed (paper: 10000). Default 10000.
+    pub train_steps: usize,
+    /// VAE steps per environment step, done at the end of the epoch. Default 0.1.
+    pub updates_per_step: f64,
+    /// Depth images in a minibatch. Default 32.
+    pub batch_size: usize,
+    /// Adam's step size. Default 1e-3.
+    pub learning_rate: f64,
+    /// Weight of the Kullback-Leibler term against the squared error summed over the image's pixels. Default 1, the plain VAE.
+    pub kl_weight: f64,
+}
+
+impl Default for VaeSection {
+    fn default() -> Self {
+        Self { train_steps: 10_000, updates_per_step: 0.1, batch_size: 32, learning_rate: 1e-3, kl_weight: 1.0 }
+    }
+}
+
+impl VaeSection {
+    pub(super) fn validate(&self) -> Result<(), Invalid> {
+        require(
+            self.train_steps >= 1,
+            "vae.train_steps",
+            self.train_steps,
+            "is below 1: the policy would see the code of an untrained encoder",
+        )?;
+        require(
+            self.train_steps <= 200_000,
+            "vae.train_steps",
+            self.train_steps,
+            "is above 200000: every depth image of these steps is held in memory, 9 KiB each",
+        )?;
+        require(
+            self.updates_per_step > 0.0 && self.updates_per_step <= 10.0,
+            "vae.updates_per_step",
+            self.updates_per_step,
+            "is outside (0, 10]",
+        )?;
+        require((1..=4096).contains(&self.batch_size), "vae.batch_size", self.batch_size, "is outside 1..=4096")?;
+        require(
+            self.learning_rate > 0.0 && self.learning_rate <= 1.0,
+            "vae.learning_rate",
+            self.learning_rate,
+            "is outside (0, 1]: the optimizer would stand still or blow up",
+        )?;
+        require(
+            self.kl_weight >= 0.0 && self.kl_weight.is_finite(),
+            "vae.kl_weight",
+            self.kl_weight,
+            "is negative or not finite: the latent code would be pushed apart without bound",
+        )
+    }
+}

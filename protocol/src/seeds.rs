@@ -1,0 +1,52 @@
+//! One seed for the run, and from it an independent one for every purpose.
+//!
+//! Nothing that draws at random keeps a generator alive: it derives one from (run seed, purpose, index). So the draws depend on *what* is drawn for,
+//! never on when or where, and there is no generator state to store in a checkpoint.
+
+use xxhash_rust::xxh3::xxh3_64_with_seed;
+
+/// What randomness is drawn for. The discriminants are part of every result: never renumber them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u64)]
+pub enum Purpose {
+    /// Start position and exploration noise of one training flight; indexed by flight.
+    Flight = 1,
+    /// Start position of one evaluation flight; indexed by its number within the evaluation.
+    EvaluationFlight = 2,
+    /// Whether a training flight is flown on a generated course, and which; indexed by flight.
+    Course = 3,
+    /// Initial parameters of the VAE.
+    VaeParameters = 4,
+    /// Initial parameters of policy and critic.
+    SacParameters = 5,
+    /// Minibatches drawn for the SAC updates of one epoch; indexed by epoch.
+    SacBatches = 6,
+    /// Action noise inside the SAC updates of one epoch; indexed by epoch.
+    SacNoise = 7,
+    /// Minibatches drawn for the VAE steps of one epoch; indexed by epoch.
+    VaeBatches = 8,
+    /// Reparameterisation noise of the VAE steps of one epoch; indexed by epoch.
+    VaeNoise = 9,
+}
+
+/// The seed for the `index`-th use of `purpose` in the run seeded `run_seed`.
+pub fn derive(run_seed: u64, purpose: Purpose, index: u64) -> u64 {
+    let mut bytes = [0; 16];
+    bytes[..8].copy_from_slice(&(purpose as u64).to_le_bytes());
+    bytes[8..].copy_from_slice(&index.to_le_bytes());
+    xxh3_64_with_seed(&bytes, run_seed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_differ_by_run_purpose_and_index() {
+        let base = derive(1, Purpose::Flight, 0);
+        assert_ne!(base, derive(2, Purpose::Flight, 0));
+        assert_ne!(base, derive(1, Purpose::EvaluationFlight, 0));
+        assert_ne!(base, derive(1, Purpose::Flight, 1));
+        assert_eq!(base, derive(1, Purpose::Flight, 0));
+    }
+}
