@@ -1,0 +1,215 @@
+//! What a layout must satisfy to be a course.
+//!
+//! Every rule exists because the flight would otherwise be impossible or the numbers meaningless; each names what to change.
+
+use super::{
+    BODY_CLEARANCE_M, CourseFault, CourseLayout, DRONE_WIDTH_M, FRAME_M, MAX_CORNERS, MAX_WALLS, Place, Shape, Wall,
+    WallLabel, WallLayout, polygon,
+};
+
+/// Way flown at 1 m/s before a sidestep has settled, metres: three time constants of the slowest vehicle (0.9 s) and half its length.
+const SETTLING_M: f32 = 3.2;
+
+/// Largest length that any key may hold, metres.
+const LARGEST_M: f32 = 1000.0;
+
+pub(super) fn corridor_and_start(layout: &CourseLayout) -> Result<(), CourseFault> {
+    let corridor = layout.corridor;
+    let course = |key, value, least, most| in_range(Place::Course, key, value, least, most);
+    course("corridor.length_m", corridor.length_m, 5.0, LARGEST_M)?;
+    course("corridor.width_m", corridor.width_m, 2.0, 100.0)?;
+    course("corridor.height_m", corridor.height_m, 2.0, 100.0)?;
+    course("wall_thickness_m", layout.wall_thickness_m, 0.01, 2.0)?;
+
+    let start = layout.start;
+    let behind_m = layout.wall_thickness_m + BODY_CLEARANCE_M;
+    course(
+        "start.offset_m",
+        start.offset_m,
+        behind_m,
+        corridor.length_m - BODY_CLEARANCE_M,
+    )?;
+    course(
+        "start.jitter_y_m",
+        start.jitter_y_m,
+        0.0,
+        corridor.width_m / 2.0 - BODY_CLEARANCE_M,
+    )?;
+    course(
+        "start.jitter_z_m",
+        start.jitter_z_m,
+        0.0,
+        corridor.height_m / 2.0 - BODY_CLEARANCE_M,
+    )?;
+
+    let count = layout.walls.len();
+    if !(1..=MAX_WALLS).contains(&count) {
+        return Err(CourseFault::WallCount { count });
+    }
+    Ok(())
+}
+
+/// Checks the walls one by one and against the one before.
+pub(super) fn walls(layout: &CourseLayout) -> Result<Vec<Wall>, CourseFault> {
+    let mut walls: Vec<Wall> = Vec::with_capacity(layout.walls.len());
+    for candidate in &layout.walls {
+        if walls.iter().any(|wall| wall.label == candidate.label) {
+            return Err(CourseFault::RepeatedWall {
+                wall: candidate.label,
+                key: "order",
+            });
+        }
+        let wall = wall(layout, candidate)?;
+        reachable(layout, walls.last(), &wall)?;
+        walls.push(wall);
+    }
+    Ok(walls)
+}
+
+fn wall(layout: &CourseLayout, candidate: &WallLayout) -> Result<Wall, CourseFault> {
+    let label = candidate.label;
+    let least_m = layout.start.offset_m + BODY_CLEARANCE_M;
+    let most_m = layout.corridor.length_m - layout.wall_thickness_m - DRONE_WIDTH_M;
+    // Written so that a NaN is refused as well.
+    if !(least_m..=most_m).contains(&candidate.x_m) {
+        return Err(CourseFault::OutsideCorridor {
+            wall: label,
+            x_m: candidate.x_m,
+            least_m,
+            most_m,
+        });
+    }
+    sizes(label, candidate)?;
+    let outline = outline(layout, candidate)?;
+    let (safe_point, clearance_m) = polygon::widest_circle(&outline);
+    if clearance_m < BODY_CLEARANCE_M {
+        let shape = candidate.opening.shape.name();
+        return Err(CourseFault::TooSmall {
+            wall: label,
+            shape,
+            clearance_m,
+        });
+    }
+    Ok(Wall {
+        label,
+        x_m: candidate.x_m,
+        opening: candidate.opening.clone(),
+        outline,
+        safe_point,
+        clearance_m,
+    })
+}
+
+/// Numbers of the opening, key by key.
+fn sizes(wall: WallLabel, candidate: &WallLayout) -> Result<(), CourseFault> {
+    let place = Place::Wall(wall);
+    let opening = &candidate.opening;
+    for centre in opening.centre_m {
+        in_range(place, "centre_m", centre, -LARGEST_M, LARGEST_M)?;
+    }
+    in_range(place, "rotation_deg", opening.rotation_deg, -360.0, 360.0)?;
+    for (key, value_m) in opening.shape.lengths_m() {
+        in_range(place, key, value_m, 0.0, LARGEST_M)?;
+        if key != "arm_m" && value_m < DRONE_WIDTH_M {
+            return Err(CourseFault::NarrowerThanDrone { wall, key, value_m });
+        }
+    }
+    match opening.shape {
+        Shape::Cross {
+            width_m,
+            height_m,
+            arm_m,
+        }
+        | Shape::L {
+            width_m,
+            height_m,
+            arm_m,
+        } => {
+            // An arm as thick as the whole shape is a rectangle with corners on top of each other.
+            in_range(place, "arm_m", arm_m, 0.01, 0.99 * width_m.min(height_m))
+        }
+        Shape::Polygon { ref points_m } => {
+            if !(3..=MAX_CORNERS).contains(&points_m.len()) {
+                return Err(CourseFault::CornerCount {
+                    wall,
+                    count: points_m.len(),
+                });
+            }
+            points_m
+                .iter()
+                .flatten()
+                .try_for_each(|&value| in_range(place, "points_m", value, -LARGEST_M, LARGEST_M))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// The outline, if it is a simple polygon within the wall's frame.
+fn outline(layout: &CourseLayout, candidate: &WallLayout) -> Result<Vec<[f32; 2]>, CourseFault> {
+    let wall = candidate.label;
+    let outline = candidate.opening.outline();
+    if let Some(edges) = polygon::self_intersection(&outline) {
+        return Err(CourseFault::SelfIntersecting { wall, edges });
+    }
+    let limit_y_m = layout.corridor.width_m / 2.0 - FRAME_M;
+    let limit_z_m = layout.corridor.height_m - FRAME_M;
+    match outline
+        .iter()
+        .find(|[y, z]| y.abs() > limit_y_m || !(FRAME_M..=limit_z_m).contains(z))
+    {
+        Some(&[y_m, z_m]) => Err(CourseFault::OutsideWall {
+            wall,
+            y_m,
+            z_m,
+            limit_y_m,
+            limit_z_m,
+        }),
+        None => Ok(outline),
+    }
+}
+
+/// There is way enough to sidestep from the opening before, and from the start area, to this opening.
+fn reachable(layout: &CourseLayout, before: Option<&Wall>, wall: &Wall) -> Result<(), CourseFault> {
+    let start = layout.start;
+    let behind_m = before.map_or(0.0, |before| before.x_m);
+    let from_start = (
+        wall.x_m - behind_m - start.offset_m,
+        wall.safe_point[0].abs() + start.jitter_y_m,
+        (wall.safe_point[1] - layout.corridor.height_m / 2.0).abs() + start.jitter_z_m,
+    );
+    let from_wall = before.map(|before| {
+        (
+            wall.x_m - before.x_m - layout.wall_thickness_m,
+            (wall.safe_point[0] - before.safe_point[0]).abs(),
+            (wall.safe_point[1] - before.safe_point[1]).abs(),
+        )
+    });
+    for (gap_m, along_y_m, along_z_m) in [Some(from_start), from_wall].into_iter().flatten() {
+        let shift_m = along_y_m.max(along_z_m);
+        let needed_m = shift_m + SETTLING_M;
+        if gap_m < needed_m {
+            return Err(CourseFault::TooClose {
+                wall: wall.label,
+                gap_m,
+                shift_m,
+                needed_m,
+            });
+        }
+    }
+    Ok(())
+}
+
+fn in_range(place: Place, key: &'static str, value: f32, least: f32, most: f32) -> Result<(), CourseFault> {
+    // Written so that a NaN is refused as well.
+    if (least..=most).contains(&value) {
+        Ok(())
+    } else {
+        Err(CourseFault::OutOfRange {
+            place,
+            key,
+            value,
+            least,
+            most,
+        })
+    }
+}

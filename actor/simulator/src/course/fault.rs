@@ -1,0 +1,192 @@
+//! Why a course cannot be flown, in words that say what to change.
+
+use std::fmt;
+
+use super::{BODY_CLEARANCE_M, DRONE_WIDTH_M, FRAME_M, MAX_CORNERS, MAX_WALLS, WallLabel};
+
+/// Where in a course description a fault lies.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Place {
+    /// In what is not part of any wall.
+    Course,
+    /// In the definition of this wall.
+    Wall(WallLabel),
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Course => f.write_str("course"),
+            Self::Wall(label) => write!(f, "wall {label}"),
+        }
+    }
+}
+
+/// Why a course is refused: the wall, the key, and the remedy.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum CourseFault {
+    /// A number outside what makes sense, or not a number.
+    #[error("{place}: key {key} = {value} must lie between {least} and {most}")]
+    OutOfRange {
+        /// Where it stands.
+        place: Place,
+        /// The key that sets it.
+        key: &'static str,
+        /// The value found.
+        value: f32,
+        /// Smallest value accepted.
+        least: f32,
+        /// Largest value accepted.
+        most: f32,
+    },
+    /// A key that the shape needs is not there.
+    #[error("wall {wall}: key {key} is missing: a {shape} needs {needed}")]
+    MissingKey {
+        /// The wall.
+        wall: WallLabel,
+        /// The key looked for.
+        key: &'static str,
+        /// The wall's shape.
+        shape: &'static str,
+        /// All keys of that shape.
+        needed: &'static str,
+    },
+    /// A key that belongs to another shape.
+    #[error("wall {wall}: key {key} does not belong to a {shape}, which takes {needed}: remove it")]
+    ForeignKey {
+        /// The wall.
+        wall: WallLabel,
+        /// The key found.
+        key: &'static str,
+        /// The wall's shape.
+        shape: &'static str,
+        /// All keys of that shape.
+        needed: &'static str,
+    },
+    /// A length smaller than the drone.
+    #[error("wall {wall}: key {key} = {value_m} m is narrower than the drone ({DRONE_WIDTH_M} m): enlarge the opening")]
+    NarrowerThanDrone {
+        /// The wall.
+        wall: WallLabel,
+        /// The key that sets the length.
+        key: &'static str,
+        /// The length.
+        value_m: f32,
+    },
+    /// The widest circle inside the opening has no room for the drone.
+    #[error(
+        "wall {wall}: the widest circle inside the {shape} has a radius of {clearance_m:.2} m, but the drone needs \
+         {BODY_CLEARANCE_M} m however it is tilted: enlarge the opening"
+    )]
+    TooSmall {
+        /// The wall.
+        wall: WallLabel,
+        /// The opening's shape.
+        shape: &'static str,
+        /// Radius of the widest circle inside, metres.
+        clearance_m: f32,
+    },
+    /// A polygon of too few or too many corners.
+    #[error("wall {wall}: key points_m has {count} corners: give 3 to {MAX_CORNERS}")]
+    CornerCount {
+        /// The wall.
+        wall: WallLabel,
+        /// Corners found.
+        count: usize,
+    },
+    /// A polygon that crosses or touches itself, or has no area.
+    #[error(
+        "wall {wall}: the opening's outline crosses or touches itself (edges {} and {}): list the corners in order around it",
+        edges.0 + 1, edges.1 + 1
+    )]
+    SelfIntersecting {
+        /// The wall.
+        wall: WallLabel,
+        /// The two edges, numbered from 0.
+        edges: (usize, usize),
+    },
+    /// The opening reaches over the wall's rim.
+    #[error(
+        "wall {wall}: the opening reaches y = {y_m:.2} m, z = {z_m:.2} m, but it must stay within |y| <= {limit_y_m:.2} m and \
+         {FRAME_M} m <= z <= {limit_z_m:.2} m: move centre_m or make it smaller"
+    )]
+    OutsideWall {
+        /// The wall.
+        wall: WallLabel,
+        /// The offending corner's y, metres.
+        y_m: f32,
+        /// The offending corner's z, metres.
+        z_m: f32,
+        /// Largest |y| accepted, metres.
+        limit_y_m: f32,
+        /// Largest z accepted, metres.
+        limit_z_m: f32,
+    },
+    /// The wall is not inside the corridor, or leaves the drone no room at its end.
+    #[error(
+        "wall {wall}: key wall_x_m = {x_m} m: the wall must stand between {least_m:.2} m and {most_m:.2} m of the corridor"
+    )]
+    OutsideCorridor {
+        /// The wall.
+        wall: WallLabel,
+        /// Its front face, metres.
+        x_m: f32,
+        /// First place possible, metres.
+        least_m: f32,
+        /// Last place possible, metres.
+        most_m: f32,
+    },
+    /// No time to get from the opening before to this one.
+    #[error(
+        "wall {wall}: key wall_x_m leaves {gap_m:.2} m before it, but its opening lies {shift_m:.2} m aside of where the drone comes \
+         from, which takes {needed_m:.2} m at 1 m/s: move the wall back or the openings together"
+    )]
+    TooClose {
+        /// The wall that comes too soon.
+        wall: WallLabel,
+        /// Free way before it, metres.
+        gap_m: f32,
+        /// Way to go sideways or up or down, metres.
+        shift_m: f32,
+        /// Way needed, metres.
+        needed_m: f32,
+    },
+    /// `order` names a wall that is not there.
+    #[error("course: key order names wall {wall}, which no [[wall]] defines: correct the order or add the wall")]
+    UnknownWall {
+        /// The label.
+        wall: WallLabel,
+    },
+    /// A label defined twice, or flown twice.
+    #[error("wall {wall}: stands twice in {key}: each wall has its own label and one place")]
+    RepeatedWall {
+        /// The label.
+        wall: WallLabel,
+        /// `label` or `order`.
+        key: &'static str,
+    },
+    /// As many places as walls are needed.
+    #[error("course: key order has {order} walls and wall_x_m {places} places: give as many of each")]
+    OrderLength {
+        /// Length of `order`.
+        order: usize,
+        /// Length of `wall_x_m`.
+        places: usize,
+    },
+    /// No walls at all, or more than levels can be counted.
+    #[error("course: {count} walls: give 1 to {MAX_WALLS}")]
+    WallCount {
+        /// Walls found.
+        count: usize,
+    },
+}
+
+/// A start level that the course does not have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("start level {level}: this course has levels 1 to {levels}")]
+pub struct NoSuchLevel {
+    /// The level asked for.
+    pub level: u8,
+    /// Levels of the course.
+    pub levels: u8,
+}

@@ -1,0 +1,292 @@
+//! Random courses from a seed.
+//!
+//! What generalises is diversity in training, not more training: a policy that meets random openings cannot learn an order
+//! by heart. An opening is drawn by the free space it leaves, so that every shape is equally hard to fly through.
+
+use std::f32::consts::TAU;
+
+use rand::{Rng, RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    BODY_CLEARANCE_M, Corridor, Course, CourseFault, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout,
+    polygon,
+};
+
+/// What random courses are drawn from. Pairs are the least and the largest value, drawn uniformly.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GeneratorRanges {
+    /// The corridor.
+    pub corridor: Corridor,
+    /// Where flights begin.
+    pub start: StartArea,
+    /// Front face of each wall, metres; as many walls as entries.
+    pub wall_x_m: Vec<f32>,
+    /// Thickness of every wall, metres.
+    pub wall_thickness_m: f32,
+    /// Kinds of openings, all equally likely.
+    pub shapes: Vec<GeneratedShape>,
+    /// Radius of the widest circle inside an opening, metres: at least [`BODY_CLEARANCE_M`].
+    pub clearance_m: [f32; 2],
+    /// Turn of an opening, degrees.
+    pub rotation_deg: [f32; 2],
+}
+
+/// A kind of opening that the generator draws.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum GeneratedShape {
+    /// Sides up to 1 : 1.4.
+    Rectangle,
+    /// A circle.
+    Circle,
+    /// Close to equilateral.
+    Triangle,
+    /// Diagonals up to 1 : 1.3.
+    Diamond,
+    /// Beams of 0.45 to 0.65 of the width.
+    Cross,
+    /// Beams of 0.45 to 0.65 of the width.
+    L,
+    /// Five to eight corners around the centre.
+    Polygon,
+}
+
+/// Ranges that no course can be drawn from.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum RangesError {
+    /// A range upside down, or with a bound that is not a number or too small.
+    #[error("generator: {key} = [{least}, {most}] is no range from {smallest} upwards")]
+    NoRange {
+        /// The key.
+        key: &'static str,
+        /// Its lower bound.
+        least: f32,
+        /// Its upper bound.
+        most: f32,
+        /// Smallest lower bound accepted.
+        smallest: f32,
+    },
+    /// No shapes to choose from.
+    #[error("generator: shapes is empty: name at least one")]
+    NoShapes,
+    /// Nothing drawn from the ranges could be flown.
+    #[error("generator: nothing drawn for wall {wall} could be flown, for instance: {last}")]
+    NothingFits {
+        /// Place of the wall, from 1.
+        wall: usize,
+        /// Why the last try was refused.
+        last: CourseFault,
+    },
+}
+
+impl Default for GeneratorRanges {
+    /// Five walls as in the paper's corridor, with the free space of the shipped courses.
+    fn default() -> Self {
+        use GeneratedShape::{Circle, Cross, Diamond, L, Polygon, Rectangle, Triangle};
+        Self {
+            corridor: Corridor::default(),
+            start: StartArea::default(),
+            wall_x_m: vec![10.0, 20.0, 30.0, 40.0, 50.0],
+            wall_thickness_m: 0.3,
+            shapes: vec![Rectangle, Circle, Triangle, Diamond, Cross, L, Polygon],
+            clearance_m: [0.9, 1.15],
+            rotation_deg: [-180.0, 180.0],
+        }
+    }
+}
+
+impl Course {
+    /// The course that belongs to a seed: the same seed and ranges give the same course.
+    ///
+    /// # Errors
+    /// [`RangesError`] if the ranges are none, or hold nothing that can be flown.
+    pub fn generate(seed: u64, ranges: &GeneratorRanges) -> Result<Self, RangesError> {
+        ranges.check()?;
+        let mut rng = Pcg64Mcg::seed_from_u64(seed);
+        let mut layout = CourseLayout {
+            name: format!("generated {seed}"),
+            corridor: ranges.corridor,
+            start: ranges.start,
+            wall_thickness_m: ranges.wall_thickness_m,
+            walls: Vec::new(),
+        };
+        let mut course = None;
+        for (place, &x_m) in ranges.wall_x_m.iter().enumerate() {
+            let label = WallLabel(place as u32 + 1);
+            course = Some(add_wall(&mut layout, label, x_m, ranges, &mut rng)?);
+        }
+        course.ok_or(RangesError::NothingFits {
+            wall: 1,
+            last: CourseFault::WallCount { count: 0 },
+        })
+    }
+}
+
+/// Draws walls until one can be flown after those already there.
+fn add_wall(
+    layout: &mut CourseLayout,
+    label: WallLabel,
+    x_m: f32,
+    ranges: &GeneratorRanges,
+    rng: &mut impl Rng,
+) -> Result<Course, RangesError> {
+    /// With the default ranges about every second try fits.
+    const TRIES: u32 = 1000;
+
+    let mut last = CourseFault::WallCount { count: 0 };
+    for _ in 0..TRIES {
+        layout.walls.push(WallLayout {
+            label,
+            x_m,
+            opening: ranges.draw_opening(rng),
+        });
+        match Course::new(layout.clone()) {
+            Ok(course) => return Ok(course),
+            Err(fault) => last = fault,
+        }
+        layout.walls.pop();
+    }
+    Err(RangesError::NothingFits {
+        wall: label.0 as usize,
+        last,
+    })
+}
+
+impl GeneratorRanges {
+    fn check(&self) -> Result<(), RangesError> {
+        if self.shapes.is_empty() {
+            return Err(RangesError::NoShapes);
+        }
+        let ranges = [
+            ("clearance_m", self.clearance_m, BODY_CLEARANCE_M),
+            ("rotation_deg", self.rotation_deg, -360.0),
+        ];
+        for (key, [least, most], smallest) in ranges {
+            let sound = least >= smallest && most >= least && most.is_finite();
+            if !sound {
+                return Err(RangesError::NoRange {
+                    key,
+                    least,
+                    most,
+                    smallest,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn draw_opening(&self, rng: &mut impl Rng) -> Opening {
+        let kind = self.shapes[rng.random_range(0..self.shapes.len())];
+        let clearance_m = rng.random_range(self.clearance_m[0]..=self.clearance_m[1]);
+        let (half_y, height) = (self.corridor.width_m / 2.0, self.corridor.height_m);
+        Opening {
+            shape: kind.draw(clearance_m, rng),
+            centre_m: [rng.random_range(-half_y..=half_y), rng.random_range(0.0..=height)],
+            rotation_deg: rng.random_range(self.rotation_deg[0]..=self.rotation_deg[1]),
+        }
+    }
+}
+
+impl GeneratedShape {
+    /// A shape whose widest inner circle has the radius `clearance_m`.
+    fn draw(self, clearance_m: f32, rng: &mut impl Rng) -> Shape {
+        let shape = self.draw_proportions(rng);
+        let unscaled = Opening {
+            shape: shape.clone(),
+            centre_m: [0.0; 2],
+            rotation_deg: 0.0,
+        };
+        let (_, radius) = polygon::widest_circle(&unscaled.outline());
+        shape.scaled(clearance_m / radius)
+    }
+
+    fn draw_proportions(self, rng: &mut impl Rng) -> Shape {
+        let width_m = 1.0;
+        match self {
+            Self::Rectangle => Shape::Rectangle {
+                width_m,
+                height_m: rng.random_range(1.0..=1.4),
+            },
+            Self::Circle => Shape::Circle { diameter_m: 1.0 },
+            Self::Triangle => Shape::Triangle {
+                width_m,
+                height_m: rng.random_range(0.75..=1.0),
+            },
+            Self::Diamond => Shape::Diamond {
+                width_m,
+                height_m: rng.random_range(1.0..=1.3),
+            },
+            Self::Cross => Shape::Cross {
+                width_m,
+                height_m: 1.0,
+                arm_m: rng.random_range(0.45..=0.65),
+            },
+            Self::L => Shape::L {
+                width_m,
+                height_m: 1.0,
+                arm_m: rng.random_range(0.45..=0.65),
+            },
+            Self::Polygon => {
+                let corners = rng.random_range(5..=8);
+                let points_m = (0..corners)
+                    .map(|corner| {
+                        let angle = (corner as f32 + rng.random_range(-0.2..=0.2)) / corners as f32 * TAU;
+                        let radius = rng.random_range(0.8..=1.2);
+                        [radius * angle.cos(), radius * angle.sin()]
+                    })
+                    .collect();
+                Shape::Polygon { points_m }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_seed_gives_a_course_with_the_free_space_asked_for() {
+        let ranges = GeneratorRanges::default();
+        let mut outlines = Vec::new();
+        for seed in 0..40 {
+            let course = Course::generate(seed, &ranges).unwrap();
+            assert_eq!(course.walls().len(), 5);
+            for wall in course.walls() {
+                assert!((0.89..=1.16).contains(&wall.clearance_m()), "{}", wall.clearance_m());
+            }
+            outlines.push(course.walls()[0].outline().to_vec());
+        }
+        outlines.dedup();
+        assert_eq!(outlines.len(), 40, "seeds must give different courses");
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_course() {
+        let ranges = GeneratorRanges::default();
+        assert_eq!(Course::generate(3, &ranges), Course::generate(3, &ranges));
+    }
+
+    #[test]
+    fn impossible_ranges_are_refused_and_say_why() {
+        let upside_down = GeneratorRanges {
+            clearance_m: [1.2, 1.0],
+            ..Default::default()
+        };
+        let error = Course::generate(0, &upside_down).unwrap_err().to_string();
+        assert!(error.contains("clearance_m = [1.2, 1]"), "{error}");
+
+        let too_wide = GeneratorRanges {
+            clearance_m: [3.5, 3.5],
+            ..Default::default()
+        };
+        let error = Course::generate(0, &too_wide).unwrap_err().to_string();
+        assert!(
+            error.contains("nothing drawn for wall 1") && error.contains("must stay within"),
+            "{error}"
+        );
+    }
+}

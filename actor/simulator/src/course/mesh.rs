@@ -1,0 +1,220 @@
+//! Every surface of a course, once: what the camera sees is what the body hits.
+//!
+//! A surface is flat and one-sided: its normal points into the free space. Neighbouring surfaces share their vertices, so
+//! that an edge is the same two numbers on both sides and no crack can open between them.
+
+use earcut::Earcut;
+use nalgebra::{Point3, Vector3};
+
+use super::{Course, Wall};
+
+/// What a surface belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum SurfaceKind {
+    /// Floor, ceiling, left and right side of the corridor, and the end behind the start.
+    Corridor,
+    /// The wall at the corridor's end: the destination.
+    EndWall,
+    /// A wall with an opening, by its place in flight order from 0: front, back and the inside of its opening.
+    Wall(usize),
+}
+
+/// A flat face, seen from the side its normal points to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Surface {
+    /// What it belongs to.
+    pub kind: SurfaceKind,
+    /// Closed loops of vertex numbers: the outer rim and, in a wall, the hole. They do not touch each other.
+    pub loops: Vec<Vec<u32>>,
+    /// Unit vector into the free space, world frame.
+    pub normal: Vector3<f32>,
+    /// `normal . p` of every point `p` of the surface, metres.
+    pub offset_m: f32,
+}
+
+/// The surfaces of a course and their corners in the world frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mesh {
+    /// Corners, metres.
+    pub vertices: Vec<Point3<f32>>,
+    /// Faces.
+    pub surfaces: Vec<Surface>,
+}
+
+impl Mesh {
+    pub(super) fn of(course: &Course) -> Self {
+        let mut mesh = Self {
+            vertices: Vec::new(),
+            surfaces: Vec::new(),
+        };
+        mesh.add_corridor(course);
+        for (place, wall) in course.walls().iter().enumerate() {
+            mesh.add_wall(course, place, wall);
+        }
+        mesh
+    }
+
+    /// Triangles as vertex numbers, counter-clockwise seen from the free side, each with the number of its surface.
+    #[must_use]
+    pub fn triangles(&self) -> Vec<([u32; 3], usize)> {
+        let mut earcut = Earcut::new();
+        let mut corners: Vec<u32> = Vec::new();
+        let mut triangles = Vec::new();
+        for (number, surface) in self.surfaces.iter().enumerate() {
+            let rim: Vec<u32> = surface.loops.concat();
+            let holes: Vec<u32> = surface
+                .loops
+                .iter()
+                .scan(0, |start, ring| {
+                    *start += ring.len() as u32;
+                    Some(*start)
+                })
+                .take(surface.loops.len() - 1)
+                .collect();
+            let flat = rim.iter().map(|&v| surface.flatten(self.vertices[v as usize]));
+            earcut.earcut(flat, &holes, &mut corners);
+            for &[a, b, c] in corners.as_chunks::<3>().0 {
+                let [a, b, c] = [a, b, c].map(|corner| rim[corner as usize]);
+                let faces_out = self.triangle_normal([a, b, c]).dot(&surface.normal) > 0.0;
+                triangles.push((if faces_out { [a, b, c] } else { [a, c, b] }, number));
+            }
+        }
+        triangles
+    }
+
+    fn triangle_normal(&self, triangle: [u32; 3]) -> Vector3<f32> {
+        let [a, b, c] = triangle.map(|v| self.vertices[v as usize]);
+        (b - a).cross(&(c - a))
+    }
+
+    fn add_corridor(&mut self, course: &Course) {
+        let corridor = course.corridor();
+        let first = self.add_ring(0.0, &rim_of(course));
+        let last = self.add_ring(corridor.length_m, &rim_of(course));
+        self.add_surface(SurfaceKind::Corridor, vec![first.clone()], Vector3::x());
+        self.add_surface(SurfaceKind::EndWall, vec![last.clone()], -Vector3::x());
+        // The rim runs along the floor, up the left side, back along the ceiling, down the right side.
+        let inwards = [Vector3::z(), -Vector3::y(), -Vector3::z(), Vector3::y()];
+        for (side, inward) in inwards.into_iter().enumerate() {
+            self.add_surface(SurfaceKind::Corridor, vec![band(&first, &last, side)], inward);
+        }
+    }
+
+    fn add_wall(&mut self, course: &Course, place: usize, wall: &Wall) {
+        let kind = SurfaceKind::Wall(place);
+        let (front_m, back_m) = (wall.x_m(), wall.x_m() + course.wall_thickness_m());
+        let front_rim = self.add_ring(front_m, &rim_of(course));
+        let back_rim = self.add_ring(back_m, &rim_of(course));
+        let front_hole = self.add_ring(front_m, wall.outline());
+        let back_hole = self.add_ring(back_m, wall.outline());
+        self.add_surface(kind, vec![front_rim, front_hole.clone()], -Vector3::x());
+        self.add_surface(kind, vec![back_rim, back_hole.clone()], Vector3::x());
+        for (side, (a, b)) in super::polygon::edges(wall.outline()).enumerate() {
+            // The outline runs counter-clockwise: the free space lies to its left.
+            let inward = Vector3::new(0.0, a[1] - b[1], b[0] - a[0]).normalize();
+            self.add_surface(kind, vec![band(&front_hole, &back_hole, side)], inward);
+        }
+    }
+
+    fn add_ring(&mut self, x_m: f32, points: &[[f32; 2]]) -> Vec<u32> {
+        let first = self.vertices.len() as u32;
+        self.vertices
+            .extend(points.iter().map(|&[y, z]| Point3::new(x_m, y, z)));
+        (first..self.vertices.len() as u32).collect()
+    }
+
+    fn add_surface(&mut self, kind: SurfaceKind, loops: Vec<Vec<u32>>, normal: Vector3<f32>) {
+        let offset_m = normal.dot(&self.vertices[loops[0][0] as usize].coords);
+        self.surfaces.push(Surface {
+            kind,
+            loops,
+            normal,
+            offset_m,
+        });
+    }
+}
+
+impl Surface {
+    /// The point in two coordinates of the surface, leaving out the axis that the normal is nearest to.
+    fn flatten(&self, point: Point3<f32>) -> [f32; 2] {
+        match self.normal.iamax() {
+            0 => [point.y, point.z],
+            1 => [point.z, point.x],
+            _ => [point.x, point.y],
+        }
+    }
+}
+
+/// The corridor's cross-section, counter-clockwise from the right end of the floor.
+fn rim_of(course: &Course) -> [[f32; 2]; 4] {
+    let corridor = course.corridor();
+    let (half, top) = (corridor.width_m / 2.0, corridor.height_m);
+    [[-half, 0.0], [half, 0.0], [half, top], [-half, top]]
+}
+
+/// The quad between the same side of two rings.
+fn band(near: &[u32], far: &[u32], side: usize) -> Vec<u32> {
+    let next = (side + 1) % near.len();
+    vec![near[side], near[next], far[next], far[side]]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::test_course;
+    use super::*;
+
+    #[test]
+    fn every_vertex_lies_on_its_surfaces_planes() {
+        let mesh = test_course().mesh();
+        for surface in &mesh.surfaces {
+            for &v in surface.loops.iter().flatten() {
+                let off = surface.normal.dot(&mesh.vertices[v as usize].coords) - surface.offset_m;
+                assert!(off.abs() < 1e-5, "{:?} off by {off}", surface.kind);
+            }
+        }
+    }
+
+    #[test]
+    fn normals_point_into_the_free_space() {
+        let course = test_course();
+        let mesh = course.mesh();
+        let corridor = course.corridor();
+        for surface in &mesh.surfaces {
+            let ring = &surface.loops[0];
+            let [a, c] = [ring[0], ring[2]].map(|v| mesh.vertices[v as usize].coords);
+            let within = a * 0.6 + c * 0.4;
+            // From inside a quad or the corner of a ring, a small step must end in air.
+            let at = match surface.loops.len() {
+                1 => within + surface.normal * 0.05,
+                _ => mesh.vertices[ring[0] as usize].coords + surface.normal * 0.05 + Vector3::new(0.0, 0.05, 0.05),
+            };
+            assert!((0.0..=corridor.length_m).contains(&at.x) && at.y.abs() <= 3.0 && (0.0..=7.0).contains(&at.z));
+            let in_wall = course.walls().iter().any(|wall| {
+                (wall.x_m()..wall.x_m() + course.wall_thickness_m()).contains(&at.x)
+                    && super::super::polygon::signed_distance(wall.outline(), [at.y, at.z]) < 0.0
+            });
+            assert!(!in_wall, "{:?} {at}", surface.kind);
+        }
+    }
+
+    #[test]
+    fn triangles_cover_each_surface_exactly() {
+        let course = test_course();
+        let mesh = course.mesh();
+        let mut areas = vec![0.0; mesh.surfaces.len()];
+        for (triangle, surface) in mesh.triangles() {
+            let normal = mesh.triangle_normal(triangle);
+            assert!(
+                normal.dot(&mesh.surfaces[surface].normal) > 0.0,
+                "triangle faces the wrong way"
+            );
+            areas[surface] += normal.norm() / 2.0;
+        }
+        for (surface, area) in mesh.surfaces.iter().zip(areas) {
+            if let (SurfaceKind::Wall(place), 2) = (surface.kind, surface.loops.len()) {
+                let hole = super::super::polygon::signed_area(course.walls()[place].outline());
+                assert!((area - (42.0 - hole)).abs() < 1e-3, "wall {place}: {area}");
+            }
+        }
+    }
+}

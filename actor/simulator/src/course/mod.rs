@@ -1,0 +1,331 @@
+//! The corridor, its walls and their openings, in flight order.
+//!
+//! A [`Course`] that exists can be flown: [`Course::new`] refuses everything else with the wall, the key and the remedy, so
+//! neither the physics nor the camera has to ask again. The same [`Mesh`] of surfaces is what the drone sees and what it
+//! hits.
+//!
+//! World frame: x forward along the corridor from 0, y to the left from the middle, z up from the floor; metres.
+
+mod check;
+mod fault;
+mod file;
+mod generator;
+mod mesh;
+mod opening;
+mod polygon;
+
+use std::fmt;
+
+use nalgebra::Point3;
+use rand::{Rng, RngExt};
+use serde::{Deserialize, Serialize};
+
+pub use fault::{CourseFault, NoSuchLevel, Place};
+pub use file::CourseError;
+pub use generator::{GeneratedShape, GeneratorRanges, RangesError};
+pub use mesh::{Mesh, Surface, SurfaceKind};
+pub use opening::{CIRCLE_SIDES, Opening, Shape};
+
+/// Width and length of the drone's body, metres. Source: AirSim's generic quadrotor mesh, 0.98 x 0.98 x 0.29 m.
+pub const DRONE_WIDTH_M: f32 = 0.98;
+
+/// Radius about an opening's safe point that must be free, metres: half the diagonal of the drone's cross-section
+/// 0.98 x 0.29 m, which is 0.511 m however the body rolls, and 0.14 m for the pilot's error.
+pub const BODY_CLEARANCE_M: f32 = 0.65;
+
+/// Least width of the frame that remains around an opening, metres.
+pub const FRAME_M: f32 = 0.1;
+
+/// Most corners of a polygon opening.
+pub const MAX_CORNERS: usize = 64;
+
+/// Most walls of a course.
+pub const MAX_WALLS: usize = 32;
+
+/// The number a wall is known by in course files and reports, whatever its place in the order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct WallLabel(pub u32);
+
+impl fmt::Display for WallLabel {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+/// Inner size of the closed corridor: `0..length_m`, `-width_m/2..width_m/2`, `0..height_m`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Corridor {
+    /// Along x, metres. Reaching its end wall is the destination.
+    pub length_m: f32,
+    /// Along y, metres.
+    pub width_m: f32,
+    /// Along z, metres.
+    pub height_m: f32,
+}
+
+impl Default for Corridor {
+    /// The paper's: 60 x 6 x 7 m.
+    fn default() -> Self {
+        Self {
+            length_m: 60.0,
+            width_m: 6.0,
+            height_m: 7.0,
+        }
+    }
+}
+
+/// Where flights begin: this far behind the previous wall's front face, in the middle of the corridor, give or take.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StartArea {
+    /// Behind the front face of the wall before (or the corridor's start), metres.
+    pub offset_m: f32,
+    /// Largest deviation from the middle along y, metres; drawn uniformly.
+    pub jitter_y_m: f32,
+    /// Largest deviation from half the height along z, metres; drawn uniformly.
+    pub jitter_z_m: f32,
+}
+
+impl Default for StartArea {
+    /// 1.5 m clears a wall of 0.3 m by more than the drone's half length; 0.5 m makes every flight another flight.
+    fn default() -> Self {
+        Self {
+            offset_m: 1.5,
+            jitter_y_m: 0.5,
+            jitter_z_m: 0.5,
+        }
+    }
+}
+
+/// What a course is made of, before it is checked.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CourseLayout {
+    /// Name in reports.
+    pub name: String,
+    /// The corridor.
+    pub corridor: Corridor,
+    /// Where flights begin.
+    pub start: StartArea,
+    /// Thickness of every wall along x, metres.
+    pub wall_thickness_m: f32,
+    /// Walls in flight order.
+    pub walls: Vec<WallLayout>,
+}
+
+/// A wall before it is checked.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WallLayout {
+    /// The wall's number.
+    pub label: WallLabel,
+    /// Its front face (the one met first), metres.
+    pub x_m: f32,
+    /// Its hole.
+    pub opening: Opening,
+}
+
+/// A wall across the whole corridor with one opening.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Wall {
+    label: WallLabel,
+    x_m: f32,
+    opening: Opening,
+    outline: Vec<[f32; 2]>,
+    safe_point: [f32; 2],
+    clearance_m: f32,
+}
+
+/// A corridor with walls that can be flown from its start to its end wall.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Course {
+    name: String,
+    corridor: Corridor,
+    start: StartArea,
+    wall_thickness_m: f32,
+    walls: Vec<Wall>,
+}
+
+impl Course {
+    /// Checks a layout and makes it a course.
+    ///
+    /// # Errors
+    /// The first [`CourseFault`] found, from the corridor to the walls in flight order.
+    pub fn new(layout: CourseLayout) -> Result<Self, CourseFault> {
+        check::corridor_and_start(&layout)?;
+        let walls = check::walls(&layout)?;
+        Ok(Self {
+            name: layout.name,
+            corridor: layout.corridor,
+            start: layout.start,
+            wall_thickness_m: layout.wall_thickness_m,
+            walls,
+        })
+    }
+
+    /// Name in reports.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Inner size of the corridor.
+    #[must_use]
+    pub fn corridor(&self) -> Corridor {
+        self.corridor
+    }
+
+    /// Where flights begin.
+    #[must_use]
+    pub fn start(&self) -> StartArea {
+        self.start
+    }
+
+    /// Thickness of every wall along x, metres: a wall fills `x_m .. x_m + wall_thickness_m`.
+    #[must_use]
+    pub fn wall_thickness_m(&self) -> f32 {
+        self.wall_thickness_m
+    }
+
+    /// The walls in flight order.
+    #[must_use]
+    pub fn walls(&self) -> &[Wall] {
+        &self.walls
+    }
+
+    /// Number of start levels: one before each wall.
+    #[must_use]
+    pub fn levels(&self) -> u8 {
+        // `new` allows at most MAX_WALLS.
+        self.walls.len() as u8
+    }
+
+    /// Draws where a flight of `level` (1 = before the first wall) begins, in the world frame, metres.
+    ///
+    /// # Errors
+    /// [`NoSuchLevel`] if the course has fewer walls.
+    pub fn start_position(&self, level: u8, rng: &mut impl Rng) -> Result<Point3<f32>, NoSuchLevel> {
+        let levels = self.levels();
+        if !(1..=levels).contains(&level) {
+            return Err(NoSuchLevel { level, levels });
+        }
+        let behind_m = match level {
+            1 => 0.0,
+            _ => self.walls[usize::from(level) - 2].x_m,
+        };
+        let StartArea {
+            offset_m,
+            jitter_y_m,
+            jitter_z_m,
+        } = self.start;
+        Ok(Point3::new(
+            behind_m + offset_m,
+            rng.random_range(-jitter_y_m..=jitter_y_m),
+            self.corridor.height_m / 2.0 + rng.random_range(-jitter_z_m..=jitter_z_m),
+        ))
+    }
+
+    /// All surfaces of the course, from the inside.
+    #[must_use]
+    pub fn mesh(&self) -> Mesh {
+        Mesh::of(self)
+    }
+}
+
+impl Wall {
+    /// The wall's number, whatever its place in the order.
+    #[must_use]
+    pub fn label(&self) -> WallLabel {
+        self.label
+    }
+
+    /// The front face, which the drone meets first, metres along the corridor.
+    #[must_use]
+    pub fn x_m(&self) -> f32 {
+        self.x_m
+    }
+
+    /// The hole as it was described.
+    #[must_use]
+    pub fn opening(&self) -> &Opening {
+        &self.opening
+    }
+
+    /// The hole's corners `[y, z]` in metres, counter-clockwise with y to the right and z up.
+    #[must_use]
+    pub fn outline(&self) -> &[[f32; 2]] {
+        &self.outline
+    }
+
+    /// Where to fly through: the centre `[y, z]` of the widest circle inside the opening, metres.
+    #[must_use]
+    pub fn safe_point(&self) -> [f32; 2] {
+        self.safe_point
+    }
+
+    /// Radius of the widest circle inside the opening, metres.
+    #[must_use]
+    pub fn clearance_m(&self) -> f32 {
+        self.clearance_m
+    }
+}
+
+/// One wall of each kind of opening, for the tests of this crate.
+#[cfg(test)]
+pub(crate) fn test_course() -> Course {
+    let square = Shape::Rectangle {
+        width_m: 2.0,
+        height_m: 2.2,
+    };
+    let shapes = [
+        (square, [0.9, 2.4], 20.0),
+        (Shape::Circle { diameter_m: 2.2 }, [-1.2, 4.1], 0.0),
+        (
+            Shape::Cross {
+                width_m: 3.0,
+                height_m: 3.0,
+                arm_m: 1.4,
+            },
+            [0.6, 3.5],
+            45.0,
+        ),
+        (
+            Shape::L {
+                width_m: 3.0,
+                height_m: 3.0,
+                arm_m: 1.6,
+            },
+            [-0.4, 2.5],
+            0.0,
+        ),
+        (
+            Shape::Triangle {
+                width_m: 3.6,
+                height_m: 3.2,
+            },
+            [0.2, 4.0],
+            180.0,
+        ),
+    ];
+    let walls = shapes
+        .into_iter()
+        .zip(1u32..)
+        .map(|((shape, centre_m, rotation_deg), number)| WallLayout {
+            label: WallLabel(number),
+            x_m: 10.0 * number as f32,
+            opening: Opening {
+                shape,
+                centre_m,
+                rotation_deg,
+            },
+        })
+        .collect();
+    Course::new(CourseLayout {
+        name: "one of each".into(),
+        corridor: Corridor::default(),
+        start: StartArea::default(),
+        wall_thickness_m: 0.3,
+        walls,
+    })
+    .expect("the course of the tests can be flown")
+}
