@@ -1,1 +1,52 @@
-//! Pending.
+//! How far a run has come: one line of JSON on the learner's standard output for each report, for whoever watches it.
+
+use serde::{Deserialize, Serialize};
+
+/// A report of the learner.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Progress {
+    /// What the learner is about.
+    pub phase: Phase,
+    /// Training flights committed.
+    pub flights: u64,
+    /// Training flights in the whole run.
+    pub total_flights: u64,
+    /// Evaluation flights committed and to be flown in the present evaluation.
+    pub evaluation_flights: (u64, u64),
+    /// Environment steps committed.
+    pub steps: u64,
+    /// SAC updates done.
+    pub updates: u64,
+    /// VAE steps done.
+    pub vae_updates: u64,
+    /// Environment steps per second, over the last few seconds.
+    pub steps_per_sec: f64,
+    /// SAC updates per second, over the last few seconds.
+    pub updates_per_sec: f64,
+    /// Walls passed per flight, over the last 50 flights.
+    pub walls_passed: Option<f64>,
+    /// Sum of rewards per flight, over the last 50 flights.
+    pub mean_return: Option<f64>,
+    /// Temperature α, once there were updates.
+    pub temperature: Option<f64>,
+    /// VAE loss of the last epoch that trained it.
+    pub vae_loss: Option<f64>,
+    /// Actors that gave a sign of life.
+    pub actors: usize,
+    /// Seconds since the learner started.
+    pub elapsed_secs: f64,
+}
+
+/// What the learner is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Phase {
+    /// Waits for flights.
+    Flying,
+    /// Updates the networks.
+    Learning,
+    /// Confirms a candidate for the best snapshot, or evaluates it at the end.
+    Evaluating,
+    /// Writes what remains.
+    Finishing,
+}

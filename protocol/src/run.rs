@@ -1,1 +1,290 @@
-//! Pending.
+//! The directory of a run: who it is, and where everything in it lies.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use serde::{Deserialize, Serialize};
+
+use crate::PROTOCOL_VERSION;
+use crate::config::{Config, ConfigError};
+use crate::ids::{ActorId, RunId};
+
+/// Paths within a run's directory.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RunDirectory {
+    root: PathBuf,
+}
+
+macro_rules! paths {
+    ($($(#[$doc:meta])* $name:ident => $path:literal),* $(,)?) => {
+        $($(#[$doc])* pub fn $name(&self) -> PathBuf { self.root.join($path) })*
+    };
+}
+
+impl RunDirectory {
+    /// The run in `root`.
+    pub fn new(root: impl Into<PathBuf>) -> Self {
+        Self { root: root.into() }
+    }
+
+    /// The directory itself.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    paths! {
+        /// The resolved configuration.
+        config => "config.toml",
+        /// [`RunIdentity`].
+        identity => "run.json",
+        /// Copies of the course files, so that the directory is complete.
+        courses => "courses",
+        /// One log file a process.
+        logs => "logs",
+        /// One row per committed training flight.
+        flights_csv => "flights.csv",
+        /// TensorBoard event files.
+        tensorboard => "tensorboard",
+        /// `best.safetensors`, `latest.safetensors`.
+        snapshots => "snapshots",
+        /// The best snapshot.
+        best_snapshot => "snapshots/best.safetensors",
+        /// The newest snapshot.
+        latest_snapshot => "snapshots/latest.safetensors",
+        /// Everything needed to go on.
+        checkpoints => "checkpoints",
+        /// [`EvaluationReport`](crate::evaluation::EvaluationReport) of the best snapshot.
+        evaluation_json => "evaluation.json",
+        /// Where the evaluation flights flew: course,flight,step,x_m,y_m,z_m,outcome.
+        evaluation_paths_csv => "evaluation_paths.csv",
+        /// Depth images and their reconstructions: `depth` and `reconstruction`, u8 `[n, 72, 128]`.
+        reconstructions => "reconstructions.safetensors",
+        /// [`Summary`](crate::summary::Summary).
+        summary_json => "summary.json",
+        /// PNG files.
+        plots => "plots",
+    }
+
+    /// The learner's log file.
+    pub fn learner_log(&self) -> PathBuf {
+        self.logs().join("learner.log")
+    }
+
+    /// An actor's log file.
+    pub fn actor_log(&self, actor: ActorId) -> PathBuf {
+        self.logs().join(format!("actor-{actor}.log"))
+    }
+
+    /// Creates the directory with its folders and writes the resolved configuration and a new identity.
+    ///
+    /// # Errors
+    /// [`RunError`] names the path.
+    pub fn create(&self, config: &Config) -> Result<RunIdentity, RunError> {
+        let io = |path: PathBuf| move |source| RunError::Io { path, source };
+        for folder in [
+            self.logs(),
+            self.tensorboard(),
+            self.snapshots(),
+            self.checkpoints(),
+            self.plots(),
+        ] {
+            fs::create_dir_all(&folder).map_err(io(folder.clone()))?;
+        }
+        fs::write(self.config(), config.to_toml()).map_err(io(self.config()))?;
+        let resolved = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
+        let identity = RunIdentity::new(&resolved);
+        let json = serde_json::to_string_pretty(&identity).expect("an identity is plain data");
+        fs::write(self.identity(), json).map_err(io(self.identity()))?;
+        Ok(identity)
+    }
+
+    /// Reads identity and configuration of an existing run.
+    ///
+    /// # Errors
+    /// [`RunError`] names the file and what is wrong with it.
+    pub fn open(&self) -> Result<(RunIdentity, Config), RunError> {
+        let path = self.identity();
+        let text = fs::read_to_string(&path).map_err(|source| RunError::Io {
+            path: path.clone(),
+            source,
+        })?;
+        let identity: RunIdentity = serde_json::from_str(&text).map_err(|source| RunError::Identity {
+            path: path.clone(),
+            source,
+        })?;
+        if identity.protocol_version != PROTOCOL_VERSION {
+            return Err(RunError::OtherVersion {
+                path,
+                found: identity.protocol_version,
+            });
+        }
+        let config = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
+        if config.digest() != identity.config_digest {
+            return Err(RunError::ConfigChanged { path: self.config() });
+        }
+        Ok((identity, config))
+    }
+
+    /// Claims the lowest actor id whose log file does not exist yet, by creating that file.
+    ///
+    /// # Errors
+    /// [`RunError::Io`] names the log folder.
+    pub fn claim_actor(&self) -> Result<ActorId, RunError> {
+        for id in 0.. {
+            let path = self.actor_log(ActorId(id));
+            match fs::OpenOptions::new()
+                .write(true)
+                .create_new(true)
+                .open(&path)
+                .and_then(|mut file| file.flush())
+            {
+                Ok(()) => return Ok(ActorId(id)),
+                Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+                Err(source) => return Err(RunError::Io { path, source }),
+            }
+        }
+        unreachable!("the ids of four thousand million actors are taken")
+    }
+}
+
+/// Who a run is: what its processes need to find each other, and nobody else.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunIdentity {
+    /// [`PROTOCOL_VERSION`] of the program that started it.
+    pub protocol_version: u32,
+    /// The run.
+    pub run: RunId,
+    /// [`Config::digest`].
+    pub config_digest: u64,
+    /// Where iceoryx2 keeps this run's services; short, because a listener's socket below it may have no more than 108 characters.
+    pub transport_root: PathBuf,
+    /// First characters of every shared-memory segment of this run.
+    pub transport_prefix: String,
+}
+
+impl RunIdentity {
+    fn new(config: &Config) -> Self {
+        let nanos = SystemTime::now()
+            .duration_since(UNIX_EPOCH)
+            .map_or(0, |elapsed| elapsed.as_nanos() as u64);
+        let run = nanos ^ u64::from(std::process::id()).rotate_left(48);
+        Self {
+            protocol_version: PROTOCOL_VERSION,
+            run: RunId(run),
+            config_digest: config.digest(),
+            transport_root: PathBuf::from(format!("/tmp/skein-{run:016x}")),
+            transport_prefix: format!("skein_{run:016x}_"),
+        }
+    }
+
+    /// Removes what a run's processes may have left in shared memory and in the transport's folder. Only for when all of them are gone.
+    pub fn remove_transport(&self) {
+        let leftovers = fs::read_dir("/dev/shm")
+            .into_iter()
+            .flatten()
+            .flatten()
+            .filter(|entry| {
+                entry
+                    .file_name()
+                    .to_str()
+                    .is_some_and(|name| name.starts_with(&self.transport_prefix))
+            });
+        for entry in leftovers {
+            remove(entry.path(), fs::remove_file);
+        }
+        remove(self.transport_root.clone(), fs::remove_dir_all);
+    }
+}
+
+fn remove(path: PathBuf, how: fn(PathBuf) -> std::io::Result<()>) {
+    match how(path.clone()) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            tracing::warn!(path = %path.display(), %error, "leftover not removed");
+        }
+        _ => {}
+    }
+}
+
+/// Why a run's directory cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// A file or folder cannot be read or written.
+    #[error("{}: {source}; is this the directory of a run?", path.display())]
+    Io {
+        /// The path.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The identity file is damaged.
+    #[error("{} is not the identity of a run: {source}", path.display())]
+    Identity {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: serde_json::Error,
+    },
+    /// The run was started by a program of another version.
+    #[error("{}: the run speaks protocol version {found}, this program {PROTOCOL_VERSION}; use the program that started it", path.display())]
+    OtherVersion {
+        /// The identity file.
+        path: PathBuf,
+        /// Its version.
+        found: u32,
+    },
+    /// The configuration is not the one the run was started with.
+    #[error("{} was changed since the run was started; start a new run for another configuration", path.display())]
+    ConfigChanged {
+        /// The configuration file.
+        path: PathBuf,
+    },
+    /// The configuration cannot be used.
+    #[error(transparent)]
+    Config(ConfigError),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_created_run_opens_with_the_same_identity() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let identity = run.create(&Config::default()).unwrap();
+        let (opened, config) = run.open().unwrap();
+        assert_eq!(opened, identity);
+        assert_eq!(config.run, Config::default().run);
+    }
+
+    #[test]
+    fn a_changed_configuration_is_noticed() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        run.create(&Config::default()).unwrap();
+        let text = fs::read_to_string(run.config())
+            .unwrap()
+            .replace("seed = 1", "seed = 2");
+        fs::write(run.config(), text).unwrap();
+        assert!(matches!(run.open(), Err(RunError::ConfigChanged { .. })));
+    }
+
+    #[test]
+    fn no_two_actors_get_the_same_id() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        run.create(&Config::default()).unwrap();
+        assert_eq!(run.claim_actor().unwrap(), ActorId(0));
+        assert_eq!(run.claim_actor().unwrap(), ActorId(1));
+    }
+
+    #[test]
+    fn the_transport_root_leaves_room_for_socket_names() {
+        assert!(RunIdentity::new(&Config::default()).transport_root.as_os_str().len() <= 66);
+    }
+}

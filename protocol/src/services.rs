@@ -1,1 +1,710 @@
-//! Pending.
+//! The iceoryx2 services of a run: the only place that names or opens one, and sets every limit.
+//!
+//! | service | pattern | from → to | carries |
+//! |---|---|---|---|
+//! | `transitions` | publish-subscribe | actors → learner | [`TransitionRecord`], rendered into the loaned sample |
+//! | `status` | publish-subscribe | actors → learner | [`StatusRecord`] |
+//! | `control` | publish-subscribe | learner → actors | [`ControlRecord`]: tickets, signs of life, the stop |
+//! | `weights` | publish-subscribe | learner → actors | snapshots' bytes behind a [`SnapshotHeader`] |
+//! | `wake-learner`, `wake-actors` | event | both | that there is something to read |
+//!
+//! Nothing here blocks and nothing here is trusted to arrive: iceoryx2 loses samples silently when a peer dies or has not connected yet. Tickets bound
+//! what is in flight, so no buffer can overflow; a flight with a hole is discarded and its ticket issued again; every wait has a deadline.
+//!
+//! Services carry protocol version, run, configuration and snapshot layout as attributes: a process that differs in one of them is refused on opening.
+
+use std::fmt::Debug;
+use std::time::Duration;
+
+use iceoryx2::config::Config as IceoryxConfig;
+use iceoryx2::node::Node;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::*;
+use iceoryx2::service::port_factory::event;
+
+use crate::PROTOCOL_VERSION;
+use crate::config::Config;
+use crate::ids::RunId;
+use crate::run::RunIdentity;
+use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
+use crate::status::StatusRecord;
+use crate::ticket::ControlRecord;
+use crate::transition::TransitionRecord;
+
+type Ipc = ipc::Service;
+/// A transition record in shared memory, being written.
+pub type LoanedTransition = iceoryx2::sample_mut::SampleMut<Ipc, TransitionRecord, ()>;
+/// A transition record in shared memory, received.
+pub type ReceivedTransition = iceoryx2::sample::Sample<Ipc, TransitionRecord, ()>;
+
+/// Samples an actor loans at one time: the record being completed and the next one, whose image its reward needs.
+const LOANED_RECORDS: usize = 2;
+/// Records the learner holds while it looks at them.
+const BORROWED_RECORDS: usize = 2;
+/// Snapshots a late joiner still gets: with policy lag 1 two versions are in use, and an evaluation adds a third.
+const SNAPSHOT_HISTORY: usize = 4;
+/// Snapshots that exist at once in shared memory: the history, one being written, and those that slow readers still hold.
+const SNAPSHOT_SLOTS: usize = 8;
+
+/// The learner's ends.
+#[derive(Debug)]
+pub struct LearnerPorts {
+    run: RunId,
+    layout: SnapshotLayout,
+    transitions: Subscriber<Ipc, TransitionRecord, ()>,
+    status: Subscriber<Ipc, StatusRecord, ()>,
+    control: Publisher<Ipc, ControlRecord, ()>,
+    weights: Publisher<Ipc, [u8], SnapshotHeader>,
+    wake: Listener<Ipc>,
+    wake_actors: Notifier<Ipc>,
+    node: Node<Ipc>,
+}
+
+/// An actor's ends.
+#[derive(Debug)]
+pub struct ActorPorts {
+    run: RunId,
+    layout: SnapshotLayout,
+    transitions: Publisher<Ipc, TransitionRecord, ()>,
+    status: Publisher<Ipc, StatusRecord, ()>,
+    control: Subscriber<Ipc, ControlRecord, ()>,
+    weights: Subscriber<Ipc, [u8], SnapshotHeader>,
+    wake: Listener<Ipc>,
+    wake_learner: Notifier<Ipc>,
+    // Held so that the node outlives its ports and is seen as alive.
+    _node: Node<Ipc>,
+}
+
+/// What a service could not do.
+#[derive(Debug, thiserror::Error)]
+#[error("{operation} of service `{service}` failed: {cause}{remedy}")]
+pub struct ServiceError {
+    /// The service.
+    pub service: &'static str,
+    /// What was tried.
+    pub operation: &'static str,
+    /// iceoryx2's word for it.
+    pub cause: String,
+    /// What to do about it.
+    pub remedy: &'static str,
+}
+
+fn failed<E: Debug>(service: &'static str, operation: &'static str) -> impl FnOnce(E) -> ServiceError {
+    move |error| {
+        let cause = format!("{error:?}");
+        let remedy = if cause.contains("IncompatibleAttributes") || cause.contains("IncompatibleTypes") {
+            "; this process and the run differ in program version or configuration: start it from the same build and run directory"
+        } else if cause.contains("ExceedsMax") {
+            "; no slot is free: raise transport.max_actors, or end the other learner of this run"
+        } else if cause.contains("InsufficientPermissions") {
+            "; the run belongs to another user"
+        } else {
+            ""
+        };
+        ServiceError {
+            service,
+            operation,
+            cause,
+            remedy,
+        }
+    }
+}
+
+/// Opens services of one run with the limits its configuration asks for.
+struct Opener<'a> {
+    node: &'a Node<Ipc>,
+    attributes: AttributeVerifier,
+    actors: usize,
+}
+
+impl<'a> Opener<'a> {
+    fn new(node: &'a Node<Ipc>, identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
+        let layout = SnapshotLayout::of(config).digest();
+        let mut attributes = AttributeVerifier::new();
+        for (key, value) in [
+            ("protocol", PROTOCOL_VERSION.to_string()),
+            ("run", format!("{:016x}", identity.run.0)),
+            ("config", format!("{:016x}", identity.config_digest)),
+            ("snapshot-layout", format!("{layout:016x}")),
+        ] {
+            let key = key.try_into().map_err(failed("all", "naming an attribute"))?;
+            let value = value
+                .as_str()
+                .try_into()
+                .map_err(failed("all", "setting an attribute"))?;
+            attributes = attributes
+                .require(&key, &value)
+                .map_err(failed("all", "setting an attribute"))?;
+        }
+        // A restarted actor may come before its dead predecessor's slots are reclaimed.
+        Ok(Self {
+            node,
+            attributes,
+            actors: 2 * config.transport.max_actors,
+        })
+    }
+
+    fn nodes(&self) -> usize {
+        self.actors + 2
+    }
+
+    fn transitions(
+        &self,
+        config: &Config,
+    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, TransitionRecord, ()>, ServiceError>
+    {
+        self.node
+            .service_builder(&service_name("transitions")?)
+            .publish_subscribe::<TransitionRecord>()
+            .payload_alignment(Alignment::new(64).expect("64 is a power of two"))
+            .max_publishers(self.actors)
+            .max_subscribers(1)
+            .max_nodes(self.nodes())
+            // Every flight an actor holds a ticket for fits whole, so a record is never refused for want of room.
+            .subscriber_max_buffer_size(config.transport.max_records_per_flight * config.transport.tickets_per_actor)
+            .subscriber_max_borrowed_samples(BORROWED_RECORDS)
+            .history_size(0)
+            .enable_safe_overflow(false)
+            .open_or_create_with_attributes(&self.attributes)
+            .map_err(failed("transitions", "opening"))
+    }
+
+    fn status(
+        &self,
+    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, StatusRecord, ()>, ServiceError>
+    {
+        self.node
+            .service_builder(&service_name("status")?)
+            .publish_subscribe::<StatusRecord>()
+            .max_publishers(self.actors)
+            .max_subscribers(1)
+            .max_nodes(self.nodes())
+            .subscriber_max_buffer_size(8)
+            .subscriber_max_borrowed_samples(1)
+            // A late joiner of a learner, or a restarted one, hears of its actors at once.
+            .history_size(1)
+            // Only the newest signs of life matter.
+            .enable_safe_overflow(true)
+            .open_or_create_with_attributes(&self.attributes)
+            .map_err(failed("status", "opening"))
+    }
+
+    fn control(
+        &self,
+        config: &Config,
+    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, ControlRecord, ()>, ServiceError>
+    {
+        self.node
+            .service_builder(&service_name("control")?)
+            .publish_subscribe::<ControlRecord>()
+            .max_publishers(1)
+            .max_subscribers(self.actors)
+            .max_nodes(self.nodes())
+            // All tickets pass by every actor: room for everyone's while this one flies.
+            .subscriber_max_buffer_size(4 * config.transport.max_actors * config.transport.tickets_per_actor + 64)
+            .subscriber_max_borrowed_samples(1)
+            .history_size(0)
+            .enable_safe_overflow(false)
+            .open_or_create_with_attributes(&self.attributes)
+            .map_err(failed("control", "opening"))
+    }
+
+    fn weights(
+        &self,
+    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, [u8], SnapshotHeader>, ServiceError>
+    {
+        self.node
+            .service_builder(&service_name("weights")?)
+            .publish_subscribe::<[u8]>()
+            .user_header::<SnapshotHeader>()
+            .payload_alignment(Alignment::new(64).expect("64 is a power of two"))
+            .max_publishers(1)
+            .max_subscribers(self.actors)
+            .max_nodes(self.nodes())
+            .subscriber_max_buffer_size(SNAPSHOT_HISTORY)
+            .subscriber_max_borrowed_samples(1)
+            .history_size(SNAPSHOT_HISTORY)
+            // The newest snapshots win.
+            .enable_safe_overflow(true)
+            .open_or_create_with_attributes(&self.attributes)
+            .map_err(failed("weights", "opening"))
+    }
+
+    fn event(
+        &self,
+        name: &'static str,
+        notifiers: usize,
+        listeners: usize,
+    ) -> Result<event::PortFactory<Ipc>, ServiceError> {
+        self.node
+            .service_builder(&service_name(name)?)
+            .event()
+            .max_notifiers(notifiers)
+            .max_listeners(listeners)
+            .max_nodes(self.nodes())
+            .event_id_max_value(1)
+            .open_or_create_with_attributes(&self.attributes)
+            .map_err(failed(name, "opening"))
+    }
+}
+
+fn service_name(name: &'static str) -> Result<ServiceName, ServiceError> {
+    name.try_into().map_err(failed(name, "naming"))
+}
+
+fn node(identity: &RunIdentity, name: &str) -> Result<Node<Ipc>, ServiceError> {
+    // Everything iceoryx2 would print goes wrong again, with our words, in the errors returned here.
+    set_log_level(LogLevel::Fatal);
+    let mut config = IceoryxConfig::default();
+    let root = identity.transport_root.to_string_lossy();
+    config
+        .global
+        .set_root_path(&Path::new(root.as_bytes()).map_err(failed("all", "setting the root path"))?);
+    config.global.prefix =
+        FileName::new(identity.transport_prefix.as_bytes()).map_err(failed("all", "setting the prefix"))?;
+    NodeBuilder::new()
+        .name(&NodeName::new(name).map_err(failed("all", "naming the node"))?)
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .config(&config)
+        .create::<Ipc>()
+        .map_err(failed("all", "creating the node"))
+}
+
+impl LearnerPorts {
+    /// Opens the learner's ends of every service, on the thread that will use them.
+    ///
+    /// # Errors
+    /// [`ServiceError`] says which service and what differs; a second learner of one run is refused.
+    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
+        let node = node(identity, "learner")?;
+        let open = Opener::new(&node, identity, config)?;
+        let layout = SnapshotLayout::of(config);
+        let weights_factory = open.weights()?;
+        Ok(Self {
+            run: identity.run,
+            transitions: open
+                .transitions(config)?
+                .subscriber_builder()
+                .create()
+                .map_err(failed("transitions", "subscribing"))?,
+            status: open
+                .status()?
+                .subscriber_builder()
+                .create()
+                .map_err(failed("status", "subscribing"))?,
+            control: open
+                .control(config)?
+                .publisher_builder()
+                .max_loaned_samples(1)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+                .map_err(failed("control", "publishing"))?,
+            weights: weights_factory
+                .publisher_builder()
+                .initial_max_slice_len(layout.values() * size_of::<f32>())
+                .allocation_strategy(AllocationStrategy::Static)
+                .max_loaned_samples(1)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .override_sample_preallocation(|worst_case| worst_case.min(SNAPSHOT_SLOTS))
+                .create()
+                .map_err(failed("weights", "publishing"))?,
+            wake: open
+                .event("wake-learner", open.actors, 1)?
+                .listener_builder()
+                .create()
+                .map_err(failed("wake-learner", "listening"))?,
+            wake_actors: open
+                .event("wake-actors", 1, open.actors)?
+                .notifier_builder()
+                .create()
+                .map_err(failed("wake-actors", "notifying"))?,
+            layout,
+            node,
+        })
+    }
+
+    /// Waits until an actor has something to say, or `timeout` has passed.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the wait itself fails.
+    pub fn wait(&self, timeout: Duration) -> Result<(), ServiceError> {
+        self.wake
+            .timed_wait(|_| {}, timeout)
+            .map(drop)
+            .map_err(failed("wake-learner", "waiting"))
+    }
+
+    /// The next transition record, if one has arrived.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when an actor's memory cannot be mapped.
+    pub fn receive_transition(&self) -> Result<Option<ReceivedTransition>, ServiceError> {
+        self.transitions.receive().map_err(failed("transitions", "receiving"))
+    }
+
+    /// The next status record, if one has arrived.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when an actor's memory cannot be mapped.
+    pub fn receive_status(&self) -> Result<Option<StatusRecord>, ServiceError> {
+        let sample = self.status.receive().map_err(failed("status", "receiving"))?;
+        Ok(sample.map(|sample| *sample))
+    }
+
+    /// Sends `record` to the actors connected now; a lost one is made good by the ticket's deadline.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when there is no memory to send it in.
+    pub fn send_control(&self, record: ControlRecord) -> Result<(), ServiceError> {
+        self.control
+            .send_copy(record)
+            .map(drop)
+            .map_err(failed("control", "sending"))
+    }
+
+    /// Copies `snapshot` into shared memory once; every actor reads it there.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when there is no memory to send it in.
+    pub fn publish(&self, snapshot: &Snapshot) -> Result<(), ServiceError> {
+        let bytes: &[u8] = bytemuck::cast_slice(&snapshot.values);
+        let mut sample = self
+            .weights
+            .loan_slice_uninit(bytes.len())
+            .map_err(failed("weights", "loaning"))?;
+        *sample.user_header_mut() = snapshot.header(self.run, &self.layout);
+        sample
+            .write_from_slice(bytes)
+            .send()
+            .map(drop)
+            .map_err(failed("weights", "sending"))
+    }
+
+    /// Wakes all actors that wait.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the event cannot be raised.
+    pub fn wake_actors(&self) -> Result<(), ServiceError> {
+        self.wake_actors
+            .notify()
+            .map(drop)
+            .map_err(failed("wake-actors", "notifying"))
+    }
+
+    /// Connects to actors that have come, hands late joiners the newest snapshots, and reclaims what dead processes held. To be called regularly.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when a peer's memory cannot be mapped.
+    pub fn maintain(&self) -> Result<(), ServiceError> {
+        self.transitions
+            .update_connections()
+            .map_err(failed("transitions", "connecting"))?;
+        self.status
+            .update_connections()
+            .map_err(failed("status", "connecting"))?;
+        self.weights
+            .update_connections()
+            .map_err(failed("weights", "connecting"))?;
+        self.control
+            .update_connections()
+            .map_err(failed("control", "connecting"))?;
+        self.node.try_cleanup_dead_nodes();
+        Ok(())
+    }
+}
+
+impl ActorPorts {
+    /// Opens an actor's ends of every service, on the thread that will use them.
+    ///
+    /// # Errors
+    /// [`ServiceError`] says which service and what differs.
+    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
+        let node = node(identity, "actor")?;
+        let open = Opener::new(&node, identity, config)?;
+        Ok(Self {
+            run: identity.run,
+            layout: SnapshotLayout::of(config),
+            transitions: open
+                .transitions(config)?
+                .publisher_builder()
+                .max_loaned_samples(LOANED_RECORDS)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+                .map_err(failed("transitions", "publishing"))?,
+            status: open
+                .status()?
+                .publisher_builder()
+                .max_loaned_samples(1)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+                .map_err(failed("status", "publishing"))?,
+            control: open
+                .control(config)?
+                .subscriber_builder()
+                .create()
+                .map_err(failed("control", "subscribing"))?,
+            weights: open
+                .weights()?
+                .subscriber_builder()
+                .create()
+                .map_err(failed("weights", "subscribing"))?,
+            wake: open
+                .event("wake-actors", 1, open.actors)?
+                .listener_builder()
+                .create()
+                .map_err(failed("wake-actors", "listening"))?,
+            wake_learner: open
+                .event("wake-learner", open.actors, 1)?
+                .notifier_builder()
+                .create()
+                .map_err(failed("wake-learner", "notifying"))?,
+            _node: node,
+        })
+    }
+
+    /// The run.
+    pub fn run(&self) -> RunId {
+        self.run
+    }
+
+    /// Waits until the learner has something to say, or `timeout` has passed.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the wait itself fails.
+    pub fn wait(&self, timeout: Duration) -> Result<(), ServiceError> {
+        self.wake
+            .timed_wait(|_| {}, timeout)
+            .map(drop)
+            .map_err(failed("wake-actors", "waiting"))
+    }
+
+    /// A record in shared memory, to be written in place. It holds whatever was in that memory before.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the learner holds all of this actor's memory, which tickets rule out.
+    pub fn loan_transition(&self) -> Result<LoanedTransition, ServiceError> {
+        let sample = self
+            .transitions
+            .loan_uninit()
+            .map_err(failed("transitions", "loaning"))?;
+        // SAFETY: the record is plain data, for which every bit pattern is valid, and the memory is a shared mapping that the operating system
+        // and iceoryx2 have initialised with zeros.
+        Ok(unsafe { sample.assume_init() })
+    }
+
+    /// Sends a record without a copy. That it arrives is not promised: the learner counts.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the connection is broken.
+    pub fn send_transition(&self, record: LoanedTransition) -> Result<(), ServiceError> {
+        record.send().map(drop).map_err(failed("transitions", "sending"))
+    }
+
+    /// Sends a sign of life.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when there is no memory to send it in.
+    pub fn send_status(&self, record: StatusRecord) -> Result<(), ServiceError> {
+        self.status
+            .send_copy(record)
+            .map(drop)
+            .map_err(failed("status", "sending"))
+    }
+
+    /// The next control record, if one has arrived.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the learner's memory cannot be mapped.
+    pub fn receive_control(&self) -> Result<Option<ControlRecord>, ServiceError> {
+        let sample = self.control.receive().map_err(failed("control", "receiving"))?;
+        Ok(sample.map(|sample| *sample))
+    }
+
+    /// The next snapshot, if one has arrived; the inner result says whether it can be flown.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the learner's memory cannot be mapped.
+    pub fn receive_snapshot(&self) -> Result<Option<Result<Snapshot, crate::snapshot::SnapshotError>>, ServiceError> {
+        let sample = self.weights.receive().map_err(failed("weights", "receiving"))?;
+        Ok(sample.map(|sample| Snapshot::receive(sample.user_header(), sample.payload(), self.run, &self.layout)))
+    }
+
+    /// Wakes the learner.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the event cannot be raised.
+    pub fn wake_learner(&self) -> Result<(), ServiceError> {
+        self.wake_learner
+            .notify()
+            .map(drop)
+            .map_err(failed("wake-learner", "notifying"))
+    }
+
+    /// Connects to a learner that has come. To be called regularly.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the learner's memory cannot be mapped.
+    pub fn maintain(&self) -> Result<(), ServiceError> {
+        self.control
+            .update_connections()
+            .map_err(failed("control", "connecting"))?;
+        self.weights
+            .update_connections()
+            .map_err(failed("weights", "connecting"))?;
+        self.transitions
+            .update_connections()
+            .map_err(failed("transitions", "connecting"))?;
+        self.status.update_connections().map_err(failed("status", "connecting"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion};
+    use crate::run::RunDirectory;
+    use crate::ticket::{CourseChoice, Exploration, Ticket};
+
+    struct Run {
+        identity: RunIdentity,
+        config: Config,
+        _directory: tempfile::TempDir,
+    }
+
+    impl Run {
+        fn new() -> Self {
+            let directory = tempfile::tempdir().unwrap();
+            let run = RunDirectory::new(directory.path());
+            let mut config = Config::default();
+            config.transport.max_actors = 2;
+            config.sac.hidden_width = 8;
+            run.create(&config).unwrap();
+            let (identity, config) = run.open().unwrap();
+            Self {
+                identity,
+                config,
+                _directory: directory,
+            }
+        }
+
+        fn learner(&self) -> Result<LearnerPorts, ServiceError> {
+            LearnerPorts::open(&self.identity, &self.config)
+        }
+
+        fn actor(&self) -> Result<ActorPorts, ServiceError> {
+            ActorPorts::open(&self.identity, &self.config)
+        }
+    }
+
+    impl Drop for Run {
+        fn drop(&mut self) {
+            self.identity.remove_transport();
+        }
+    }
+
+    fn ticket(run: RunId) -> Ticket {
+        Ticket {
+            run,
+            flight: FlightId(1),
+            attempt: Attempt(0),
+            policy_version: PolicyVersion(0),
+            course: CourseChoice::Training,
+            start_level: 1,
+            exploration: Exploration::Uniform,
+            seed: 7,
+        }
+    }
+
+    #[test]
+    fn the_image_written_into_the_loan_is_the_image_received() {
+        let run = Run::new();
+        let (learner, actor) = (run.learner().unwrap(), run.actor().unwrap());
+        learner.maintain().unwrap();
+        let ticket = ticket(run.identity.run);
+        let mut record = actor.loan_transition().unwrap();
+        record.begin(&ticket, ActorId(0), Incarnation(1), 0);
+        record
+            .depth
+            .iter_mut()
+            .enumerate()
+            .for_each(|(index, pixel)| *pixel = index as u8);
+        assert_eq!(
+            record.depth.as_ptr() as usize % 64,
+            0,
+            "the image starts on a cache line"
+        );
+        actor.send_transition(record).unwrap();
+        actor.wake_learner().unwrap();
+        learner.wait(Duration::from_secs(1)).unwrap();
+        let received = learner.receive_transition().unwrap().unwrap();
+        received.check(&ticket, ActorId(0), Incarnation(1), 0).unwrap();
+        assert!(
+            received
+                .depth
+                .iter()
+                .enumerate()
+                .all(|(index, pixel)| *pixel == index as u8)
+        );
+    }
+
+    #[test]
+    fn a_late_actor_gets_the_newest_snapshots() {
+        let run = Run::new();
+        let learner = run.learner().unwrap();
+        let values = SnapshotLayout::of(&run.config).values();
+        for version in 0..7 {
+            let snapshot = Snapshot {
+                version: PolicyVersion(version),
+                values: vec![version as f32; values],
+            };
+            learner.publish(&snapshot).unwrap();
+        }
+        let actor = run.actor().unwrap();
+        learner.maintain().unwrap();
+        let mut versions = Vec::new();
+        while let Some(snapshot) = actor.receive_snapshot().unwrap() {
+            versions.push(snapshot.unwrap().version.0);
+        }
+        assert_eq!(versions, [3, 4, 5, 6]);
+    }
+
+    #[test]
+    fn the_largest_flight_of_every_ticket_fits_unread() {
+        let run = Run::new();
+        let (learner, actor) = (run.learner().unwrap(), run.actor().unwrap());
+        learner.maintain().unwrap();
+        let records = run.config.transport.max_records_per_flight * run.config.transport.tickets_per_actor;
+        for step in 0..records {
+            let mut record = actor.loan_transition().unwrap();
+            record.begin(&ticket(run.identity.run), ActorId(0), Incarnation(1), step as u32);
+            actor.send_transition(record).unwrap();
+        }
+        for step in 0..records {
+            assert_eq!(learner.receive_transition().unwrap().unwrap().step, step as u32);
+        }
+    }
+
+    #[test]
+    fn a_second_learner_is_refused() {
+        let run = Run::new();
+        let _first = run.learner().unwrap();
+        let refusal = run.learner().unwrap_err().to_string();
+        assert!(refusal.contains("the other learner of this run"), "{refusal}");
+    }
+
+    #[test]
+    fn an_actor_of_another_configuration_is_refused() {
+        let mut run = Run::new();
+        let _learner = run.learner().unwrap();
+        run.identity.config_digest ^= 1;
+        let refusal = run.actor().unwrap_err().to_string();
+        assert!(
+            refusal.contains("differ in program version or configuration"),
+            "{refusal}"
+        );
+    }
+}

@@ -1,1 +1,450 @@
-//! Pending.
+//! The policy snapshot: what an actor needs to fly, as one range of bytes.
+//!
+//! A snapshot is the encoder's and the policy's parameters, back to back, f32 little-endian, in the order of [`SnapshotLayout`]. It travels over shared
+//! memory behind a [`SnapshotHeader`], and lies on disk as safetensors with the run's configuration in its metadata, so that a file alone can be flown.
+
+use std::collections::HashMap;
+use std::fs;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use iceoryx2::prelude::ZeroCopySend;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use sha2::{Digest, Sha256};
+use xxhash_rust::xxh3::xxh3_64;
+
+use crate::config::Config;
+use crate::ids::{PolicyVersion, RunId};
+use crate::{ACTION, LATENT};
+
+/// Channels of the encoder's four 4×4 convolutions of stride 2; the first is the image's (paper, section 3.3; widths as in arXiv:1803.10122).
+pub const ENCODER_CHANNELS: [usize; 5] = [1, 32, 64, 128, 256];
+/// Width and height of the encoder's kernels.
+pub const ENCODER_KERNEL: usize = 4;
+/// Length of the last convolution's output: 256 channels of 2×6.
+pub const ENCODER_FEATURES: usize = 3072;
+/// Fully connected layers of the policy (paper, section 3.4).
+pub const POLICY_LAYERS: usize = 4;
+
+/// One parameter tensor within a snapshot.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TensorSpec {
+    /// `part.layer.kind`, e.g. `encoder.conv1.weight`.
+    pub name: String,
+    /// PyTorch's convention: `[out, in, height, width]`, `[out, in]` or `[out]`.
+    pub shape: Vec<usize>,
+    /// Where its f32 values lie, counted in values.
+    pub range: Range<usize>,
+}
+
+/// Which tensors a snapshot holds, and where.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SnapshotLayout {
+    tensors: Vec<TensorSpec>,
+    encoder_values: usize,
+}
+
+impl SnapshotLayout {
+    /// The layout for policies that see `observation` values and have hidden layers of `hidden_width`.
+    pub fn new(observation: usize, hidden_width: usize) -> Self {
+        let mut layout = Self {
+            tensors: Vec::new(),
+            encoder_values: 0,
+        };
+        for (index, pair) in ENCODER_CHANNELS.windows(2).enumerate() {
+            let shape = [pair[1], pair[0], ENCODER_KERNEL, ENCODER_KERNEL];
+            layout.push_layer(&format!("encoder.conv{}", index + 1), &shape);
+        }
+        layout.push_layer("encoder.mean", &[LATENT, ENCODER_FEATURES]);
+        layout.encoder_values = layout.values();
+        let widths = [observation, hidden_width, hidden_width, hidden_width, 2 * ACTION];
+        for (index, pair) in widths.windows(2).enumerate() {
+            layout.push_layer(&format!("policy.layer{}", index + 1), &[pair[1], pair[0]]);
+        }
+        layout
+    }
+
+    /// The layout a configuration asks for.
+    pub fn of(config: &Config) -> Self {
+        Self::new(config.learning.observation.len(), config.sac.hidden_width)
+    }
+
+    fn push_layer(&mut self, name: &str, weight: &[usize]) {
+        self.push(format!("{name}.weight"), weight);
+        self.push(format!("{name}.bias"), &weight[..1]);
+    }
+
+    fn push(&mut self, name: String, shape: &[usize]) {
+        let start = self.values();
+        self.tensors.push(TensorSpec {
+            name,
+            shape: shape.to_vec(),
+            range: start..start + shape.iter().product::<usize>(),
+        });
+    }
+
+    /// The tensors in order.
+    pub fn tensors(&self) -> &[TensorSpec] {
+        &self.tensors
+    }
+
+    /// The tensor of this name.
+    pub fn tensor(&self, name: &str) -> Option<&TensorSpec> {
+        self.tensors.iter().find(|tensor| tensor.name == name)
+    }
+
+    /// Values in a snapshot.
+    pub fn values(&self) -> usize {
+        self.tensors.last().map_or(0, |tensor| tensor.range.end)
+    }
+
+    /// Where the encoder's values lie: before the policy's.
+    pub fn encoder(&self) -> Range<usize> {
+        0..self.encoder_values
+    }
+
+    /// Where the policy's values lie.
+    pub fn policy(&self) -> Range<usize> {
+        self.encoder_values..self.values()
+    }
+
+    /// Fingerprint of names and shapes, compared by both ends of the weights service.
+    pub fn digest(&self) -> u64 {
+        let text: Vec<String> = self
+            .tensors
+            .iter()
+            .map(|t| format!("{}{:?}", t.name, t.shape))
+            .collect();
+        xxh3_64(text.join(";").as_bytes())
+    }
+}
+
+/// What precedes a snapshot's values in shared memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
+#[repr(C)]
+#[type_name("skein.SnapshotHeader.v1")]
+pub struct SnapshotHeader {
+    /// The run.
+    pub run: u64,
+    /// The version.
+    pub policy_version: u64,
+    /// [`SnapshotLayout::digest`].
+    pub layout: u64,
+    /// xxh3 of the values' bytes.
+    pub checksum: u64,
+}
+
+// Four 8-byte fields: no padding.
+const _: () = assert!(size_of::<SnapshotHeader>() == 4 * 8);
+
+/// A frozen policy: the parameters of encoder and policy.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Snapshot {
+    /// Its number.
+    pub version: PolicyVersion,
+    /// The parameters in the order of the layout.
+    pub values: Vec<f32>,
+}
+
+/// Why a snapshot is not flown.
+#[derive(Debug, thiserror::Error)]
+pub enum SnapshotError {
+    /// It belongs to another run.
+    #[error("the snapshot belongs to run {found:016x}, not to {expected:016x}")]
+    OtherRun {
+        /// Its run.
+        found: u64,
+        /// Ours.
+        expected: u64,
+    },
+    /// Its tensors are not ours.
+    #[error("the snapshot has another layout: sac.hidden_width or learning.observation differ")]
+    OtherLayout,
+    /// Its length is not that of the layout.
+    #[error("the snapshot has {found} bytes where its layout has {expected}")]
+    Length {
+        /// Its length.
+        found: usize,
+        /// The layout's.
+        expected: usize,
+    },
+    /// Its bytes are damaged.
+    #[error("the snapshot's checksum does not match its bytes")]
+    Damaged,
+    /// A parameter is not a number.
+    #[error("the snapshot's tensor {tensor} holds a value that is not finite")]
+    NotFinite {
+        /// The tensor.
+        tensor: String,
+    },
+    /// The file cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The file is no snapshot of ours.
+    #[error("{} is not a snapshot of this version: {problem}", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+}
+
+impl Snapshot {
+    /// The header that goes before the values.
+    pub fn header(&self, run: RunId, layout: &SnapshotLayout) -> SnapshotHeader {
+        SnapshotHeader {
+            run: run.0,
+            policy_version: self.version.0,
+            layout: layout.digest(),
+            checksum: xxh3_64(bytemuck::cast_slice(&self.values)),
+        }
+    }
+
+    /// Reads a snapshot out of shared memory.
+    ///
+    /// # Errors
+    /// [`SnapshotError`] when it is of another run or layout, or damaged.
+    pub fn receive(
+        header: &SnapshotHeader,
+        bytes: &[u8],
+        run: RunId,
+        layout: &SnapshotLayout,
+    ) -> Result<Self, SnapshotError> {
+        if header.run != run.0 {
+            return Err(SnapshotError::OtherRun {
+                found: header.run,
+                expected: run.0,
+            });
+        }
+        if header.layout != layout.digest() {
+            return Err(SnapshotError::OtherLayout);
+        }
+        let expected = layout.values() * size_of::<f32>();
+        if bytes.len() != expected {
+            return Err(SnapshotError::Length {
+                found: bytes.len(),
+                expected,
+            });
+        }
+        if xxh3_64(bytes) != header.checksum {
+            return Err(SnapshotError::Damaged);
+        }
+        let snapshot = Self {
+            version: PolicyVersion(header.policy_version),
+            values: values_of(bytes),
+        };
+        snapshot.check_finite(layout)?;
+        Ok(snapshot)
+    }
+
+    fn check_finite(&self, layout: &SnapshotLayout) -> Result<(), SnapshotError> {
+        let broken = |tensor: &&TensorSpec| self.values[tensor.range.clone()].iter().any(|value| !value.is_finite());
+        match layout.tensors().iter().find(broken) {
+            Some(tensor) => Err(SnapshotError::NotFinite {
+                tensor: tensor.name.clone(),
+            }),
+            None => Ok(()),
+        }
+    }
+
+    /// SHA-256 of the parameters' bytes, in hexadecimal: equal exactly when two policies are bit-equal.
+    pub fn sha256(&self) -> String {
+        let digest = Sha256::digest(bytemuck::cast_slice::<f32, u8>(&self.values));
+        digest.iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    /// Writes the snapshot as safetensors, with `config` in its metadata; in place at once, or not at all.
+    ///
+    /// # Errors
+    /// [`SnapshotError::Io`] names the file.
+    pub fn save(&self, path: &Path, layout: &SnapshotLayout, config: &Config) -> Result<(), SnapshotError> {
+        let bytes: &[u8] = bytemuck::cast_slice(&self.values);
+        let views = layout.tensors().iter().map(|tensor| {
+            let range = tensor.range.start * size_of::<f32>()..tensor.range.end * size_of::<f32>();
+            let view = TensorView::new(Dtype::F32, tensor.shape.clone(), &bytes[range])
+                .expect("a tensor's range is as long as its shape says");
+            (tensor.name.clone(), view)
+        });
+        let metadata = HashMap::from([
+            (FORMAT_KEY.to_owned(), FORMAT.to_owned()),
+            (VERSION_KEY.to_owned(), self.version.to_string()),
+            (CONFIG_KEY.to_owned(), config.to_toml()),
+        ]);
+        let file = safetensors::serialize(views, Some(metadata)).map_err(|error| SnapshotError::Format {
+            path: path.to_owned(),
+            problem: error.to_string(),
+        })?;
+        let io = |source| SnapshotError::Io {
+            path: path.to_owned(),
+            source,
+        };
+        let aside = path.with_extension("tmp");
+        fs::write(&aside, file).map_err(io)?;
+        fs::rename(&aside, path).map_err(io)
+    }
+
+    /// Reads a snapshot file and the configuration it was trained with.
+    ///
+    /// # Errors
+    /// [`SnapshotError`] names the file and what is wrong with it.
+    pub fn load(path: &Path) -> Result<(Self, Config), SnapshotError> {
+        let bytes = fs::read(path).map_err(|source| SnapshotError::Io {
+            path: path.to_owned(),
+            source,
+        })?;
+        parse_file(&bytes).map_err(|problem| SnapshotError::Format {
+            path: path.to_owned(),
+            problem,
+        })
+    }
+}
+
+const FORMAT_KEY: &str = "skein.format";
+const FORMAT: &str = "policy-snapshot-1";
+const VERSION_KEY: &str = "skein.policy_version";
+const CONFIG_KEY: &str = "skein.config";
+
+fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
+    let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| error.to_string())?;
+    let metadata = metadata.metadata().as_ref().ok_or("it has no metadata")?;
+    let value = |key: &str| metadata.get(key).ok_or(format!("its metadata has no {key}"));
+    if value(FORMAT_KEY)? != FORMAT {
+        return Err(format!("its format is {}, not {FORMAT}", value(FORMAT_KEY)?));
+    }
+    let version = value(VERSION_KEY)?
+        .parse()
+        .map_err(|_| format!("its {VERSION_KEY} is not a number"))?;
+    let config: Config = toml::from_str(value(CONFIG_KEY)?).map_err(|error| format!("its configuration: {error}"))?;
+    config
+        .validate()
+        .map_err(|error| format!("its configuration: {error}"))?;
+    let file = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
+    let layout = SnapshotLayout::of(&config);
+    let mut values = Vec::with_capacity(layout.values());
+    for tensor in layout.tensors() {
+        let view = file.tensor(&tensor.name).map_err(|error| error.to_string())?;
+        if view.dtype() != Dtype::F32 || view.shape() != tensor.shape {
+            return Err(format!(
+                "{} is {:?} {:?}, not F32 {:?}",
+                tensor.name,
+                view.dtype(),
+                view.shape(),
+                tensor.shape
+            ));
+        }
+        values.extend(values_of(view.data()));
+    }
+    let snapshot = Snapshot {
+        version: PolicyVersion(version),
+        values,
+    };
+    snapshot.check_finite(&layout).map_err(|error| error.to_string())?;
+    Ok((snapshot, config))
+}
+
+/// f32 values from bytes that need not be aligned.
+fn values_of(bytes: &[u8]) -> Vec<f32> {
+    bytes
+        .chunks_exact(4)
+        .map(|chunk| f32::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3]]))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn snapshot(layout: &SnapshotLayout) -> Snapshot {
+        let values = (0..layout.values()).map(|index| (index as f32).sin()).collect();
+        Snapshot {
+            version: PolicyVersion(12),
+            values,
+        }
+    }
+
+    #[test]
+    fn tensors_lie_back_to_back_and_encoder_before_policy() {
+        let layout = SnapshotLayout::new(34, 256);
+        let mut end = 0;
+        for tensor in layout.tensors() {
+            assert_eq!(tensor.range.start, end);
+            end = tensor.range.end;
+        }
+        assert_eq!(layout.encoder(), 0..787_456);
+        assert_eq!(
+            layout.policy().len(),
+            34 * 256 + 256 + 2 * (256 * 256 + 256) + 256 * 4 + 4
+        );
+    }
+
+    #[test]
+    fn a_received_snapshot_is_the_one_sent() {
+        let layout = SnapshotLayout::new(32, 64);
+        let sent = snapshot(&layout);
+        let header = sent.header(RunId(1), &layout);
+        let bytes = bytemuck::cast_slice(&sent.values);
+        assert_eq!(Snapshot::receive(&header, bytes, RunId(1), &layout).unwrap(), sent);
+    }
+
+    #[test]
+    fn a_foreign_damaged_or_poisoned_snapshot_is_refused() {
+        let layout = SnapshotLayout::new(32, 64);
+        let mut sent = snapshot(&layout);
+        let header = sent.header(RunId(1), &layout);
+        let mut bytes = bytemuck::cast_slice(&sent.values).to_vec();
+        let receive = |bytes: &[u8], run, layout: &SnapshotLayout| Snapshot::receive(&header, bytes, run, layout);
+        assert!(matches!(
+            receive(&bytes, RunId(2), &layout),
+            Err(SnapshotError::OtherRun { .. })
+        ));
+        let other = SnapshotLayout::new(34, 64);
+        assert!(matches!(
+            receive(&bytes, RunId(1), &other),
+            Err(SnapshotError::OtherLayout)
+        ));
+        assert!(matches!(
+            receive(&bytes[4..], RunId(1), &layout),
+            Err(SnapshotError::Length { .. })
+        ));
+        bytes[1000] ^= 1;
+        assert!(matches!(
+            receive(&bytes, RunId(1), &layout),
+            Err(SnapshotError::Damaged)
+        ));
+        sent.values[5] = f32::NAN;
+        let header = sent.header(RunId(1), &layout);
+        let poisoned = Snapshot::receive(&header, bytemuck::cast_slice(&sent.values), RunId(1), &layout);
+        assert!(poisoned.unwrap_err().to_string().contains("encoder.conv1.weight"));
+    }
+
+    #[test]
+    fn a_file_holds_the_snapshot_and_its_configuration() {
+        let mut config = Config::default();
+        config.sac.hidden_width = 64;
+        let layout = SnapshotLayout::of(&config);
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("best.safetensors");
+        let saved = snapshot(&layout);
+        saved.save(&path, &layout, &config).unwrap();
+        let (loaded, loaded_config) = Snapshot::load(&path).unwrap();
+        assert_eq!(loaded, saved);
+        assert_eq!(loaded.sha256(), saved.sha256());
+        assert_eq!(loaded_config, config);
+        let mut bytes = fs::read(&path).unwrap();
+        bytes.truncate(bytes.len() - 1);
+        fs::write(&path, bytes).unwrap();
+        assert!(
+            Snapshot::load(&path)
+                .unwrap_err()
+                .to_string()
+                .contains("best.safetensors")
+        );
+    }
+}

@@ -1,1 +1,110 @@
-//! Pending.
+//! What an actor tells the learner besides its flights: that it is there, and that it lives.
+
+use iceoryx2::prelude::ZeroCopySend;
+
+use crate::ids::{ActorId, Incarnation, PolicyVersion, RunId};
+
+/// Sign of life of an actor, sent at its start, at every heartbeat and at its end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+#[repr(C)]
+#[type_name("skein.StatusRecord.v1")]
+pub struct StatusRecord {
+    run: u64,
+    incarnation: u64,
+    newest_policy: u64,
+    flights_flown: u64,
+    actor: u32,
+    pid: u32,
+    state: u32,
+    reserved: u32,
+}
+
+// Four 8-byte and four 4-byte fields: no padding.
+const _: () = assert!(size_of::<StatusRecord>() == 4 * 8 + 4 * 4);
+
+/// An actor's state, as read from a [`StatusRecord`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ActorStatus {
+    /// The actor.
+    pub actor: ActorId,
+    /// Its life.
+    pub incarnation: Incarnation,
+    /// Its process.
+    pub pid: u32,
+    /// What it is about.
+    pub state: ActorState,
+    /// The newest snapshot it holds, if any.
+    pub newest_policy: Option<PolicyVersion>,
+    /// Flights it has flown in this life.
+    pub flights_flown: u64,
+}
+
+/// What an actor is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ActorState {
+    /// Ready for tickets, or flying.
+    Serving,
+    /// Takes no more tickets.
+    Leaving,
+}
+
+const NO_POLICY: u64 = u64::MAX;
+
+impl StatusRecord {
+    /// `status` on the wire.
+    pub fn new(run: RunId, status: &ActorStatus) -> Self {
+        Self {
+            run: run.0,
+            incarnation: status.incarnation.0,
+            newest_policy: status.newest_policy.map_or(NO_POLICY, |version| version.0),
+            flights_flown: status.flights_flown,
+            actor: status.actor.0,
+            pid: status.pid,
+            state: match status.state {
+                ActorState::Serving => 1,
+                ActorState::Leaving => 2,
+            },
+            reserved: 0,
+        }
+    }
+
+    /// The status, or `None` when the record is of another run or holds what no actor of this version writes.
+    pub fn read(&self, run: RunId) -> Option<ActorStatus> {
+        let state = match self.state {
+            1 => ActorState::Serving,
+            2 => ActorState::Leaving,
+            _ => return None,
+        };
+        (self.run == run.0).then_some(ActorStatus {
+            actor: ActorId(self.actor),
+            incarnation: Incarnation(self.incarnation),
+            pid: self.pid,
+            state,
+            newest_policy: (self.newest_policy != NO_POLICY).then_some(PolicyVersion(self.newest_policy)),
+            flights_flown: self.flights_flown,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_status_survives_the_wire_of_its_own_run_only() {
+        for newest_policy in [None, Some(PolicyVersion(4))] {
+            let status = ActorStatus {
+                actor: ActorId(1),
+                incarnation: Incarnation(2),
+                pid: 3,
+                state: ActorState::Leaving,
+                newest_policy,
+                flights_flown: 6,
+            };
+            let record = StatusRecord::new(RunId(9), &status);
+            assert_eq!(record.read(RunId(9)), Some(status));
+            assert_eq!(record.read(RunId(8)), None);
+            assert_eq!(StatusRecord { state: 7, ..record }.read(RunId(9)), None);
+        }
+    }
+}

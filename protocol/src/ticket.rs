@@ -1,1 +1,286 @@
-//! Pending.
+//! The ticket: everything a flight is a function of.
+//!
+//! A flight is flown only against a ticket, and two actors that hold the same ticket fly the same flight, bit for bit. The learner sends tickets inside
+//! [`ControlRecord`]s, the one fixed-size message that actors listen to.
+
+use iceoryx2::prelude::ZeroCopySend;
+
+use crate::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion, RunId};
+
+/// What a flight is flown for, how, where and with which policy.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Ticket {
+    /// The run it belongs to.
+    pub run: RunId,
+    /// Its number.
+    pub flight: FlightId,
+    /// How often this flight had been issued before.
+    pub attempt: Attempt,
+    /// The snapshot to hold for the whole flight.
+    pub policy_version: PolicyVersion,
+    /// Where it is flown.
+    pub course: CourseChoice,
+    /// The level (1 is the first) whose start it takes off from.
+    pub start_level: u8,
+    /// How actions are chosen.
+    pub exploration: Exploration,
+    /// Seed of everything random in the flight.
+    pub seed: u64,
+}
+
+/// Where a flight is flown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CourseChoice {
+    /// The training course.
+    Training,
+    /// The evaluation course of this index.
+    Evaluation(u32),
+    /// A generated course of this seed.
+    Generated(u64),
+}
+
+/// How actions are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Exploration {
+    /// Uniformly at random, before the first update.
+    Uniform,
+    /// Sampled from the policy, in training.
+    Sample,
+    /// The policy's mode, without noise, in evaluation.
+    Mode,
+}
+
+/// What the learner tells an actor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Control {
+    /// Fly this.
+    Fly(Ticket),
+    /// The learner is alive.
+    Heartbeat,
+    /// The run is over: stop flying and exit.
+    Stop,
+}
+
+/// [`Control`] on the wire, addressed to one actor or, for heartbeats and the stop, to all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+#[repr(C)]
+#[type_name("skein.ControlRecord.v1")]
+pub struct ControlRecord {
+    run: u64,
+    to_incarnation: u64,
+    flight: u64,
+    policy_version: u64,
+    course_seed: u64,
+    seed: u64,
+    to_actor: u32,
+    attempt: u32,
+    course_index: u32,
+    kind: u8,
+    course_kind: u8,
+    start_level: u8,
+    exploration: u8,
+}
+
+// Six 8-byte and three 4-byte fields, then four bytes: no padding, so no uninitialised byte ever leaves the process.
+const _: () = assert!(size_of::<ControlRecord>() == 6 * 8 + 3 * 4 + 4);
+
+const EVERYONE: u32 = u32::MAX;
+
+impl ControlRecord {
+    /// `ticket`, for one life of one actor.
+    pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: Incarnation) -> Self {
+        let (course_kind, course_index, course_seed) = match ticket.course {
+            CourseChoice::Training => (0, 0, 0),
+            CourseChoice::Evaluation(index) => (1, index, 0),
+            CourseChoice::Generated(seed) => (2, 0, seed),
+        };
+        Self {
+            run: ticket.run.0,
+            to_incarnation: incarnation.0,
+            flight: ticket.flight.0,
+            policy_version: ticket.policy_version.0,
+            course_seed,
+            seed: ticket.seed,
+            to_actor: actor.0,
+            attempt: ticket.attempt.0,
+            course_index,
+            kind: 1,
+            course_kind,
+            start_level: ticket.start_level,
+            exploration: match ticket.exploration {
+                Exploration::Uniform => 0,
+                Exploration::Sample => 1,
+                Exploration::Mode => 2,
+            },
+        }
+    }
+
+    /// A sign of life to all actors.
+    pub fn heartbeat(run: RunId) -> Self {
+        Self::to_everyone(run, 0)
+    }
+
+    /// The end of the run, to all actors.
+    pub fn stop(run: RunId) -> Self {
+        Self::to_everyone(run, 2)
+    }
+
+    fn to_everyone(run: RunId, kind: u8) -> Self {
+        Self {
+            run: run.0,
+            to_incarnation: 0,
+            flight: 0,
+            policy_version: 0,
+            course_seed: 0,
+            seed: 0,
+            to_actor: EVERYONE,
+            attempt: 0,
+            course_index: 0,
+            kind,
+            course_kind: 0,
+            start_level: 0,
+            exploration: 0,
+        }
+    }
+
+    /// Whether this life of this actor is meant.
+    pub fn is_for(&self, actor: ActorId, incarnation: Incarnation) -> bool {
+        self.to_actor == EVERYONE || (self.to_actor == actor.0 && self.to_incarnation == incarnation.0)
+    }
+
+    /// What is said.
+    ///
+    /// # Errors
+    /// [`ControlFault`] when the record holds what no learner of this version and run writes.
+    pub fn read(&self, run: RunId) -> Result<Control, ControlFault> {
+        if self.run != run.0 {
+            return Err(ControlFault::OtherRun(self.run));
+        }
+        match self.kind {
+            0 => Ok(Control::Heartbeat),
+            1 => self.ticket(run).map(Control::Fly),
+            2 => Ok(Control::Stop),
+            kind => Err(ControlFault::Field {
+                name: "kind",
+                value: kind,
+            }),
+        }
+    }
+
+    fn ticket(&self, run: RunId) -> Result<Ticket, ControlFault> {
+        if self.start_level == 0 {
+            return Err(ControlFault::Field {
+                name: "start_level",
+                value: 0,
+            });
+        }
+        Ok(Ticket {
+            run,
+            flight: FlightId(self.flight),
+            attempt: Attempt(self.attempt),
+            policy_version: PolicyVersion(self.policy_version),
+            course: match self.course_kind {
+                0 => CourseChoice::Training,
+                1 => CourseChoice::Evaluation(self.course_index),
+                2 => CourseChoice::Generated(self.course_seed),
+                value => {
+                    return Err(ControlFault::Field {
+                        name: "course_kind",
+                        value,
+                    });
+                }
+            },
+            start_level: self.start_level,
+            exploration: match self.exploration {
+                0 => Exploration::Uniform,
+                1 => Exploration::Sample,
+                2 => Exploration::Mode,
+                value => {
+                    return Err(ControlFault::Field {
+                        name: "exploration",
+                        value,
+                    });
+                }
+            },
+            seed: self.seed,
+        })
+    }
+}
+
+/// Why a control record is not believed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum ControlFault {
+    /// It belongs to another run.
+    #[error("control record of run {0:016x}")]
+    OtherRun(u64),
+    /// A field has a value this version does not know.
+    #[error("control record with {name} = {value}")]
+    Field {
+        /// The field.
+        name: &'static str,
+        /// Its value.
+        value: u8,
+    },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ticket() -> Ticket {
+        Ticket {
+            run: RunId(3),
+            flight: FlightId(7),
+            attempt: Attempt(1),
+            policy_version: PolicyVersion(5),
+            course: CourseChoice::Generated(99),
+            start_level: 2,
+            exploration: Exploration::Sample,
+            seed: 42,
+        }
+    }
+
+    #[test]
+    fn a_ticket_survives_the_wire() {
+        let choices = [
+            CourseChoice::Training,
+            CourseChoice::Evaluation(3),
+            CourseChoice::Generated(99),
+        ];
+        let explorations = [Exploration::Uniform, Exploration::Sample, Exploration::Mode];
+        for (course, exploration) in choices.into_iter().zip(explorations) {
+            let ticket = Ticket {
+                course,
+                exploration,
+                ..ticket()
+            };
+            let record = ControlRecord::fly(&ticket, ActorId(4), Incarnation(8));
+            assert_eq!(record.read(RunId(3)), Ok(Control::Fly(ticket)));
+        }
+    }
+
+    #[test]
+    fn a_ticket_is_for_one_life_of_one_actor() {
+        let record = ControlRecord::fly(&ticket(), ActorId(4), Incarnation(8));
+        assert!(record.is_for(ActorId(4), Incarnation(8)));
+        assert!(!record.is_for(ActorId(4), Incarnation(9)));
+        assert!(!record.is_for(ActorId(5), Incarnation(8)));
+        assert!(ControlRecord::stop(RunId(3)).is_for(ActorId(5), Incarnation(1)));
+    }
+
+    #[test]
+    fn garbage_is_refused_with_the_field() {
+        let mut record = ControlRecord::fly(&ticket(), ActorId(4), Incarnation(8));
+        assert_eq!(record.read(RunId(4)), Err(ControlFault::OtherRun(3)));
+        record.exploration = 77;
+        assert_eq!(
+            record.read(RunId(3)),
+            Err(ControlFault::Field {
+                name: "exploration",
+                value: 77
+            })
+        );
+        record.start_level = 0;
+        assert!(record.read(RunId(3)).is_err());
+    }
+}

@@ -1,1 +1,321 @@
-//! Pending.
+//! The transition record: one step of a flight, as it lies in shared memory.
+//!
+//! A flight of T steps is T+1 records. Record t holds the observation at step t, the action chosen on it, and the reward and end flags that followed; the
+//! closing record holds the last observation only. The depth camera renders into [`TransitionRecord::depth`] of a loaned sample, and the learner reads
+//! it there: the image's bytes are written once.
+
+use bytemuck::{Pod, Zeroable};
+use iceoryx2::prelude::ZeroCopySend;
+use serde::{Deserialize, Serialize};
+
+use crate::ids::{ActorId, Incarnation};
+use crate::ticket::Ticket;
+use crate::{ACTION, IMAGE_PIXELS, LATENT};
+
+/// One step of a flight on the wire. Every bit pattern is a valid value of every field's type; [`TransitionRecord::check`] says whether it makes sense.
+#[derive(Debug, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
+#[repr(C)]
+#[type_name("skein.TransitionRecord.v1")]
+pub struct TransitionRecord {
+    /// The run.
+    pub run: u64,
+    /// The flight.
+    pub flight: u64,
+    /// The snapshot the whole flight is flown with.
+    pub policy_version: u64,
+    /// The actor's life.
+    pub incarnation: u64,
+    /// The actor.
+    pub actor: u32,
+    /// The ticket's attempt: tells a flight flown again from its late twin.
+    pub attempt: u32,
+    /// Position in the flight, from 0 without a gap; the closing record counts too.
+    pub step: u32,
+    /// A [`RecordKind`].
+    pub kind: u8,
+    /// The level the flight took off from.
+    pub start_level: u8,
+    /// Walls passed in the flight so far, this step's included.
+    pub walls_passed: u8,
+    /// An [`Outcome`], in the closing record.
+    pub outcome: u8,
+    /// Position in the world in metres: along the corridor, lateral, up.
+    pub position_m: [f32; 3],
+    /// Orientation, world from body, as a unit quaternion (i, j, k, w).
+    pub orientation: [f32; 4],
+    /// Velocity in the world in metres per second: forward, left, up.
+    pub velocity_mps: [f32; 3],
+    /// The VAE's latent mean of `depth`, `[32]`.
+    pub latent: [f32; LATENT],
+    /// Lateral and vertical velocity command, each in [-1, 1].
+    pub action: [f32; ACTION],
+    /// Sum of `reward_terms`.
+    pub reward: f32,
+    /// The paper's four terms: collision, level-up, destination, action.
+    pub reward_terms: [f32; 4],
+    /// 1 when a wall was crossed or the destination reached in this step.
+    pub level_up: u8,
+    /// 1 when the flight ended in this step in a state without a future (collision, destination).
+    pub terminated: u8,
+    /// 1 when the flight was cut off in this step by its step limit; its value still bootstraps.
+    pub truncated: u8,
+    reserved: [u8; 9],
+    /// The depth image, 128×72, row by row from the top left; 255 is the camera's range or farther. On a cache line of its own.
+    pub depth: [u8; IMAGE_PIXELS],
+}
+
+// The header is four cache lines, so that in samples aligned to one (see `services`) the image starts on one; nothing is padding, so that the record is plain data.
+const _: () = assert!(std::mem::offset_of!(TransitionRecord, depth) == 256);
+const _: () = assert!(size_of::<TransitionRecord>() == 256 + IMAGE_PIXELS);
+const _: () = assert!(align_of::<TransitionRecord>() == 8);
+
+/// What a record is within its flight.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RecordKind {
+    /// An observation, the action on it and what followed.
+    Step,
+    /// The last observation; ends the flight.
+    Closing,
+    /// The flight broke off by a fault in the simulator; what was sent of it is void.
+    Failed,
+}
+
+/// How a flight ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// Touched a wall or the corridor.
+    Collided,
+    /// Touched the end wall: the course is passed.
+    ReachedEnd,
+    /// Reached the step limit in the air.
+    TimedOut,
+}
+
+impl Outcome {
+    /// As on the wire.
+    pub fn code(self) -> u8 {
+        match self {
+            Self::Collided => 1,
+            Self::ReachedEnd => 2,
+            Self::TimedOut => 3,
+        }
+    }
+
+    /// From the wire; `None` for what is no outcome.
+    pub fn from_code(code: u8) -> Option<Self> {
+        [Self::Collided, Self::ReachedEnd, Self::TimedOut]
+            .into_iter()
+            .find(|outcome| outcome.code() == code)
+    }
+
+    /// As in `flights.csv`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Collided => "collided",
+            Self::ReachedEnd => "reached_end",
+            Self::TimedOut => "timed_out",
+        }
+    }
+}
+
+impl RecordKind {
+    /// As on the wire.
+    pub fn code(self) -> u8 {
+        match self {
+            Self::Step => 1,
+            Self::Closing => 2,
+            Self::Failed => 3,
+        }
+    }
+
+    /// From the wire; `None` for what is no kind.
+    pub fn from_code(code: u8) -> Option<Self> {
+        [Self::Step, Self::Closing, Self::Failed]
+            .into_iter()
+            .find(|kind| kind.code() == code)
+    }
+}
+
+impl TransitionRecord {
+    /// Writes who flies what; everything but the image is reset. The image is left as it is, to be rendered over.
+    pub fn begin(&mut self, ticket: &Ticket, actor: ActorId, incarnation: Incarnation, step: u32) {
+        bytemuck::bytes_of_mut(self)[..std::mem::offset_of!(Self, depth)].fill(0);
+        self.run = ticket.run.0;
+        self.flight = ticket.flight.0;
+        self.policy_version = ticket.policy_version.0;
+        self.incarnation = incarnation.0;
+        self.actor = actor.0;
+        self.attempt = ticket.attempt.0;
+        self.step = step;
+        self.kind = RecordKind::Step.code();
+        self.start_level = ticket.start_level;
+    }
+
+    /// The record's kind, if it makes sense as step `step` of `ticket` flown by `incarnation` of `actor`.
+    ///
+    /// # Errors
+    /// [`RecordFault`] names the field; such a record is never learned from.
+    pub fn check(
+        &self,
+        ticket: &Ticket,
+        actor: ActorId,
+        incarnation: Incarnation,
+        step: u32,
+    ) -> Result<RecordKind, RecordFault> {
+        let same = |name, found: u64, expected: u64| {
+            if found == expected {
+                Ok(())
+            } else {
+                Err(RecordFault::Mismatch { name, found, expected })
+            }
+        };
+        same("run", self.run, ticket.run.0)?;
+        same("flight", self.flight, ticket.flight.0)?;
+        same("policy_version", self.policy_version, ticket.policy_version.0)?;
+        same("attempt", self.attempt.into(), ticket.attempt.0.into())?;
+        same("actor", self.actor.into(), actor.0.into())?;
+        same("incarnation", self.incarnation, incarnation.0)?;
+        same("start_level", self.start_level.into(), ticket.start_level.into())?;
+        same("step", self.step.into(), step.into())?;
+        let kind = RecordKind::from_code(self.kind).ok_or(RecordFault::Code {
+            name: "kind",
+            value: self.kind,
+        })?;
+        if kind != RecordKind::Failed {
+            self.check_numbers()?;
+        }
+        if kind == RecordKind::Closing && Outcome::from_code(self.outcome).is_none() {
+            return Err(RecordFault::Code {
+                name: "outcome",
+                value: self.outcome,
+            });
+        }
+        Ok(kind)
+    }
+
+    fn check_numbers(&self) -> Result<(), RecordFault> {
+        let finite = |name, values: &[f32]| {
+            if values.iter().all(|value| value.is_finite()) {
+                Ok(())
+            } else {
+                Err(RecordFault::NotFinite { name })
+            }
+        };
+        finite("position_m", &self.position_m)?;
+        finite("orientation", &self.orientation)?;
+        finite("velocity_mps", &self.velocity_mps)?;
+        finite("latent", &self.latent)?;
+        finite("action", &self.action)?;
+        finite("reward", &[self.reward])?;
+        finite("reward_terms", &self.reward_terms)?;
+        if self.action.iter().any(|value| value.abs() > 1.0) {
+            return Err(RecordFault::ActionOutOfRange { action: self.action });
+        }
+        for (name, value) in [
+            ("level_up", self.level_up),
+            ("terminated", self.terminated),
+            ("truncated", self.truncated),
+        ] {
+            if value > 1 {
+                return Err(RecordFault::Code { name, value });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Why a record is not believed.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum RecordFault {
+    /// It belongs to something else, or has a gap before it.
+    #[error("{name} is {found} where {expected} is expected")]
+    Mismatch {
+        /// The field.
+        name: &'static str,
+        /// Its value.
+        found: u64,
+        /// The value it should have.
+        expected: u64,
+    },
+    /// A field has a value this version does not know.
+    #[error("{name} has the unknown value {value}")]
+    Code {
+        /// The field.
+        name: &'static str,
+        /// Its value.
+        value: u8,
+    },
+    /// A field holds an infinity or no number.
+    #[error("{name} is not finite")]
+    NotFinite {
+        /// The field.
+        name: &'static str,
+    },
+    /// An action no policy of ours chooses.
+    #[error("action {action:?} is outside [-1, 1]")]
+    ActionOutOfRange {
+        /// The action.
+        action: [f32; ACTION],
+    },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ids::{Attempt, FlightId, PolicyVersion, RunId};
+    use crate::ticket::{CourseChoice, Exploration};
+
+    const ACTOR: ActorId = ActorId(2);
+    const INCARNATION: Incarnation = Incarnation(11);
+
+    fn ticket() -> Ticket {
+        Ticket {
+            run: RunId(1),
+            flight: FlightId(5),
+            attempt: Attempt(0),
+            policy_version: PolicyVersion(3),
+            course: CourseChoice::Training,
+            start_level: 1,
+            exploration: Exploration::Sample,
+            seed: 9,
+        }
+    }
+
+    fn record() -> TransitionRecord {
+        let mut record = TransitionRecord::zeroed();
+        record.begin(&ticket(), ACTOR, INCARNATION, 4);
+        record
+    }
+
+    #[test]
+    fn a_begun_record_belongs_to_its_ticket_and_keeps_the_image() {
+        let mut record = record();
+        record.depth[17] = 200;
+        record.begin(&ticket(), ACTOR, INCARNATION, 4);
+        assert_eq!(record.depth[17], 200);
+        assert_eq!(record.check(&ticket(), ACTOR, INCARNATION, 4), Ok(RecordKind::Step));
+    }
+
+    #[test]
+    fn a_record_of_anything_else_is_refused_by_name() {
+        let check = |change: fn(&mut TransitionRecord)| {
+            let mut record = record();
+            change(&mut record);
+            record.check(&ticket(), ACTOR, INCARNATION, 4).unwrap_err().to_string()
+        };
+        assert!(check(|r| r.run = 2).contains("run"));
+        assert!(check(|r| r.flight = 6).contains("flight"));
+        assert!(check(|r| r.policy_version = 4).contains("policy_version"));
+        assert!(check(|r| r.attempt = 1).contains("attempt"));
+        assert!(check(|r| r.actor = 3).contains("actor"));
+        assert!(check(|r| r.incarnation = 12).contains("incarnation"));
+        assert!(check(|r| r.step = 5).contains("step"));
+        assert!(check(|r| r.kind = 9).contains("kind"));
+        assert!(check(|r| r.kind = RecordKind::Closing.code()).contains("outcome"));
+        assert!(check(|r| r.latent[3] = f32::NAN).contains("latent"));
+        assert!(check(|r| r.reward = f32::INFINITY).contains("reward"));
+        assert!(check(|r| r.action = [0.0, 1.5]).contains("action"));
+        assert!(check(|r| r.terminated = 2).contains("terminated"));
+    }
+}

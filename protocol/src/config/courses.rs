@@ -24,9 +24,14 @@ impl Default for CoursesSection {
         Self {
             training: shipped("training.toml"),
             generated_share: 0.0,
-            evaluation: ["training.toml", "rearranged_34125.toml", "rearranged_53412.toml", "non_rectangular.toml"]
-                .map(shipped)
-                .to_vec(),
+            evaluation: [
+                "training.toml",
+                "rearranged_34125.toml",
+                "rearranged_53412.toml",
+                "non_rectangular.toml",
+            ]
+            .map(shipped)
+            .to_vec(),
         }
     }
 }
@@ -39,7 +44,12 @@ impl CoursesSection {
             self.generated_share,
             "is outside [0, 1]: it is a share of the training flights",
         )?;
-        require(!self.evaluation.is_empty(), "courses.evaluation", "[]", "is empty: no snapshot could be confirmed")?;
+        require(
+            !self.evaluation.is_empty(),
+            "courses.evaluation",
+            "[]",
+            "is empty: no snapshot could be confirmed",
+        )?;
         require(
             self.evaluation.len() <= 64,
             "courses.evaluation",

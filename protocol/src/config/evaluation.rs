@@ -20,7 +20,12 @@ pub struct EvaluationSection {
 
 impl Default for EvaluationSection {
     fn default() -> Self {
-        Self { flights: 100, confirm_flights: 20, window_flights: 50, every_flights: 50 }
+        Self {
+            flights: 100,
+            confirm_flights: 20,
+            window_flights: 50,
+            every_flights: 50,
+        }
     }
 }
 

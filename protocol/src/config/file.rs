@@ -62,16 +62,25 @@ impl Config {
     /// # Errors
     /// [`ConfigError`] names file, key, value and remedy.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text =
-            fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
-        let mut table: Table = toml::from_str(&text)
-            .map_err(|source| ConfigError::Syntax { path: path.to_owned(), source: Box::new(source) })?;
+        let text = fs::read_to_string(path).map_err(|source| ConfigError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+        let mut table: Table = toml::from_str(&text).map_err(|source| ConfigError::Syntax {
+            path: path.to_owned(),
+            source: Box::new(source),
+        })?;
         for text in overrides {
             apply_override(&mut table, text)?;
         }
-        let mut config = from_table(table)
-            .map_err(|message| ConfigError::Key { path: path.to_owned(), message })?;
-        config.validate().map_err(|source| ConfigError::Invalid { path: path.to_owned(), source })?;
+        let mut config = from_table(table).map_err(|message| ConfigError::Key {
+            path: path.to_owned(),
+            message,
+        })?;
+        config.validate().map_err(|source| ConfigError::Invalid {
+            path: path.to_owned(),
+            source,
+        })?;
         let directory = path.parent().unwrap_or(Path::new(""));
         let courses = &mut config.courses;
         for course in courses.evaluation.iter_mut().chain([&mut courses.training]) {
@@ -116,7 +125,10 @@ fn from_table(mut table: Table) -> Result<Config, String> {
 }
 
 fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
-    let fail = |problem: &str| ConfigError::Override { text: text.to_owned(), problem: problem.to_owned() };
+    let fail = |problem: &str| ConfigError::Override {
+        text: text.to_owned(),
+        problem: problem.to_owned(),
+    };
     let (path, value) = text.split_once('=').ok_or_else(|| fail("has no `=`"))?;
     let (sections, key) = path.trim().rsplit_once('.').ok_or_else(|| fail("names no section"))?;
     let mut target = table;
@@ -177,7 +189,11 @@ mod tests {
 
     #[test]
     fn overrides_take_toml_and_bare_words() {
-        let config = load("", &["run.seed=7", "run.device=cuda:1", "simulator.vehicle.preset=point"]).unwrap();
+        let config = load(
+            "",
+            &["run.seed=7", "run.device=cuda:1", "simulator.vehicle.preset=point"],
+        )
+        .unwrap();
         assert_eq!(config.run.seed, 7);
         assert_eq!(config.run.device, Device::Cuda(1));
         assert_eq!(config.simulator["vehicle"]["preset"].as_str(), Some("point"));
@@ -186,12 +202,20 @@ mod tests {
     #[test]
     fn errors_name_file_key_and_remedy() {
         for (text, overrides, expected) in [
-            ("[run]\nsed = 1", vec![], vec!["test.toml", "[run]", "unknown field `sed`", "seed"]),
+            (
+                "[run]\nsed = 1",
+                vec![],
+                vec!["test.toml", "[run]", "unknown field `sed`", "seed"],
+            ),
             ("[rum]", vec![], vec!["test.toml", "unknown section [rum]", "run"]),
             ("[run]\nseed = \"x\"", vec![], vec!["test.toml", "[run]", "seed"]),
             ("", vec!["seed=1"], vec!["--set seed=1", "section.key=value"]),
             ("", vec!["run.seed"], vec!["--set run.seed", "no `=`"]),
-            ("[learning]\nwarmup_steps = 200000", vec![], vec!["learning.warmup_steps = 200000", "replay.capacity"]),
+            (
+                "[learning]\nwarmup_steps = 200000",
+                vec![],
+                vec!["learning.warmup_steps = 200000", "replay.capacity"],
+            ),
             ("[run]\ndevice = \"gpu\"", vec![], vec!["gpu", "cuda:N"]),
             ("[sac]\ndiscount = nan", vec![], vec!["sac.discount = NaN"]),
         ] {

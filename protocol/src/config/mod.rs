@@ -71,7 +71,10 @@ impl Config {
             self.learning.warmup_steps <= self.replay.capacity,
             "learning.warmup_steps",
             self.learning.warmup_steps,
-            format!("exceeds replay.capacity = {}: the learner would wait for ever", self.replay.capacity),
+            format!(
+                "exceeds replay.capacity = {}: the learner would wait for ever",
+                self.replay.capacity
+            ),
         )?;
         require(
             self.sac.batch_size <= self.learning.warmup_steps.max(1),
@@ -102,11 +105,21 @@ pub struct Invalid {
     pub problem: String,
 }
 
+/// One check of one key: reads as "require that … holds".
+#[allow(clippy::fn_params_excessive_bools)] // the condition is the point
 pub(crate) fn require(
     holds: bool,
     key: &'static str,
     value: impl std::fmt::Display,
     problem: impl Into<String>,
 ) -> Result<(), Invalid> {
-    if holds { Ok(()) } else { Err(Invalid { key, value: value.to_string(), problem: problem.into() }) }
+    if holds {
+        Ok(())
+    } else {
+        Err(Invalid {
+            key,
+            value: value.to_string(),
+            problem: problem.into(),
+        })
+    }
 }

@@ -20,7 +20,12 @@ pub struct ReplaySection {
 
 impl Default for ReplaySection {
     fn default() -> Self {
-        Self { capacity: 1 << 17, success_share: 0.125, success: SuccessRule::LevelUp, approach_steps: 5 }
+        Self {
+            capacity: 1 << 17,
+            success_share: 0.125,
+            success: SuccessRule::LevelUp,
+            approach_steps: 5,
+        }
     }
 }
 

@@ -23,14 +23,29 @@ pub struct RunSection {
 
 impl Default for RunSection {
     fn default() -> Self {
-        Self { seed: 1, flights: 2000, device: Device::Cpu, learner_threads: 2 }
+        Self {
+            seed: 1,
+            flights: 2000,
+            device: Device::Cpu,
+            learner_threads: 2,
+        }
     }
 }
 
 impl RunSection {
     pub(super) fn validate(&self) -> Result<(), Invalid> {
-        require(self.flights >= 1, "run.flights", self.flights, "is below 1: nothing would be flown")?;
-        require(self.flights < 1 << 62, "run.flights", self.flights, "is not below 2^62: flight numbers would run out")?;
+        require(
+            self.flights >= 1,
+            "run.flights",
+            self.flights,
+            "is below 1: nothing would be flown",
+        )?;
+        require(
+            self.flights < 1 << 62,
+            "run.flights",
+            self.flights,
+            "is not below 2^62: flight numbers would run out",
+        )?;
         require(
             (1..=256).contains(&self.learner_threads),
             "run.learner_threads",
@@ -100,7 +115,10 @@ pub struct CheckpointSection {
 
 impl Default for CheckpointSection {
     fn default() -> Self {
-        Self { every_flights: 500, keep: 2 }
+        Self {
+            every_flights: 500,
+            keep: 2,
+        }
     }
 }
 
@@ -112,6 +130,11 @@ impl CheckpointSection {
             self.every_flights,
             "is below 1: no flight would ever complete the interval",
         )?;
-        require(self.keep >= 1, "checkpoints.keep", self.keep, "is below 1: every checkpoint would be removed at once")
+        require(
+            self.keep >= 1,
+            "checkpoints.keep",
+            self.keep,
+            "is below 1: every checkpoint would be removed at once",
+        )
     }
 }

@@ -47,14 +47,29 @@ impl Default for SacSection {
 
 impl SacSection {
     pub(super) fn validate(&self) -> Result<(), Invalid> {
-        require((1..=4096).contains(&self.hidden_width), "sac.hidden_width", self.hidden_width, "is outside 1..=4096")?;
-        require((1..=65_536).contains(&self.batch_size), "sac.batch_size", self.batch_size, "is outside 1..=65536")?;
+        require(
+            (1..=4096).contains(&self.hidden_width),
+            "sac.hidden_width",
+            self.hidden_width,
+            "is outside 1..=4096",
+        )?;
+        require(
+            (1..=65_536).contains(&self.batch_size),
+            "sac.batch_size",
+            self.batch_size,
+            "is outside 1..=65536",
+        )?;
         for (key, rate) in [
             ("sac.policy_learning_rate", self.policy_learning_rate),
             ("sac.critic_learning_rate", self.critic_learning_rate),
             ("sac.temperature_learning_rate", self.temperature_learning_rate),
         ] {
-            require(rate > 0.0 && rate <= 1.0, key, rate, "is outside (0, 1]: the optimizer would stand still or blow up")?;
+            require(
+                rate > 0.0 && rate <= 1.0,
+                key,
+                rate,
+                "is outside (0, 1]: the optimizer would stand still or blow up",
+            )?;
         }
         require(
             (0.0..1.0).contains(&self.discount),
@@ -114,6 +129,10 @@ mod auto {
 
     pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<(), D::Error> {
         let word = String::deserialize(deserializer)?;
-        if word == "auto" { Ok(()) } else { Err(D::Error::custom("expected a number or \"auto\"")) }
+        if word == "auto" {
+            Ok(())
+        } else {
+            Err(D::Error::custom("expected a number or \"auto\""))
+        }
     }
 }

@@ -22,7 +22,13 @@ pub struct VaeSection {
 
 impl Default for VaeSection {
     fn default() -> Self {
-        Self { train_steps: 10_000, updates_per_step: 0.1, batch_size: 32, learning_rate: 1e-3, kl_weight: 1.0 }
+        Self {
+            train_steps: 10_000,
+            updates_per_step: 0.1,
+            batch_size: 32,
+            learning_rate: 1e-3,
+            kl_weight: 1.0,
+        }
     }
 }
 
@@ -46,7 +52,12 @@ impl VaeSection {
             self.updates_per_step,
             "is outside (0, 10]",
         )?;
-        require((1..=4096).contains(&self.batch_size), "vae.batch_size", self.batch_size, "is outside 1..=4096")?;
+        require(
+            (1..=4096).contains(&self.batch_size),
+            "vae.batch_size",
+            self.batch_size,
+            "is outside 1..=4096",
+        )?;
         require(
             self.learning_rate > 0.0 && self.learning_rate <= 1.0,
             "vae.learning_rate",
