@@ -1,1 +1,3 @@
-//! Placeholder, replaced in the first build-up.
+//! The actor: flies against tickets and sends back what it saw.
+
+pub mod inference;
