@@ -27,6 +27,10 @@ pub enum Purpose {
     VaeBatches = 8,
     /// Reparameterisation noise of the VAE steps of one epoch; indexed by epoch.
     VaeNoise = 9,
+    /// Where one flight starts; derived from the ticket's seed.
+    StartPosition = 10,
+    /// Exploration noise of one flight; derived from the ticket's seed, so that a start drawn otherwise does not shift it.
+    ActionNoise = 11,
 }
 
 /// The seed for the `index`-th use of `purpose` in the run seeded `run_seed`.
