@@ -79,6 +79,13 @@ pub struct ActorPorts {
     _node: Node<Ipc>,
 }
 
+/// Wakes the learner's receiving thread from another thread of the learner: ports belong to the thread that opened them.
+#[derive(Debug)]
+pub struct LearnerWaker {
+    wake_learner: Notifier<Ipc>,
+    _node: Node<Ipc>,
+}
+
 /// What a service could not do.
 #[derive(Debug, thiserror::Error)]
 #[error("{operation} of service `{service}` failed: {cause}{remedy}")]
@@ -140,7 +147,7 @@ impl<'a> Opener<'a> {
                 .require(&key, &value)
                 .map_err(failed("all", "setting an attribute"))?;
         }
-        // A restarted actor may come before its dead predecessor's slots are reclaimed.
+        // A restarted actor may come before its dead predecessor's slots are reclaimed; the learner's own waker takes one.
         Ok(Self {
             node,
             attributes,
@@ -414,6 +421,37 @@ impl LearnerPorts {
             .map_err(failed("control", "connecting"))?;
         self.node.try_cleanup_dead_nodes();
         Ok(())
+    }
+}
+
+impl LearnerWaker {
+    /// Opens the waker, on the thread that will use it.
+    ///
+    /// # Errors
+    /// [`ServiceError`] says what differs.
+    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
+        let node = node(identity, "learner-waker")?;
+        let open = Opener::new(&node, identity, config)?;
+        let wake_learner = open
+            .event("wake-learner", open.actors, 1)?
+            .notifier_builder()
+            .create()
+            .map_err(failed("wake-learner", "notifying"))?;
+        Ok(Self {
+            wake_learner,
+            _node: node,
+        })
+    }
+
+    /// Wakes the receiving thread.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the event cannot be raised.
+    pub fn wake(&self) -> Result<(), ServiceError> {
+        self.wake_learner
+            .notify()
+            .map(drop)
+            .map_err(failed("wake-learner", "notifying"))
     }
 }
 

@@ -59,7 +59,9 @@ pub struct TransitionRecord {
     pub terminated: u8,
     /// 1 when the flight was cut off in this step by its step limit; its value still bootstraps.
     pub truncated: u8,
-    reserved: [u8; 9],
+    /// Walls of the course, in the closing record: what `walls_passed` is measured against.
+    pub course_walls: u8,
+    reserved: [u8; 8],
     /// The depth image, 128×72, row by row from the top left; 255 is the camera's range or farther. On a cache line of its own.
     pub depth: [u8; IMAGE_PIXELS],
 }

@@ -19,6 +19,8 @@ pub struct LearningSection {
     pub warmup_steps: usize,
     /// Flights before training starts from the next level (paper: 10). Default 10.
     pub flights_per_level: u64,
+    /// Start levels that training goes through before it returns to the first (paper: 5); at most the walls of the training course. Default 5.
+    pub levels: u8,
     /// What the policy sees. Default `latent`, as in the paper.
     pub observation: Observation,
 }
@@ -31,6 +33,7 @@ impl Default for LearningSection {
             updates_per_step: 0.5,
             warmup_steps: 2000,
             flights_per_level: 10,
+            levels: 5,
             observation: Observation::Latent,
         }
     }
@@ -60,6 +63,12 @@ impl LearningSection {
             self.flights_per_level >= 1,
             "learning.flights_per_level",
             self.flights_per_level,
+            "is below 1: no flight could start",
+        )?;
+        require(
+            self.levels >= 1,
+            "learning.levels",
+            self.levels,
             "is below 1: no flight could start",
         )
     }
