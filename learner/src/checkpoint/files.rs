@@ -1,0 +1,242 @@
+//! The files of a checkpoint: from state to bytes and back.
+
+use std::borrow::Cow;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use safetensors::tensor::{Dtype, SafeTensors, TensorView, View};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+
+use super::manifest::Manifest;
+use super::{CheckpointError, CheckpointState, NamedTensor, Progress, TensorValues};
+use crate::replay::{ReplayState, RingState};
+
+const TENSORS: &str = "tensors.safetensors";
+const REPLAY: &str = "replay.safetensors";
+const PROGRESS: &str = "progress.bin";
+/// All files but the manifest.
+pub(super) const NAMES: [&str; 3] = [TENSORS, REPLAY, PROGRESS];
+
+// Safetensors are little-endian, and values are written as they lie in memory.
+const _: () = assert!(cfg!(target_endian = "little"));
+
+/// `progress.bin`: counters, and what of the replay buffer is no tensor.
+#[derive(serde::Serialize, serde::Deserialize)]
+struct ProgressFile {
+    progress: Progress,
+    success_inserted: u64,
+    regular_inserted: u64,
+    /// Blocks of images in the replay buffer; `None` once the VAE is frozen.
+    image_blocks: Option<u64>,
+}
+
+/// Writes all files but the manifest into `directory`.
+pub(super) fn write(directory: &Path, state: &CheckpointState) -> Result<(), CheckpointError> {
+    let tensors = state
+        .tensors
+        .iter()
+        .map(|tensor| (tensor.name.clone(), Borrowed::of(tensor)))
+        .collect();
+    write_tensors(&directory.join(TENSORS), tensors)?;
+    write_tensors(&directory.join(REPLAY), replay_tensors(&state.replay))?;
+    let progress = ProgressFile {
+        progress: state.progress.clone(),
+        success_inserted: state.replay.success.inserted,
+        regular_inserted: state.replay.regular.inserted,
+        image_blocks: state.replay.images.as_ref().map(|blocks| blocks.len() as u64),
+    };
+    let bytes = bincode::serde::encode_to_vec(&progress, bincode::config::standard())
+        .expect("progress consists of numbers and lists of them");
+    let path = directory.join(PROGRESS);
+    fs::write(&path, bytes).map_err(CheckpointError::io("write", &path))
+}
+
+/// Reads what [`write`] wrote, each file checked against `manifest`.
+pub(super) fn read(directory: &Path, manifest: &Manifest) -> Result<CheckpointState, CheckpointError> {
+    let tensors = read_tensors(&Stored::open(directory, TENSORS, manifest)?)?;
+    let path = directory.join(PROGRESS);
+    let bytes = manifest.read_file(directory, PROGRESS)?;
+    let (file, _): (ProgressFile, usize) = bincode::serde::decode_from_slice(&bytes, bincode::config::standard())
+        .map_err(|error| CheckpointError::Content {
+            path,
+            problem: error.to_string(),
+        })?;
+    let replay = read_replay(&Stored::open(directory, REPLAY, manifest)?, &file)?;
+    Ok(CheckpointState {
+        progress: file.progress,
+        tensors,
+        replay,
+    })
+}
+
+fn replay_tensors(replay: &ReplayState) -> Vec<(String, Borrowed<'_>)> {
+    let mut tensors = Vec::new();
+    for (part, ring) in [("success", &replay.success), ("regular", &replay.regular)] {
+        tensors.push((format!("{part}.rows"), Borrowed::flat(Dtype::F32, &ring.rows)));
+        tensors.push((format!("{part}.images"), Borrowed::flat(Dtype::U32, &ring.images)));
+    }
+    for (number, block) in replay.images.iter().flatten().enumerate() {
+        let shape = vec![block.len() / IMAGE_PIXELS, IMAGE_HEIGHT, IMAGE_WIDTH];
+        tensors.push((
+            block_name(number as u64),
+            Borrowed {
+                dtype: Dtype::U8,
+                shape,
+                bytes: block,
+            },
+        ));
+    }
+    tensors
+}
+
+fn read_replay(stored: &Stored, file: &ProgressFile) -> Result<ReplayState, CheckpointError> {
+    let tensors = stored.tensors()?;
+    let ring = |part: &str, inserted| {
+        let rows = stored.tensor(&tensors, &format!("{part}.rows"), Dtype::F32)?;
+        let images = stored.tensor(&tensors, &format!("{part}.images"), Dtype::U32)?;
+        Ok(RingState {
+            inserted,
+            rows: bytemuck::allocation::pod_collect_to_vec(rows.data()),
+            images: bytemuck::allocation::pod_collect_to_vec(images.data()),
+        })
+    };
+    let block = |number| {
+        Ok(Arc::new(
+            stored.tensor(&tensors, &block_name(number), Dtype::U8)?.data().to_vec(),
+        ))
+    };
+    Ok(ReplayState {
+        success: ring("success", file.success_inserted)?,
+        regular: ring("regular", file.regular_inserted)?,
+        images: file
+            .image_blocks
+            .map(|blocks| (0..blocks).map(block).collect::<Result<_, _>>())
+            .transpose()?,
+    })
+}
+
+fn block_name(number: u64) -> String {
+    format!("images.{number:06}")
+}
+
+fn write_tensors(path: &Path, tensors: Vec<(String, Borrowed<'_>)>) -> Result<(), CheckpointError> {
+    safetensors::serialize_to_file(tensors, None, path).map_err(|error| match error {
+        safetensors::SafeTensorError::IoError(source) => CheckpointError::io("write", path)(source),
+        other => CheckpointError::Content {
+            path: path.to_owned(),
+            problem: other.to_string(),
+        },
+    })
+}
+
+fn read_tensors(stored: &Stored) -> Result<Vec<NamedTensor>, CheckpointError> {
+    let mut named = Vec::new();
+    for (name, view) in stored.tensors()?.iter() {
+        let bytes = view.data();
+        let values = match view.dtype() {
+            Dtype::F32 => TensorValues::F32(bytemuck::allocation::pod_collect_to_vec(bytes)),
+            Dtype::F64 => TensorValues::F64(bytemuck::allocation::pod_collect_to_vec(bytes)),
+            Dtype::I64 => TensorValues::I64(bytemuck::allocation::pod_collect_to_vec(bytes)),
+            other => return Err(stored.unusable(format!("tensor {name} has values of type {other:?}"))),
+        };
+        named.push(NamedTensor {
+            name: name.to_owned(),
+            shape: view.shape().to_vec(),
+            values,
+        });
+    }
+    // The file orders tensors by their type; the order given to it means nothing, so one is chosen.
+    named.sort_by(|left, right| left.name.cmp(&right.name));
+    Ok(named)
+}
+
+/// A safetensors file in memory, its checksum verified.
+struct Stored {
+    path: PathBuf,
+    bytes: Vec<u8>,
+}
+
+impl Stored {
+    fn open(directory: &Path, name: &str, manifest: &Manifest) -> Result<Self, CheckpointError> {
+        Ok(Self {
+            path: directory.join(name),
+            bytes: manifest.read_file(directory, name)?,
+        })
+    }
+
+    fn tensors(&self) -> Result<SafeTensors<'_>, CheckpointError> {
+        SafeTensors::deserialize(&self.bytes).map_err(|error| self.unusable(error.to_string()))
+    }
+
+    fn tensor<'a>(
+        &self,
+        tensors: &SafeTensors<'a>,
+        name: &str,
+        dtype: Dtype,
+    ) -> Result<TensorView<'a>, CheckpointError> {
+        let view = tensors.tensor(name).map_err(|error| self.unusable(error.to_string()))?;
+        if view.dtype() != dtype {
+            let found = view.dtype();
+            return Err(self.unusable(format!(
+                "tensor {name} has values of type {found:?} instead of {dtype:?}"
+            )));
+        }
+        Ok(view)
+    }
+
+    fn unusable(&self, problem: String) -> CheckpointError {
+        CheckpointError::Content {
+            path: self.path.clone(),
+            problem,
+        }
+    }
+}
+
+/// Values as they lie in memory: nothing is copied on the way to the file.
+struct Borrowed<'a> {
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: &'a [u8],
+}
+
+impl<'a> Borrowed<'a> {
+    fn of(tensor: &'a NamedTensor) -> Self {
+        let (dtype, bytes) = match &tensor.values {
+            TensorValues::F32(values) => (Dtype::F32, bytemuck::cast_slice(values)),
+            TensorValues::F64(values) => (Dtype::F64, bytemuck::cast_slice(values)),
+            TensorValues::I64(values) => (Dtype::I64, bytemuck::cast_slice(values)),
+        };
+        Self {
+            dtype,
+            shape: tensor.shape.clone(),
+            bytes,
+        }
+    }
+
+    fn flat<T: bytemuck::Pod>(dtype: Dtype, values: &'a [T]) -> Self {
+        Self {
+            dtype,
+            shape: vec![values.len()],
+            bytes: bytemuck::cast_slice(values),
+        }
+    }
+}
+
+impl View for Borrowed<'_> {
+    fn dtype(&self) -> Dtype {
+        self.dtype
+    }
+
+    fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
+    fn data(&self) -> Cow<'_, [u8]> {
+        Cow::Borrowed(self.bytes)
+    }
+
+    fn data_len(&self) -> usize {
+        self.bytes.len()
+    }
+}

@@ -1,0 +1,227 @@
+//! A training flight as the learner keeps it: committed, complete, in order.
+//!
+//! The assembler builds it from streamed records; metrics and replay take it from there. It holds one observation more than it has steps: the closing
+//! observation is what the last step led to, and a flight that was cut off bootstraps from it.
+
+use skein_protocol::config::Observation;
+use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
+use skein_protocol::transition::Outcome;
+use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
+
+/// What the vehicle saw and where it was at the beginning of a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepObservation {
+    /// The VAE's latent mean of the depth image.
+    pub latent: [f32; LATENT],
+    /// Velocity in the world in metres per second: forward, left, up.
+    pub velocity_mps: [f32; 3],
+    /// Position in the world in metres: along the corridor, lateral, up.
+    pub position_m: [f32; 3],
+    /// Orientation, world from body, as a unit quaternion (i, j, k, w).
+    pub orientation: [f32; 4],
+}
+
+/// One whole flight of T steps.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CommittedFlight {
+    /// Its number.
+    pub flight: FlightId,
+    /// The epoch it belongs to.
+    pub epoch: Epoch,
+    /// The one snapshot all of it was flown with.
+    pub policy_version: PolicyVersion,
+    /// Who flew it; without influence on learning.
+    pub actor: ActorId,
+    /// The level (1 is the first) whose start it took off from.
+    pub level: u8,
+    /// `[T + 1]`, the closing observation last.
+    pub observations: Vec<StepObservation>,
+    /// Lateral and vertical velocity command, each in [-1, 1]; `[T]`.
+    pub actions: Vec<[f32; ACTION]>,
+    /// `[T]`.
+    pub rewards: Vec<f32>,
+    /// Terms of each reward: collision, level-up, destination, action; `[T]`.
+    pub reward_terms: Vec<[f32; 4]>,
+    /// Whether a wall was crossed or the destination reached in the step; `[T]`.
+    pub level_up: Vec<bool>,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Walls passed; the end wall is none.
+    pub walls_passed: u8,
+    /// Walls of the course.
+    pub course_walls: u8,
+    /// Depth images of all observations, `[T + 1, 72, 128]`, while the VAE is trained.
+    pub depth: Option<Vec<u8>>,
+}
+
+/// Why a flight's parts do not belong together.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("flight {flight} of {steps} steps has {found} {what} where {expected} are expected")]
+pub struct FlightFault {
+    /// The flight.
+    pub flight: FlightId,
+    /// Its steps, by the number of its actions.
+    pub steps: usize,
+    /// The part that is too short or too long.
+    pub what: &'static str,
+    /// Its length.
+    pub found: usize,
+    /// The length it should have.
+    pub expected: usize,
+}
+
+impl CommittedFlight {
+    /// Steps flown, T.
+    pub fn steps(&self) -> usize {
+        self.actions.len()
+    }
+
+    /// Sum of all rewards, undiscounted; summed in double precision, so that it does not depend on how the sum is arranged.
+    pub fn total_reward(&self) -> f32 {
+        self.rewards.iter().map(|&reward| f64::from(reward)).sum::<f64>() as f32
+    }
+
+    /// Whether it ended in a state without a future. A flight that reached its step limit did not, and its last step still bootstraps.
+    pub fn terminated(&self) -> bool {
+        match self.outcome {
+            Outcome::Collided | Outcome::ReachedEnd => true,
+            Outcome::TimedOut => false,
+        }
+    }
+
+    /// Writes the observation vector at the beginning of `step`, at most T, as the actor saw it.
+    pub fn write_observation(&self, step: usize, observation: Observation, into: &mut [f32]) {
+        let previous_action = step
+            .checked_sub(1)
+            .map_or([0.0; ACTION], |previous| self.actions[previous]);
+        let seen = &self.observations[step];
+        observation.write(&seen.latent, &seen.velocity_mps, &previous_action, into);
+    }
+
+    /// Checks that every part has the length that the number of actions asks for, and that there is a step.
+    ///
+    /// # Errors
+    /// [`FlightFault`] names the first part that has not.
+    pub fn check(&self) -> Result<(), FlightFault> {
+        let steps = self.steps();
+        let images = self.depth.as_ref().map_or((steps + 1) * IMAGE_PIXELS, Vec::len);
+        for (what, found, expected) in [
+            ("actions", steps, steps.max(1)),
+            ("observations", self.observations.len(), steps + 1),
+            ("rewards", self.rewards.len(), steps),
+            ("reward terms", self.reward_terms.len(), steps),
+            ("level-up flags", self.level_up.len(), steps),
+            ("bytes of depth images", images, (steps + 1) * IMAGE_PIXELS),
+        ] {
+            if found != expected {
+                return Err(FlightFault {
+                    flight: self.flight,
+                    steps,
+                    what,
+                    found,
+                    expected,
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod samples {
+    //! Flights for tests, every number in them recognisable.
+
+    use super::*;
+
+    /// A flight of `steps` steps whose every quantity is a function of (`flight`, step). Image t is filled with [`shade`]; its latent is [`code`] of that.
+    pub(crate) fn flight(flight: u64, steps: usize, outcome: Outcome) -> CommittedFlight {
+        let at = |step: usize| flight as f32 * 1000.0 + step as f32;
+        CommittedFlight {
+            flight: FlightId(flight),
+            epoch: Epoch(flight / 10),
+            policy_version: PolicyVersion(flight / 10),
+            actor: ActorId(0),
+            level: 1,
+            observations: (0..=steps)
+                .map(|step| StepObservation {
+                    latent: code(shade(flight, step)),
+                    velocity_mps: [1.0, at(step) + 0.25, at(step) + 0.5],
+                    position_m: [step as f32, 0.0, 3.5],
+                    orientation: [0.0, 0.0, 0.0, 1.0],
+                })
+                .collect(),
+            actions: (0..steps).map(|step| [at(step) / 1e6, -at(step) / 1e6]).collect(),
+            rewards: (0..steps).map(|step| at(step) / 100.0).collect(),
+            reward_terms: vec![[0.0; 4]; steps],
+            level_up: vec![false; steps],
+            outcome,
+            walls_passed: 0,
+            course_walls: 5,
+            depth: None,
+        }
+    }
+
+    /// The same with its images.
+    pub(crate) fn with_images(mut committed: CommittedFlight) -> CommittedFlight {
+        let flight = committed.flight.0;
+        committed.depth = Some(
+            (0..=committed.steps())
+                .flat_map(|step| [shade(flight, step); IMAGE_PIXELS])
+                .collect(),
+        );
+        committed
+    }
+
+    /// Gray value of image `step` of `flight`.
+    pub(crate) fn shade(flight: u64, step: usize) -> u8 {
+        ((flight * 37 + step as u64 * 11) % 251) as u8
+    }
+
+    /// Latent code of an image of gray value `shade`.
+    pub(crate) fn code(shade: u8) -> [f32; LATENT] {
+        std::array::from_fn(|index| f32::from(shade) + index as f32 / 64.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_part_of_the_wrong_length_is_named() {
+        let sound = samples::with_images(samples::flight(3, 5, Outcome::Collided));
+        assert_eq!(sound.check(), Ok(()));
+        type Damage = fn(&mut CommittedFlight);
+        let damage: [(&str, Damage); 6] = [
+            ("actions", |flight| flight.actions.clear()),
+            ("observations", |flight| flight.observations.truncate(5)),
+            ("rewards", |flight| flight.rewards.push(0.0)),
+            ("reward terms", |flight| flight.reward_terms.truncate(4)),
+            ("level-up flags", |flight| flight.level_up.push(true)),
+            ("bytes of depth images", |flight| flight.depth.as_mut().unwrap().push(0)),
+        ];
+        for (what, damage) in damage {
+            let mut flight = sound.clone();
+            damage(&mut flight);
+            assert_eq!(flight.check().unwrap_err().what, what);
+        }
+    }
+
+    #[test]
+    fn the_previous_action_is_zero_at_take_off_and_then_the_one_before() {
+        let flight = samples::flight(3, 5, Outcome::Collided);
+        let mut vector = [f32::NAN; LATENT + 2 + ACTION];
+        flight.write_observation(0, Observation::LatentVelocityAction, &mut vector);
+        assert_eq!(vector[LATENT + 2..], [0.0, 0.0]);
+        flight.write_observation(5, Observation::LatentVelocityAction, &mut vector);
+        assert_eq!(vector[LATENT + 2..], flight.actions[4]);
+        assert_eq!(vector[..LATENT], flight.observations[5].latent);
+    }
+
+    #[test]
+    fn only_collision_and_destination_terminate() {
+        assert!(samples::flight(0, 1, Outcome::Collided).terminated());
+        assert!(samples::flight(0, 1, Outcome::ReachedEnd).terminated());
+        assert!(!samples::flight(0, 1, Outcome::TimedOut).terminated());
+    }
+}

@@ -1,0 +1,268 @@
+//! `flights.csv`: one row per committed training flight, in flight order.
+//!
+//! Row n is flight n, whoever flew it and whenever. A run that is resumed cuts the file back to the flights its checkpoint knows of, so what is in the
+//! file never says more than what was learned from, and never twice.
+
+use std::fs::{File, OpenOptions};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use skein_protocol::transition::Outcome;
+
+use crate::flight::CommittedFlight;
+
+/// A row of `flights.csv`; the fields are its columns.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FlightRow {
+    /// Number of the flight, from 0 without a gap.
+    pub flight: u64,
+    /// Epoch it belongs to.
+    pub epoch: u64,
+    /// Snapshot it was flown with.
+    pub policy_version: u64,
+    /// Who flew it: the one column that may differ between two runs of one configuration.
+    pub actor: u32,
+    /// Level it took off from, 1 is the first.
+    pub level: u8,
+    /// Steps flown.
+    pub steps: usize,
+    /// Walls passed.
+    pub walls_passed: u8,
+    /// Sum of its rewards, in the shortest decimal notation that reads back as the same number.
+    #[serde(rename = "return")]
+    pub total_reward: f32,
+    /// `collided`, `reached_end` or `timed_out`.
+    pub outcome: Outcome,
+}
+
+impl From<&CommittedFlight> for FlightRow {
+    fn from(flight: &CommittedFlight) -> Self {
+        Self {
+            flight: flight.flight.0,
+            epoch: flight.epoch.0,
+            policy_version: flight.policy_version.0,
+            actor: flight.actor.0,
+            level: flight.level,
+            steps: flight.steps(),
+            walls_passed: flight.walls_passed,
+            total_reward: flight.total_reward(),
+            outcome: flight.outcome,
+        }
+    }
+}
+
+/// Writes `flights.csv`.
+#[derive(Debug)]
+pub struct FlightsCsv {
+    path: PathBuf,
+    writer: csv::Writer<File>,
+}
+
+/// Why `flights.csv` cannot be written or continued.
+#[derive(Debug, thiserror::Error)]
+pub enum FlightsError {
+    /// The file system refuses.
+    #[error("cannot write {}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+    /// A row cannot be read back, or written.
+    #[error("{}: {source}", path.display())]
+    Row {
+        /// The file.
+        path: PathBuf,
+        /// Which, and why.
+        #[source]
+        source: csv::Error,
+    },
+    /// The rows are not those of the flights that the checkpoint knows of.
+    #[error("{} cannot be continued after {expected} flights: {problem}", path.display())]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// Flights it should hold.
+        expected: u64,
+        /// What it holds instead.
+        problem: String,
+    },
+}
+
+impl FlightsCsv {
+    /// Starts an empty file; one that is there is replaced.
+    ///
+    /// # Errors
+    /// [`FlightsError::Io`].
+    pub fn create(path: &Path) -> Result<Self, FlightsError> {
+        let file = File::create(path).map_err(|source| FlightsError::Io {
+            path: path.to_owned(),
+            source,
+        })?;
+        Ok(Self {
+            path: path.to_owned(),
+            writer: csv::Writer::from_writer(file),
+        })
+    }
+
+    /// Continues after the first `flights` rows; later rows, of flights whose learning was lost, are cut off.
+    ///
+    /// # Errors
+    /// [`FlightsError`] when the file does not hold flights 0 to `flights` - 1 in order.
+    pub fn resume(path: &Path, flights: u64) -> Result<Self, FlightsError> {
+        if flights == 0 {
+            return Self::create(path);
+        }
+        let io = |source| FlightsError::Io {
+            path: path.to_owned(),
+            source,
+        };
+        let mut file = OpenOptions::new().read(true).write(true).open(path).map_err(io)?;
+        let end = end_of_rows(path, &file, flights)?;
+        file.set_len(end).map_err(io)?;
+        io::Seek::seek(&mut file, io::SeekFrom::End(0)).map_err(io)?;
+        let writer = csv::WriterBuilder::new().has_headers(false).from_writer(file);
+        Ok(Self {
+            path: path.to_owned(),
+            writer,
+        })
+    }
+
+    /// Appends a row; it reaches the file with [`FlightsCsv::flush`].
+    ///
+    /// # Errors
+    /// [`FlightsError::Row`].
+    pub fn write(&mut self, row: &FlightRow) -> Result<(), FlightsError> {
+        self.writer.serialize(row).map_err(|source| FlightsError::Row {
+            path: self.path.clone(),
+            source,
+        })
+    }
+
+    /// Hands everything written to the operating system.
+    ///
+    /// # Errors
+    /// [`FlightsError::Io`].
+    pub fn flush(&mut self) -> Result<(), FlightsError> {
+        self.writer.flush().map_err(|source| FlightsError::Io {
+            path: self.path.clone(),
+            source,
+        })
+    }
+}
+
+/// Byte after the first `flights` rows, which must be flights 0, 1, 2, …
+fn end_of_rows(path: &Path, file: &File, flights: u64) -> Result<u64, FlightsError> {
+    let content = |problem| FlightsError::Content {
+        path: path.to_owned(),
+        expected: flights,
+        problem,
+    };
+    let row_error = |source| FlightsError::Row {
+        path: path.to_owned(),
+        source,
+    };
+    let mut reader = csv::Reader::from_reader(file);
+    let headers = reader.headers().map_err(row_error)?.clone();
+    let mut record = csv::StringRecord::new();
+    for expected in 0..flights {
+        if !reader.read_record(&mut record).map_err(row_error)? {
+            return Err(content(format!("it ends after {expected}")));
+        }
+        let row: FlightRow = record.deserialize(Some(&headers)).map_err(row_error)?;
+        if row.flight != expected {
+            return Err(content(format!("its row {expected} is flight {}", row.flight)));
+        }
+    }
+    Ok(reader.position().byte())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::flight::samples;
+
+    fn row(number: u64) -> FlightRow {
+        FlightRow::from(&samples::flight(number, 3, Outcome::ReachedEnd))
+    }
+
+    fn write(csv: &mut FlightsCsv, flights: std::ops::Range<u64>) {
+        flights.for_each(|flight| csv.write(&row(flight)).unwrap());
+        csv.flush().unwrap();
+    }
+
+    #[test]
+    fn columns_are_those_documented() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("flights.csv");
+        write(&mut FlightsCsv::create(&path).unwrap(), 0..1);
+        assert_eq!(
+            fs::read_to_string(&path).unwrap(),
+            "flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n0,0,0,0,1,3,0,0.03,reached_end\n"
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn returns_read_back_as_the_same_number(bits in any::<u32>()) {
+            let value = f32::from_bits(bits);
+            prop_assume!(value.is_finite());
+            let directory = tempfile::tempdir().unwrap();
+            let path = directory.path().join("flights.csv");
+            let mut csv = FlightsCsv::create(&path).unwrap();
+            csv.write(&FlightRow { total_reward: value, ..row(0) }).unwrap();
+            csv.flush().unwrap();
+            let read: FlightRow = csv::Reader::from_path(&path).unwrap().deserialize().next().unwrap().unwrap();
+            prop_assert_eq!(read.total_reward.to_bits(), bits);
+        }
+    }
+
+    #[test]
+    fn a_resumed_file_is_that_of_a_run_never_interrupted() {
+        let directory = tempfile::tempdir().unwrap();
+        let (whole, resumed) = (directory.path().join("whole.csv"), directory.path().join("resumed.csv"));
+        write(&mut FlightsCsv::create(&whole).unwrap(), 0..30);
+        for checkpoint in [0, 1, 20] {
+            write(&mut FlightsCsv::create(&resumed).unwrap(), 0..25);
+            write(&mut FlightsCsv::resume(&resumed, checkpoint).unwrap(), checkpoint..30);
+            assert_eq!(
+                fs::read(&whole).unwrap(),
+                fs::read(&resumed).unwrap(),
+                "resumed after {checkpoint}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_row_cut_short_behind_the_checkpoint_does_not_matter() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("flights.csv");
+        write(&mut FlightsCsv::create(&path).unwrap(), 0..5);
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, &text[..text.len() - 7]).unwrap();
+        write(&mut FlightsCsv::resume(&path, 4).unwrap(), 4..5);
+        assert_eq!(fs::read_to_string(&path).unwrap(), text);
+    }
+
+    #[test]
+    fn a_file_of_other_flights_is_not_continued() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("flights.csv");
+        write(&mut FlightsCsv::create(&path).unwrap(), 0..5);
+        let error = FlightsCsv::resume(&path, 6).unwrap_err().to_string();
+        assert!(
+            error.contains("flights.csv") && error.contains("ends after 5"),
+            "{error}"
+        );
+        write(&mut FlightsCsv::create(&path).unwrap(), 3..9);
+        let error = FlightsCsv::resume(&path, 2).unwrap_err().to_string();
+        assert!(error.contains("row 0 is flight 3"), "{error}");
+    }
+}

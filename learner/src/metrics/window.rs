@@ -1,0 +1,69 @@
+//! Averages over the latest flights.
+
+use std::collections::VecDeque;
+
+use serde::{Deserialize, Serialize};
+
+/// The mean of the latest values.
+///
+/// It is summed anew at every call, oldest value first: a running sum would drift, and would depend on where a run was resumed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MovingAverage {
+    window: usize,
+    values: VecDeque<f32>,
+}
+
+impl MovingAverage {
+    /// An empty one over `window` values, at least 1.
+    pub fn new(window: usize) -> Self {
+        Self {
+            window: window.max(1),
+            values: VecDeque::new(),
+        }
+    }
+
+    /// Takes in the latest value; the oldest leaves when the window is full.
+    pub fn push(&mut self, value: f32) {
+        if self.values.len() == self.window {
+            self.values.pop_front();
+        }
+        self.values.push_back(value);
+    }
+
+    /// The mean of what is in the window; `None` while it is empty.
+    pub fn mean(&self) -> Option<f64> {
+        let sum: f64 = self.values.iter().map(|&value| f64::from(value)).sum();
+        (!self.values.is_empty()).then(|| sum / self.values.len() as f64)
+    }
+
+    /// Whether as many values came in as the window holds: before, the mean is over fewer.
+    pub fn is_full(&self) -> bool {
+        self.values.len() == self.window
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mean_is_over_the_latest_values_only() {
+        let mut average = MovingAverage::new(3);
+        assert_eq!(average.mean(), None);
+        average.push(100.0);
+        assert_eq!((average.mean(), average.is_full()), (Some(100.0), false));
+        for value in [1.0, 2.0, 6.0] {
+            average.push(value);
+        }
+        assert_eq!((average.mean(), average.is_full()), (Some(3.0), true));
+    }
+
+    #[test]
+    fn a_large_value_leaves_no_trace_behind() {
+        let mut average = MovingAverage::new(2);
+        for value in [1e30, 0.125, 0.25] {
+            average.push(value);
+        }
+        assert_eq!(average.mean(), Some(0.1875));
+    }
+}

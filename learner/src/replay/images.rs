@@ -1,0 +1,109 @@
+//! Depth images of stored transitions, kept only while the VAE is trained.
+//!
+//! A flight's images are taken over in the block the flight brought them in, not copied. Images are numbered in order of arrival, so the image of a step's
+//! next observation is the following number, the closing image included. Nothing is dropped before the end: a transition that the ring overwrites
+//! leaves its images behind as training material for the VAE, and no row can ever point at an image of another flight. What bounds the store is
+//! that the VAE is frozen after a configured number of steps.
+
+use std::sync::Arc;
+
+use rand::{Rng, RngExt};
+use skein_protocol::{IMAGE_PIXELS, LATENT};
+
+/// Images, by number.
+#[derive(Debug)]
+pub(super) struct ImageStore {
+    /// One block a flight, shared with a checkpoint being written: `[steps + 1, 72, 128]`.
+    flights: Vec<Arc<Vec<u8>>>,
+    /// Number of each block's first image.
+    first: Vec<u32>,
+    len: usize,
+    limit: usize,
+}
+
+impl ImageStore {
+    /// An empty store for at most `limit` images.
+    pub(super) fn new(limit: usize) -> Self {
+        // Numbers are 32 bits; the configuration's largest limit is far below.
+        Self {
+            flights: Vec::new(),
+            first: Vec::new(),
+            len: 0,
+            limit: limit.min(u32::MAX as usize),
+        }
+    }
+
+    /// Images stored.
+    pub(super) fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Images at most.
+    pub(super) fn limit(&self) -> usize {
+        self.limit
+    }
+
+    /// Whether `images` more have room.
+    pub(super) fn has_room(&self, images: usize) -> bool {
+        self.len + images <= self.limit
+    }
+
+    /// Takes over a flight's images; returns the number of the first. The caller made sure of [`ImageStore::has_room`].
+    pub(super) fn push(&mut self, images: Arc<Vec<u8>>) -> u32 {
+        let first = self.len as u32;
+        self.len += images.len() / IMAGE_PIXELS;
+        self.first.push(first);
+        self.flights.push(images);
+        first
+    }
+
+    /// The blocks, in order.
+    pub(super) fn flights(&self) -> &[Arc<Vec<u8>>] {
+        &self.flights
+    }
+
+    /// Draws `count` images uniformly with replacement into `into`, `[count, 72, 128]`.
+    pub(super) fn sample(&self, rng: &mut impl Rng, count: usize, into: &mut Vec<u8>) {
+        into.clear();
+        for _ in 0..count {
+            into.extend_from_slice(self.image(rng.random_range(0..self.len as u32)));
+        }
+    }
+
+    /// The latent code of every image, by number. `encode` sees `chunk` images at a time, the last time what remains, whatever the flights' lengths:
+    /// a store restored from a checkpoint is encoded in the same pieces.
+    pub(super) fn encode<E>(
+        &self,
+        chunk: usize,
+        mut encode: impl FnMut(&[u8]) -> Result<Vec<[f32; LATENT]>, E>,
+    ) -> Result<Vec<[f32; LATENT]>, E> {
+        let mut latents = Vec::with_capacity(self.len);
+        let mut images = Vec::with_capacity(chunk.min(self.len) * IMAGE_PIXELS);
+        let mut pending = self
+            .flights
+            .iter()
+            .flat_map(|flight| flight.chunks_exact(IMAGE_PIXELS))
+            .peekable();
+        while pending.peek().is_some() {
+            images.clear();
+            pending
+                .by_ref()
+                .take(chunk)
+                .for_each(|image| images.extend_from_slice(image));
+            let codes = encode(&images)?;
+            assert_eq!(
+                codes.len(),
+                images.len() / IMAGE_PIXELS,
+                "an encoder returns one code an image"
+            );
+            latents.extend(codes);
+        }
+        Ok(latents)
+    }
+
+    fn image(&self, number: u32) -> &[u8] {
+        let flight = self.first.partition_point(|&first| first <= number) - 1;
+        let start = (number - self.first[flight]) as usize * IMAGE_PIXELS;
+        &self.flights[flight][start..start + IMAGE_PIXELS]
+    }
+}

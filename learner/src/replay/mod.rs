@@ -1,0 +1,252 @@
+//! The split replay buffer (paper, section 3.5).
+//!
+//! Successful avoidance is rare in the beginning and would drown among everything else, so it has a part of its own with a fixed share of every
+//! minibatch. Each part is a [`ring`] of self-contained rows. Whole flights go in, in flight order, and nothing here is random but what the
+//! caller's seeded generator draws: the content is a function of the flights, and a minibatch one of content and seed.
+//!
+//! While the VAE is trained, the depth [`images`] of stored transitions are kept: the VAE learns from them, and when it is frozen the latent codes of all
+//! rows, each made by the encoder of its day, are made anew with the final one. Then the images go.
+
+mod images;
+mod ring;
+mod state;
+mod success;
+#[cfg(test)]
+mod tests;
+
+use std::sync::Arc;
+
+use rand::{Rng, RngExt};
+use skein_protocol::config::{Config, Observation, ReplaySection};
+use skein_protocol::ids::FlightId;
+use skein_protocol::{ACTION, LATENT};
+
+use crate::flight::{CommittedFlight, FlightFault};
+use images::ImageStore;
+use ring::{Ring, RowLayout};
+
+pub use ring::RingState;
+pub use state::{ReplayState, RestoreError};
+use success::success_steps;
+
+/// The split replay buffer.
+#[derive(Debug)]
+pub struct Replay {
+    section: ReplaySection,
+    observation: Observation,
+    success: Ring,
+    regular: Ring,
+    /// Until the VAE is frozen.
+    images: Option<ImageStore>,
+}
+
+/// A minibatch of transitions in flat buffers that are reused from draw to draw.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Minibatch {
+    /// `[batch, observation]`.
+    pub observations: Vec<f32>,
+    /// `[batch, 2]`.
+    pub actions: Vec<f32>,
+    /// `[batch]`.
+    pub rewards: Vec<f32>,
+    /// `[batch, observation]`.
+    pub next_observations: Vec<f32>,
+    /// `[batch]`: 1 where the flight ended in a state without a future, else 0. A flight's last step before the time limit is 0: it bootstraps.
+    pub terminated: Vec<f32>,
+    /// Slots drawn, before any row is touched: the loads of many rows are then under way at one time.
+    slots: Vec<usize>,
+}
+
+/// Why a flight cannot be stored. Nothing of it is.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum InsertError {
+    /// Its parts do not belong together.
+    #[error(transparent)]
+    Fault(#[from] FlightFault),
+    /// It came without depth images while the VAE is trained.
+    #[error(
+        "flight {flight} has no depth images, but the VAE is not frozen yet and its latent codes will have to be made anew"
+    )]
+    NoImages {
+        /// The flight.
+        flight: FlightId,
+    },
+    /// The images have no room.
+    #[error(
+        "{found} depth images of flight {flight} exceed the {limit} that the VAE's training can need, {held} of them held: the VAE should have been frozen"
+    )]
+    TooManyImages {
+        /// The flight.
+        flight: FlightId,
+        /// Its images.
+        found: usize,
+        /// Images held.
+        held: usize,
+        /// Images that may be held.
+        limit: usize,
+    },
+}
+
+impl Replay {
+    /// An empty buffer for the run configured by `config`.
+    pub fn new(config: &Config) -> Self {
+        let layout = RowLayout {
+            observation: config.learning.observation.len(),
+        };
+        let (success, regular) = capacities(&config.replay);
+        Self {
+            section: config.replay.clone(),
+            observation: config.learning.observation,
+            success: Ring::new(success, layout),
+            regular: Ring::new(regular, layout),
+            images: Some(ImageStore::new(image_limit(config))),
+        }
+    }
+
+    /// Transitions held in both parts.
+    pub fn len(&self) -> usize {
+        self.success.len() + self.regular.len()
+    }
+
+    /// Whether there is nothing to draw from.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Transitions held in the success part.
+    pub fn success_len(&self) -> usize {
+        self.success.len()
+    }
+
+    /// Depth images held; `None` once the VAE is frozen.
+    pub fn image_count(&self) -> Option<usize> {
+        self.images.as_ref().map(ImageStore::len)
+    }
+
+    /// Stores all transitions of `flight`, in order, each in the part the success rule says. Its depth images are taken over while the VAE is trained, and
+    /// dropped after.
+    ///
+    /// # Errors
+    /// [`InsertError`]; the buffer is as before.
+    pub fn insert(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
+        flight.check()?;
+        let first_image = self.take_images(&mut flight)?;
+        let success = success_steps(&flight.level_up, &self.section);
+        let last = flight.steps() - 1;
+        for (step, &success) in success.iter().enumerate() {
+            let ring = if success { &mut self.success } else { &mut self.regular };
+            let row = ring.claim(first_image.map(|first| first + step as u32));
+            flight.write_observation(step, self.observation, row.observation);
+            flight.write_observation(step + 1, self.observation, row.next_observation);
+            row.action.copy_from_slice(&flight.actions[step]);
+            *row.reward = flight.rewards[step];
+            *row.terminated = f32::from(step == last && flight.terminated());
+        }
+        Ok(())
+    }
+
+    /// Draws `count` transitions uniformly with replacement from each part in the configured ratio; all from the other part while one is empty.
+    ///
+    /// # Panics
+    /// When the buffer [is empty](Replay::is_empty): the warm-up is over before anything is drawn.
+    pub fn sample(&self, rng: &mut impl Rng, count: usize, into: &mut Minibatch) {
+        assert!(!self.is_empty(), "nothing can be drawn from an empty replay buffer");
+        let from_success = match (self.success.len(), self.regular.len()) {
+            (0, _) => 0,
+            (_, 0) => count,
+            _ => (count as f64 * self.section.success_share).round() as usize,
+        };
+        into.clear();
+        into.gather(&self.success, rng, from_success);
+        into.gather(&self.regular, rng, count - from_success);
+    }
+
+    /// Draws `count` depth images uniformly with replacement, `[count, 72, 128]`, for a step of the VAE.
+    ///
+    /// # Panics
+    /// When there are none: none were inserted yet, or the VAE is frozen.
+    pub fn sample_images(&self, rng: &mut impl Rng, count: usize, into: &mut Vec<u8>) {
+        let images = self.images.as_ref().filter(|images| images.len() > 0);
+        images
+            .expect("the VAE is trained only before it is frozen and after flights came in")
+            .sample(rng, count, into);
+    }
+
+    /// Ends the VAE's training: every stored latent code is made anew by `encode`, and the images are dropped.
+    ///
+    /// `encode` turns up to `chunk` images, `[n, 72, 128]`, into as many codes. Does nothing if the VAE is frozen already.
+    ///
+    /// # Errors
+    /// The first that `encode` returns; the buffer is as before.
+    pub fn freeze_latents<E>(
+        &mut self,
+        chunk: usize,
+        encode: impl FnMut(&[u8]) -> Result<Vec<[f32; LATENT]>, E>,
+    ) -> Result<(), E> {
+        if let Some(images) = &self.images {
+            let latents = images.encode(chunk, encode)?;
+            self.success.replace_latents(&latents);
+            self.regular.replace_latents(&latents);
+            self.images = None;
+        }
+        Ok(())
+    }
+
+    /// Hands the flight's images to the store; the number of the first, if images are stored.
+    fn take_images(&mut self, flight: &mut CommittedFlight) -> Result<Option<u32>, InsertError> {
+        let Some(store) = &mut self.images else {
+            return Ok(None);
+        };
+        let (id, found) = (flight.flight, flight.steps() + 1);
+        if !store.has_room(found) {
+            let (held, limit) = (store.len(), store.limit());
+            return Err(InsertError::TooManyImages {
+                flight: id,
+                found,
+                held,
+                limit,
+            });
+        }
+        let images = flight.depth.take().ok_or(InsertError::NoImages { flight: id })?;
+        Ok(Some(store.push(Arc::new(images))))
+    }
+}
+
+impl Minibatch {
+    fn clear(&mut self) {
+        self.observations.clear();
+        self.actions.clear();
+        self.rewards.clear();
+        self.next_observations.clear();
+        self.terminated.clear();
+    }
+
+    /// Appends `count` rows drawn from `ring`.
+    fn gather(&mut self, ring: &Ring, rng: &mut impl Rng, count: usize) {
+        self.slots.clear();
+        self.slots.extend((0..count).map(|_| rng.random_range(0..ring.len())));
+        self.actions.reserve(count * ACTION);
+        for &slot in &self.slots {
+            let row = ring.row(slot);
+            self.observations.extend_from_slice(row.observation);
+            self.next_observations.extend_from_slice(row.next_observation);
+            self.actions.extend_from_slice(row.action);
+            self.rewards.push(row.reward);
+            self.terminated.push(row.terminated);
+        }
+    }
+}
+
+/// Capacities of the success and the regular part; each has room for one transition at least.
+fn capacities(section: &ReplaySection) -> (usize, usize) {
+    let success = (section.capacity as f64 * section.success_share).round() as usize;
+    let success = success.clamp(1, section.capacity - 1);
+    (success, section.capacity - success)
+}
+
+/// Images that the VAE's training can leave behind: before the epoch in which it is frozen, fewer than `vae.train_steps` steps were flown, with at
+/// most as many closing images; then come the flights of one epoch.
+fn image_limit(config: &Config) -> usize {
+    let epoch = config.learning.flights_per_epoch as usize * config.transport.max_records_per_flight;
+    2 * config.vae.train_steps + epoch
+}

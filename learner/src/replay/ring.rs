@@ -1,0 +1,170 @@
+//! One part of the replay: a ring of transition rows.
+//!
+//! A row holds everything an update needs of one transition, observation and next observation both, contiguous in memory: a minibatch of random rows
+//! is bound by cache misses, and a row costs one run of neighbouring cache lines where a table per quantity would cost one miss each.
+
+use skein_protocol::{ACTION, LATENT};
+
+/// Where the parts of a row lie: `[observation | next observation | action | reward | terminated]`, all `f32`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct RowLayout {
+    /// Length of an observation vector.
+    pub(super) observation: usize,
+}
+
+/// Mutable view of one row.
+pub(super) struct RowMut<'a> {
+    pub(super) observation: &'a mut [f32],
+    pub(super) next_observation: &'a mut [f32],
+    pub(super) action: &'a mut [f32],
+    pub(super) reward: &'a mut f32,
+    pub(super) terminated: &'a mut f32,
+}
+
+/// View of one row.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Row<'a> {
+    pub(super) observation: &'a [f32],
+    pub(super) next_observation: &'a [f32],
+    pub(super) action: &'a [f32],
+    pub(super) reward: f32,
+    pub(super) terminated: f32,
+}
+
+impl RowLayout {
+    /// Values in a row.
+    pub(super) fn width(self) -> usize {
+        2 * self.observation + ACTION + 2
+    }
+
+    fn row(self, values: &[f32]) -> Row<'_> {
+        let (observation, rest) = values.split_at(self.observation);
+        let (next_observation, rest) = rest.split_at(self.observation);
+        let (action, rest) = rest.split_at(ACTION);
+        Row {
+            observation,
+            next_observation,
+            action,
+            reward: rest[0],
+            terminated: rest[1],
+        }
+    }
+
+    fn row_mut(self, values: &mut [f32]) -> RowMut<'_> {
+        let (observation, rest) = values.split_at_mut(self.observation);
+        let (next_observation, rest) = rest.split_at_mut(self.observation);
+        let (action, rest) = rest.split_at_mut(ACTION);
+        let (reward, terminated) = rest.split_at_mut(1);
+        RowMut {
+            observation,
+            next_observation,
+            action,
+            reward: &mut reward[0],
+            terminated: &mut terminated[0],
+        }
+    }
+}
+
+/// A ring of rows; the oldest is overwritten when it is full.
+#[derive(Debug)]
+pub(super) struct Ring {
+    layout: RowLayout,
+    capacity: usize,
+    /// Rows ever inserted; tells the next slot and how many slots are filled.
+    inserted: u64,
+    /// `[filled, width]`.
+    rows: Vec<f32>,
+    /// The depth image of each row's observation, the next observation's follows it; `[filled]`, or empty once the images are gone.
+    images: Vec<u32>,
+}
+
+impl Ring {
+    /// An empty ring. The memory of all rows is set aside at once, and touched only as they fill: growth never copies them.
+    pub(super) fn new(capacity: usize, layout: RowLayout) -> Self {
+        let rows = Vec::with_capacity(capacity * layout.width());
+        Self {
+            layout,
+            capacity,
+            inserted: 0,
+            rows,
+            images: Vec::new(),
+        }
+    }
+
+    /// A ring as it was, or what is wrong with the parts.
+    pub(super) fn restore(capacity: usize, layout: RowLayout, state: RingState) -> Result<Self, String> {
+        let RingState { inserted, rows, images } = state;
+        let mut ring = Self::new(capacity, layout);
+        ring.inserted = inserted;
+        if rows.len() != ring.len() * layout.width() {
+            return Err(format!(
+                "{inserted} transitions were inserted into a part for {capacity}, so {} values are expected, but {} are stored",
+                ring.len() * layout.width(),
+                rows.len()
+            ));
+        }
+        ring.rows.extend_from_slice(&rows);
+        ring.images = images;
+        Ok(ring)
+    }
+
+    /// Everything that determines the ring's future.
+    pub(super) fn state(&self) -> RingState {
+        RingState {
+            inserted: self.inserted,
+            rows: self.rows.clone(),
+            images: self.images.clone(),
+        }
+    }
+
+    /// Rows filled.
+    pub(super) fn len(&self) -> usize {
+        usize::try_from(self.inserted).unwrap_or(usize::MAX).min(self.capacity)
+    }
+
+    /// Claims the next slot, the oldest row's if the ring is full. `image` is the number of the observation's depth image while images are stored.
+    pub(super) fn claim(&mut self, image: Option<u32>) -> RowMut<'_> {
+        let width = self.layout.width();
+        let slot = (self.inserted % self.capacity as u64) as usize;
+        if self.len() < self.capacity {
+            self.rows.resize(self.rows.len() + width, 0.0);
+            self.images.extend(image);
+        } else if let Some(image) = image {
+            self.images[slot] = image;
+        }
+        self.inserted += 1;
+        self.layout.row_mut(&mut self.rows[slot * width..(slot + 1) * width])
+    }
+
+    /// The row in `slot`, below [`Ring::len`].
+    pub(super) fn row(&self, slot: usize) -> Row<'_> {
+        let width = self.layout.width();
+        self.layout.row(&self.rows[slot * width..(slot + 1) * width])
+    }
+
+    /// The image number of every row, `[filled]`; empty once the images are gone.
+    pub(super) fn images(&self) -> &[u32] {
+        &self.images
+    }
+
+    /// Rewrites the latent part of both observations of every row from `latents`, one per image, and forgets the images.
+    pub(super) fn replace_latents(&mut self, latents: &[[f32; LATENT]]) {
+        let images = std::mem::take(&mut self.images);
+        for (values, image) in self.rows.chunks_exact_mut(self.layout.width()).zip(images) {
+            let row = self.layout.row_mut(values);
+            row.observation[..LATENT].copy_from_slice(&latents[image as usize]);
+            row.next_observation[..LATENT].copy_from_slice(&latents[image as usize + 1]);
+        }
+    }
+}
+
+/// A ring's content, for a checkpoint.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RingState {
+    /// Transitions ever inserted.
+    pub inserted: u64,
+    /// Rows in slot order, `[filled, width]`: `[observation | next observation | action | reward | terminated]`.
+    pub rows: Vec<f32>,
+    /// Number of the depth image of each row's observation, `[filled]`; empty once the VAE is frozen.
+    pub images: Vec<u32>,
+}

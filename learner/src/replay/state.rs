@@ -1,0 +1,107 @@
+//! The buffer's content for a checkpoint, and back.
+
+use std::sync::Arc;
+
+use skein_protocol::IMAGE_PIXELS;
+use skein_protocol::config::Config;
+
+use super::images::ImageStore;
+use super::ring::{Ring, RingState};
+use super::{Replay, capacities};
+
+/// Everything in a [`Replay`] that determines what follows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReplayState {
+    /// The success part.
+    pub success: RingState,
+    /// The regular part.
+    pub regular: RingState,
+    /// Depth images, one block a flight, `[steps + 1, 72, 128]`; `None` once the VAE is frozen. Shared with the buffer, not copied.
+    pub images: Option<Vec<Arc<Vec<u8>>>>,
+}
+
+/// Why a stored content does not fit the configured buffer.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("the replay buffer's {part} cannot be restored: {problem}")]
+pub struct RestoreError {
+    /// `success part`, `regular part` or `depth images`.
+    pub part: &'static str,
+    /// What does not fit.
+    pub problem: String,
+}
+
+impl Replay {
+    /// The content. Rows are copied, which takes some 10 ms for 2^17 of them; images are shared.
+    pub fn state(&self) -> ReplayState {
+        ReplayState {
+            success: self.success.state(),
+            regular: self.regular.state(),
+            images: self.images.as_ref().map(|images| images.flights().to_vec()),
+        }
+    }
+
+    /// The buffer as it was when [`Replay::state`] was taken.
+    ///
+    /// # Errors
+    /// [`RestoreError`] when the content does not fit `config`.
+    pub fn restore(config: &Config, state: ReplayState) -> Result<Self, RestoreError> {
+        let mut replay = Self::new(config);
+        let layout = super::RowLayout {
+            observation: config.learning.observation.len(),
+        };
+        let (success, regular) = capacities(&config.replay);
+        let fail = |part| move |problem| RestoreError { part, problem };
+        replay.success = Ring::restore(success, layout, state.success).map_err(fail("success part"))?;
+        replay.regular = Ring::restore(regular, layout, state.regular).map_err(fail("regular part"))?;
+        match state.images {
+            Some(blocks) => replay.images.iter_mut().try_for_each(|store| fill(store, &blocks)),
+            None => {
+                replay.images = None;
+                Ok(())
+            }
+        }
+        .and_then(|()| check_rows(replay.images.as_ref(), [&replay.success, &replay.regular]))
+        .map_err(fail("depth images"))?;
+        Ok(replay)
+    }
+}
+
+fn fill(store: &mut ImageStore, blocks: &[Arc<Vec<u8>>]) -> Result<(), String> {
+    for block in blocks {
+        let images = block.len() / IMAGE_PIXELS;
+        if block.len() % IMAGE_PIXELS != 0 || !store.has_room(images) {
+            return Err(format!(
+                "a flight's {} bytes are no whole images of {IMAGE_PIXELS}, or more than the {} images that may be held",
+                block.len(),
+                store.limit()
+            ));
+        }
+        store.push(Arc::clone(block));
+    }
+    Ok(())
+}
+
+/// Every row has an image that is stored, or, without a store, none has.
+fn check_rows(store: Option<&ImageStore>, rings: [&Ring; 2]) -> Result<(), String> {
+    let stored = store.map_or(0, ImageStore::len);
+    for ring in rings {
+        let expected = if store.is_some() { ring.len() } else { 0 };
+        if ring.images().len() != expected {
+            return Err(format!(
+                "{} transitions have an image where {expected} should",
+                ring.images().len()
+            ));
+        }
+        // The next observation's image follows.
+        if let Some(last) = ring
+            .images()
+            .iter()
+            .map(|&image| image as usize + 1)
+            .max()
+            .filter(|&last| last >= stored)
+        {
+            return Err(format!("a transition needs image {last} of {stored}"));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,449 @@
+//! The buffer against a naive model of it, and its claims one by one.
+
+use std::collections::VecDeque;
+use std::convert::Infallible;
+
+use proptest::prelude::*;
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
+use skein_protocol::IMAGE_PIXELS;
+use skein_protocol::config::SuccessRule;
+use skein_protocol::transition::Outcome;
+
+use super::*;
+use crate::flight::samples::{code, flight, shade, with_images};
+
+fn config(capacity: usize, observation: Observation) -> Config {
+    let mut config = Config::default();
+    config.replay.capacity = capacity;
+    config.replay.success_share = 0.25;
+    config.learning.observation = observation;
+    config.vae.train_steps = 500;
+    config
+}
+
+/// A buffer whose VAE is frozen from the start.
+fn frozen(config: &Config) -> Replay {
+    let mut replay = Replay::new(config);
+    replay.freeze_latents(1, |_| Ok::<_, Infallible>(Vec::new())).unwrap();
+    replay
+}
+
+fn encode(images: &[u8]) -> Result<Vec<[f32; LATENT]>, Infallible> {
+    Ok(images
+        .chunks_exact(IMAGE_PIXELS)
+        .map(|image| final_code(image[0]))
+        .collect())
+}
+
+/// What the final encoder makes of an image, in contrast to [`code`].
+fn final_code(shade: u8) -> [f32; LATENT] {
+    code(shade).map(|value| -value - 1.0)
+}
+
+/// A transition, owned.
+#[derive(Debug, Clone, PartialEq)]
+struct Transition {
+    observation: Vec<f32>,
+    next_observation: Vec<f32>,
+    action: [f32; ACTION],
+    reward: f32,
+    terminated: f32,
+}
+
+/// The model: both parts as queues of owned transitions, the oldest in front.
+struct Model {
+    parts: [(VecDeque<Transition>, usize); 2],
+    observation: Observation,
+    section: ReplaySection,
+}
+
+impl Model {
+    fn new(config: &Config) -> Self {
+        let (success, regular) = capacities(&config.replay);
+        let parts = [(VecDeque::new(), success), (VecDeque::new(), regular)];
+        Self {
+            parts,
+            observation: config.learning.observation,
+            section: config.replay.clone(),
+        }
+    }
+
+    fn insert(&mut self, flight: &CommittedFlight) {
+        for step in 0..flight.steps() {
+            let observed = |step: usize| {
+                let mut vector = flight.observations[step].latent.to_vec();
+                if self.observation != Observation::Latent {
+                    vector.extend(&flight.observations[step].velocity_mps[1..]);
+                }
+                if self.observation == Observation::LatentVelocityAction {
+                    vector.extend(if step == 0 { [0.0; 2] } else { flight.actions[step - 1] });
+                }
+                vector
+            };
+            let ends = step + 1 == flight.steps() && flight.outcome != Outcome::TimedOut;
+            let transition = Transition {
+                observation: observed(step),
+                next_observation: observed(step + 1),
+                action: flight.actions[step],
+                reward: flight.rewards[step],
+                terminated: if ends { 1.0 } else { 0.0 },
+            };
+            let ahead = match self.section.success {
+                SuccessRule::LevelUp => 0,
+                SuccessRule::Approach => self.section.approach_steps,
+            };
+            let success = flight.level_up[step..].iter().take(ahead + 1).any(|&level_up| level_up);
+            let (part, capacity) = &mut self.parts[usize::from(!success)];
+            part.push_back(transition);
+            if part.len() > *capacity {
+                part.pop_front();
+            }
+        }
+    }
+
+    fn set_latents(&mut self, latent: impl Fn(&[f32]) -> [f32; LATENT]) {
+        for transition in self.parts.iter_mut().flat_map(|(part, _)| part) {
+            for vector in [&mut transition.observation, &mut transition.next_observation] {
+                let made = latent(vector);
+                vector[..LATENT].copy_from_slice(&made);
+            }
+        }
+    }
+}
+
+/// A ring's transitions, the oldest first.
+fn transitions(ring: &Ring) -> Vec<Transition> {
+    let state = ring.state();
+    let oldest = if state.inserted as usize > ring.len() {
+        state.inserted as usize % ring.len()
+    } else {
+        0
+    };
+    (0..ring.len())
+        .map(|index| ring.row((oldest + index) % ring.len()))
+        .map(|row| Transition {
+            observation: row.observation.to_vec(),
+            next_observation: row.next_observation.to_vec(),
+            action: row.action.try_into().unwrap(),
+            reward: row.reward,
+            terminated: row.terminated,
+        })
+        .collect()
+}
+
+fn assert_same(replay: &Replay, model: &Model) {
+    assert_eq!(transitions(&replay.success), Vec::from(model.parts[0].0.clone()));
+    assert_eq!(transitions(&replay.regular), Vec::from(model.parts[1].0.clone()));
+}
+
+prop_compose! {
+    /// Flights of 1 to 12 steps with crossings anywhere and every outcome.
+    fn flights()(
+        shapes in prop::collection::vec((prop::collection::vec(prop::bool::weighted(0.2), 1..12), 0..3_usize), 1..20)
+    ) -> Vec<CommittedFlight> {
+        shapes
+            .into_iter()
+            .enumerate()
+            .map(|(number, (level_up, outcome))| {
+                let outcome = [Outcome::Collided, Outcome::ReachedEnd, Outcome::TimedOut][outcome];
+                let mut flight = flight(number as u64, level_up.len(), outcome);
+                flight.level_up = level_up;
+                flight
+            })
+            .collect()
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    /// Overwriting, classification, freezing at any point, saving and restoring at any point: always what the model holds.
+    #[test]
+    fn holds_what_a_naive_model_holds(
+        flights in flights(),
+        capacity in 4..80_usize,
+        freeze_after in 0..20_usize,
+        observation in prop::sample::select(vec![
+            Observation::Latent, Observation::LatentVelocity, Observation::LatentVelocityAction,
+        ]),
+        rule in prop::sample::select(vec![SuccessRule::LevelUp, SuccessRule::Approach]),
+        chunk in 1..9_usize,
+    ) {
+        let mut config = config(capacity, observation);
+        config.replay.success = rule;
+        config.replay.approach_steps = 3;
+        let (mut replay, mut model) = (Replay::new(&config), Model::new(&config));
+        for (number, flight) in flights.iter().enumerate() {
+            if number == freeze_after {
+                replay.freeze_latents(chunk, encode).unwrap();
+                model.set_latents(|vector| final_code(vector[0] as u8));
+            }
+            let images_live = replay.image_count().is_some();
+            replay.insert(if images_live { with_images(flight.clone()) } else { flight.clone() }).unwrap();
+            model.insert(flight);
+            assert_same(&replay, &model);
+            let restored = Replay::restore(&config, replay.state()).unwrap();
+            prop_assert_eq!(restored.state(), replay.state());
+            replay = restored;
+        }
+        prop_assert!(replay.len() <= capacity);
+        prop_assert_eq!(replay.success_len(), model.parts[0].0.len());
+    }
+}
+
+#[test]
+fn a_minibatch_holds_the_configured_share_of_success() {
+    let mut replay = frozen(&config(1000, Observation::Latent));
+    let mut crossing = flight(1, 20, Outcome::Collided);
+    crossing.level_up[7] = true;
+    replay.insert(crossing).unwrap();
+    let mut batch = Minibatch::default();
+    for (count, success) in [(256, 64), (8, 2), (2, 1), (1, 0)] {
+        replay.sample(&mut Pcg64Mcg::seed_from_u64(1), count, &mut batch);
+        let marked = batch.rewards.iter().filter(|&&reward| reward == 10.07).count();
+        assert_eq!((batch.rewards.len(), marked), (count, success));
+        assert_eq!(batch.observations.len(), count * LATENT);
+        assert_eq!(batch.next_observations.len(), count * LATENT);
+        assert_eq!(batch.actions.len(), count * ACTION);
+        assert_eq!(batch.terminated.len(), count);
+    }
+}
+
+#[test]
+fn an_empty_part_is_made_up_for_by_the_other() {
+    for level_up in [false, true] {
+        let mut replay = frozen(&config(1000, Observation::Latent));
+        let mut one_sided = flight(1, 20, Outcome::Collided);
+        one_sided.level_up.fill(level_up);
+        replay.insert(one_sided).unwrap();
+        let mut batch = Minibatch::default();
+        replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 64, &mut batch);
+        assert_eq!(batch.rewards.len(), 64);
+    }
+}
+
+#[test]
+fn every_transition_of_a_part_is_equally_likely() {
+    let mut replay = frozen(&config(1000, Observation::Latent));
+    replay.insert(flight(0, 10, Outcome::Collided)).unwrap();
+    let mut batch = Minibatch::default();
+    replay.sample(&mut Pcg64Mcg::seed_from_u64(5), 100_000, &mut batch);
+    for step in 0..10 {
+        let drawn = batch
+            .rewards
+            .iter()
+            .filter(|&&reward| reward == step as f32 / 100.0)
+            .count();
+        // Five standard deviations of a binomial count of 100,000 draws at 1/10.
+        assert!(drawn.abs_diff(10_000) < 475, "step {step} was drawn {drawn} times");
+    }
+}
+
+#[test]
+fn a_minibatch_is_a_function_of_content_and_seed() {
+    let mut replay = frozen(&config(100, Observation::LatentVelocity));
+    for number in 0..20 {
+        replay.insert(flight(number, 9, Outcome::Collided)).unwrap();
+    }
+    let draw = |seed| {
+        let mut batch = Minibatch::default();
+        replay.sample(&mut Pcg64Mcg::seed_from_u64(seed), 64, &mut batch);
+        batch
+    };
+    assert_eq!(draw(1), draw(1));
+    assert_ne!(draw(1), draw(2));
+}
+
+#[test]
+fn rows_of_a_minibatch_belong_together() {
+    let mut replay = frozen(&config(100, Observation::LatentVelocityAction));
+    for number in 0..20 {
+        replay.insert(flight(number, 9, Outcome::Collided)).unwrap();
+    }
+    let mut batch = Minibatch::default();
+    replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 64, &mut batch);
+    let width = Observation::LatentVelocityAction.len();
+    for index in 0..64 {
+        let observation = &batch.observations[index * width..(index + 1) * width];
+        let next = &batch.next_observations[index * width..(index + 1) * width];
+        let at = observation[LATENT] - 0.25;
+        assert_eq!(
+            next[LATENT],
+            at + 1.25,
+            "the next observation is one step later in the same flight"
+        );
+        assert_eq!(batch.rewards[index], at / 100.0);
+        assert_eq!(
+            batch.actions[2 * index..2 * index + 2],
+            next[LATENT + 2..],
+            "what is done now was done before then"
+        );
+        assert_eq!(batch.terminated[index] == 1.0, at % 1000.0 == 8.0);
+    }
+}
+
+#[test]
+fn a_truncated_flight_is_not_terminated_anywhere() {
+    for (outcome, expected) in [
+        (Outcome::TimedOut, 0.0),
+        (Outcome::Collided, 1.0),
+        (Outcome::ReachedEnd, 1.0),
+    ] {
+        let mut replay = frozen(&config(100, Observation::Latent));
+        replay.insert(flight(1, 6, outcome)).unwrap();
+        let terminated: Vec<_> = transitions(&replay.regular).iter().map(|row| row.terminated).collect();
+        assert_eq!(terminated, [0.0, 0.0, 0.0, 0.0, 0.0, expected]);
+    }
+}
+
+#[test]
+fn memory_is_bounded_and_set_aside_once() {
+    let config = config(64, Observation::Latent);
+    let mut replay = frozen(&config);
+    replay.insert(flight(0, 1, Outcome::Collided)).unwrap();
+    let first_row = replay.regular.row(0).observation.as_ptr();
+    for number in 1..100 {
+        replay.insert(flight(number, 9, Outcome::Collided)).unwrap();
+    }
+    assert_eq!(replay.len(), 48, "the regular part is full, the success part empty");
+    assert_eq!(
+        replay.regular.row(0).observation.as_ptr(),
+        first_row,
+        "no growth moved the rows"
+    );
+    let state = replay.state().regular;
+    assert_eq!((state.rows.len(), state.images.len()), (48 * (2 * LATENT + 4), 0));
+}
+
+#[test]
+fn more_images_than_training_can_need_are_refused_and_nothing_is_stored() {
+    let mut config = config(64, Observation::Latent);
+    config.vae.train_steps = 10;
+    config.learning.flights_per_epoch = 1;
+    config.transport.max_records_per_flight = 20;
+    let mut replay = Replay::new(&config);
+    replay.insert(with_images(flight(0, 30, Outcome::Collided))).unwrap();
+    let before = replay.state();
+    let error = replay.insert(with_images(flight(1, 9, Outcome::Collided))).unwrap_err();
+    assert!(
+        matches!(
+            error,
+            InsertError::TooManyImages {
+                found: 10,
+                held: 31,
+                limit: 40,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    assert_eq!(replay.state(), before);
+}
+
+#[test]
+fn a_flight_without_images_is_refused_while_the_vae_is_trained() {
+    let mut replay = Replay::new(&config(64, Observation::Latent));
+    let error = replay.insert(flight(7, 3, Outcome::Collided)).unwrap_err();
+    assert_eq!(error, InsertError::NoImages { flight: FlightId(7) });
+    assert!(replay.is_empty());
+}
+
+#[test]
+fn images_are_dropped_when_the_vae_is_frozen_and_no_more_are_taken() {
+    let mut replay = Replay::new(&config(64, Observation::Latent));
+    replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
+    assert_eq!(replay.image_count(), Some(6));
+    replay.freeze_latents(4, encode).unwrap();
+    replay.insert(with_images(flight(1, 5, Outcome::Collided))).unwrap();
+    assert_eq!(replay.image_count(), None);
+    assert_eq!(replay.state().images, None);
+}
+
+#[test]
+fn a_failed_encoder_leaves_everything_as_it_was() {
+    let mut replay = Replay::new(&config(64, Observation::Latent));
+    replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
+    let before = replay.state();
+    let mut calls = 0;
+    let result = replay.freeze_latents(4, |images| {
+        calls += 1;
+        if calls == 2 {
+            Err("out of memory")
+        } else {
+            encode(images).map_err(|never| match never {})
+        }
+    });
+    assert_eq!(result, Err("out of memory"));
+    assert_eq!(replay.state(), before);
+}
+
+#[test]
+fn sampled_images_are_those_of_the_flights_closing_ones_included() {
+    let mut replay = Replay::new(&config(64, Observation::Latent));
+    for number in 0..3 {
+        replay
+            .insert(with_images(flight(number, 2, Outcome::Collided)))
+            .unwrap();
+    }
+    let mut images = Vec::new();
+    replay.sample_images(&mut Pcg64Mcg::seed_from_u64(3), 200, &mut images);
+    assert_eq!(images.len(), 200 * IMAGE_PIXELS);
+    let mut drawn: Vec<_> = images.chunks_exact(IMAGE_PIXELS).map(|image| image[0]).collect();
+    drawn.sort_unstable();
+    drawn.dedup();
+    let mut expected: Vec<_> = (0..3)
+        .flat_map(|number| (0..3).map(move |step| shade(number, step)))
+        .collect();
+    expected.sort_unstable();
+    assert_eq!(drawn, expected);
+}
+
+#[test]
+fn content_of_another_shape_is_not_restored() {
+    let narrow = config(64, Observation::Latent);
+    let mut replay = Replay::new(&narrow);
+    replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
+    let error = Replay::restore(&config(64, Observation::LatentVelocity), replay.state()).unwrap_err();
+    assert_eq!(error.part, "regular part");
+    let mut without_images = replay.state();
+    without_images.images = None;
+    assert_eq!(
+        Replay::restore(&narrow, without_images).unwrap_err().part,
+        "depth images"
+    );
+    let mut too_few = replay.state();
+    too_few.images = Some(Vec::new());
+    assert_eq!(Replay::restore(&narrow, too_few).unwrap_err().part, "depth images");
+}
+
+/// Prints what a minibatch costs: `cargo test --release -p skein-learner -- --ignored --nocapture minibatch_of_256`.
+#[test]
+#[ignore = "a measurement, not a claim"]
+fn time_of_a_minibatch_of_256_from_a_full_buffer() {
+    let mut config = config(1 << 17, Observation::LatentVelocityAction);
+    config.replay.success_share = 0.125;
+    let mut replay = frozen(&config);
+    for number in 0..20_000 {
+        let mut flight = flight(number, 50, Outcome::Collided);
+        for step in 0..10 {
+            flight.level_up[step * 5] = true;
+        }
+        replay.insert(flight).unwrap();
+    }
+    assert_eq!(replay.len(), 1 << 17);
+    let mut batch = Minibatch::default();
+    let mut rng = Pcg64Mcg::seed_from_u64(1);
+    let mut micros: Vec<_> = (0..2000)
+        .map(|_| {
+            let start = std::time::Instant::now();
+            replay.sample(&mut rng, 256, std::hint::black_box(&mut batch));
+            start.elapsed().as_secs_f64() * 1e6
+        })
+        .collect();
+    micros.sort_by(f64::total_cmp);
+    println!(
+        "minibatch of 256: median {:.1} µs, 99th percentile {:.1} µs",
+        micros[1000], micros[1980]
+    );
+}
