@@ -6,4 +6,11 @@
 //! World frame: x forward along the corridor, y to the left, z up. Body frame: x forward, y left, z up. Metres, seconds,
 //! radians, unless a name says otherwise.
 
+pub mod camera;
 pub mod course;
+pub mod oracle;
+pub mod reward;
+pub mod simulator;
+pub mod vehicle;
+
+mod world;

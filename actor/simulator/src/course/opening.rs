@@ -264,7 +264,7 @@ mod tests {
                 1.5 + 1.0 - 0.25,
             );
             let circle = area(Shape::Circle { diameter_m: 2.0 }, turn);
-            assert!((3.11..3.1416).contains(&circle), "{circle}");
+            assert!((3.11..std::f32::consts::PI).contains(&circle), "{circle}");
         }
     }
 

@@ -1,0 +1,136 @@
+//! Fills outlines with planes, keeping what is nearest.
+//!
+//! The depth of a plane is not affine over the image, but its inverse is: `1 / depth = a column + b row + c`. So a surface is
+//! drawn without a division or a texture, and the nearer of two surfaces has the larger inverse. What is inside an
+//! outline is told by parity: each edge flips every pixel to the right of it, in a row of 128 bits at once, so that holes, and
+//! corners that point inwards, need no triangles. Two surfaces that share an edge compute the same pixel for it: no cracks.
+
+use super::settings::MIDDLE_PX;
+use super::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+
+/// A point of the image, pixels from its left and upper border; it may lie far outside.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct ImagePoint {
+    pub column: f32,
+    pub row: f32,
+}
+
+/// Range over depth as an affine function of the image, about the image's middle: 1 at the range, more when nearer.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Nearness {
+    pub per_column: f32,
+    pub per_row: f32,
+    pub in_middle: f32,
+}
+
+/// Pixels that are filled at a time: a bit each of a `u16`, and one AVX-512 register.
+const BLOCK: usize = 16;
+
+/// Pixels from a column to the right border, as bits; none from behind it.
+const FROM_COLUMN: [u128; IMAGE_WIDTH + 1] = {
+    let mut masks = [0; IMAGE_WIDTH + 1];
+    let mut column = 0;
+    while column < IMAGE_WIDTH {
+        masks[column] = u128::MAX << column;
+        column += 1;
+    }
+    masks
+};
+
+const _: () = assert!(IMAGE_WIDTH == u128::BITS as usize, "a row is the bits of a u128");
+
+/// The image while it is drawn.
+pub(super) struct Canvas {
+    nearness: Box<[[f32; IMAGE_WIDTH]; IMAGE_HEIGHT]>,
+    /// The outline being drawn: set bits are inside. All clear between outlines.
+    inside: [u128; IMAGE_HEIGHT],
+    /// Rows that the outline touches.
+    first_row: usize,
+    end_row: usize,
+}
+
+impl Canvas {
+    pub(super) fn new() -> Self {
+        Self {
+            nearness: Box::new([[1.0; IMAGE_WIDTH]; IMAGE_HEIGHT]),
+            inside: [0; IMAGE_HEIGHT],
+            first_row: IMAGE_HEIGHT,
+            end_row: 0,
+        }
+    }
+
+    /// Nothing in range anywhere.
+    #[inline(always)]
+    pub(super) fn clear(&mut self) {
+        self.nearness.as_flattened_mut().fill(1.0);
+    }
+
+    /// Adds an edge to the outline. The edges of an outline form closed loops; their direction does not matter.
+    #[inline(always)]
+    pub(super) fn add_edge(&mut self, a: ImagePoint, b: ImagePoint) {
+        // From the upper end, whichever way the surface runs along it: neighbours must compute the same.
+        let (upper, lower) = if a.row < b.row { (a, b) } else { (b, a) };
+        let first = first_at_or_after(upper.row, IMAGE_HEIGHT);
+        let end = first_at_or_after(lower.row, IMAGE_HEIGHT);
+        if first >= end {
+            return;
+        }
+        self.first_row = self.first_row.min(first);
+        self.end_row = self.end_row.max(end);
+        let slope = (lower.column - upper.column) / (lower.row - upper.row);
+        for (row, inside) in (first..end).zip(&mut self.inside[first..end]) {
+            let crossing = upper.column + (row as f32 + 0.5 - upper.row) * slope;
+            *inside ^= FROM_COLUMN[first_at_or_after(crossing, IMAGE_WIDTH)];
+        }
+    }
+
+    /// Draws a plane into the outline, where it is nearest so far, and begins another outline.
+    #[inline(always)]
+    pub(super) fn fill(&mut self, plane: Nearness) {
+        for row in self.first_row..self.end_row {
+            let inside = std::mem::take(&mut self.inside[row]);
+            if inside == 0 {
+                continue;
+            }
+            let at_row = plane.in_middle + (row as f32 + 0.5 - MIDDLE_PX[1]) * plane.per_row;
+            let blocks = self.nearness[row].as_chunks_mut::<BLOCK>().0;
+            for (number, block) in blocks.iter_mut().enumerate() {
+                let bits = (inside >> (number * BLOCK)) as u16;
+                if bits != 0 {
+                    let first_column = (number * BLOCK) as f32 + 0.5 - MIDDLE_PX[0];
+                    fill_block(block, bits, at_row + first_column * plane.per_column, plane.per_column);
+                }
+            }
+        }
+        self.first_row = IMAGE_HEIGHT;
+        self.end_row = 0;
+    }
+
+    /// Grey levels: 0 at the lens, 255 at the range or farther.
+    #[inline(always)]
+    pub(super) fn write(&self, image: &mut [u8; IMAGE_PIXELS]) {
+        /// Added to a small number, it leaves the number, rounded, in the lowest bits of the sum.
+        const ROUNDER: f32 = 8_388_608.0;
+        for (pixel, nearness) in image.iter_mut().zip(self.nearness.as_flattened()) {
+            *pixel = (255.0 / nearness + ROUNDER).to_bits() as u8;
+        }
+    }
+}
+
+/// Raises the pixels whose bit is set to the plane.
+#[inline(always)]
+fn fill_block(block: &mut [f32; BLOCK], bits: u16, first: f32, per_column: f32) {
+    for (lane, pixel) in block.iter_mut().enumerate() {
+        let plane = first + lane as f32 * per_column;
+        let raised = if plane > *pixel { plane } else { *pixel };
+        *pixel = if bits >> lane & 1 == 1 { raised } else { *pixel };
+    }
+}
+
+/// Number of the first pixel whose middle lies at or after `position`, at most `count`.
+#[inline(always)]
+fn first_at_or_after(position: f32, count: usize) -> usize {
+    // Truncation towards zero rounds down here, and up when counted from the far end: `ceil` without its call.
+    let from_end = count as f32 + 1.0 - (position - 0.5).clamp(0.0, count as f32);
+    count + 1 - from_end as usize
+}

@@ -1,0 +1,105 @@
+//! The depth camera: what the drone sees of a course.
+//!
+//! The image is the planar depth (along the optical axis, not along the ray) in 8 bits. It is drawn, not traced: every surface
+//! of a course is flat, so a frame costs some hundred edges and a few thousand vector operations. The
+//! [`reference`](ReferenceCamera) traces the same surfaces ray by ray; a property test holds the two together.
+
+mod canvas;
+mod reference;
+mod scene;
+mod settings;
+
+#[cfg(test)]
+mod agreement;
+
+use nalgebra::Isometry3;
+
+use crate::course::Course;
+
+pub use reference::ReferenceCamera;
+pub use settings::{CameraFault, CameraSettings};
+
+/// Columns of the depth image.
+pub const IMAGE_WIDTH: usize = 128;
+
+/// Rows of the depth image.
+pub const IMAGE_HEIGHT: usize = 72;
+
+/// Pixels of the depth image, a byte each: row by row from the top, each from the left.
+pub const IMAGE_PIXELS: usize = IMAGE_WIDTH * IMAGE_HEIGHT;
+
+/// Draws depth images of one course. Holds its scratch memory: drawing allocates nothing.
+pub struct DepthCamera {
+    settings: CameraSettings,
+    scene: scene::Scene,
+    canvas: canvas::Canvas,
+    draw: Draw,
+}
+
+/// [`draw`], compiled for the instructions that this machine has.
+type Draw = fn(&mut DepthCamera, &settings::View, &mut [u8; IMAGE_PIXELS]);
+
+impl DepthCamera {
+    /// A camera in this course.
+    ///
+    /// # Errors
+    /// [`CameraFault`] if the settings make no sense.
+    pub fn new(settings: &CameraSettings, course: &Course) -> Result<Self, CameraFault> {
+        settings.check()?;
+        Ok(Self {
+            settings: settings.clone(),
+            scene: scene::Scene::new(&course.mesh()),
+            canvas: canvas::Canvas::new(),
+            draw: fastest_draw(),
+        })
+    }
+
+    /// Draws what the camera sees with the body at `world_from_body`, straight into `image`.
+    ///
+    /// A pixel is `round(255 * min(depth / range, 1))`, so larger is farther. Every pixel is written. Surfaces nearer than
+    /// `near_m` and the backs of surfaces (from inside a wall) are not seen. A pose that is not a number
+    /// sees nothing: all 255.
+    pub fn render(&mut self, world_from_body: &Isometry3<f32>, image: &mut [u8; IMAGE_PIXELS]) {
+        let view = self.settings.view(world_from_body);
+        (self.draw)(self, &view, image);
+    }
+}
+
+#[inline(always)]
+fn draw(camera: &mut DepthCamera, view: &settings::View, image: &mut [u8; IMAGE_PIXELS]) {
+    camera.canvas.clear();
+    camera.scene.draw(&camera.settings, view, &mut camera.canvas);
+    camera.canvas.write(image);
+}
+
+/// The same arithmetic in the same order whichever is chosen: wider registers do not change a bit of the image.
+fn fastest_draw() -> Draw {
+    #[cfg(target_arch = "x86_64")]
+    {
+        if is_x86_feature_detected!("avx512f")
+            && is_x86_feature_detected!("avx512bw")
+            && is_x86_feature_detected!("avx512dq")
+            && is_x86_feature_detected!("avx512vl")
+        {
+            // SAFETY: the machine has the features that the function is compiled for, as just asked.
+            return |camera, view, image| unsafe { draw_avx512(camera, view, image) };
+        }
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: as above.
+            return |camera, view, image| unsafe { draw_avx2(camera, view, image) };
+        }
+    }
+    draw
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
+fn draw_avx512(camera: &mut DepthCamera, view: &settings::View, image: &mut [u8; IMAGE_PIXELS]) {
+    draw(camera, view, image);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn draw_avx2(camera: &mut DepthCamera, view: &settings::View, image: &mut [u8; IMAGE_PIXELS]) {
+    draw(camera, view, image);
+}

@@ -1,0 +1,66 @@
+//! The depth image, one ray at a time.
+//!
+//! Slow and obviously right: it casts a ray through the middle of each pixel against the course's triangles. The fast
+//! camera is held to it pixel by pixel.
+
+use nalgebra::{Isometry3, Vector3};
+use parry3d::math::Vector;
+use parry3d::query::{Ray, RayCullingMode};
+use parry3d::shape::{TriMesh, TriMeshBuilderError};
+
+use super::settings::{MIDDLE_PX, View};
+use super::{CameraSettings, IMAGE_PIXELS, IMAGE_WIDTH};
+use crate::course::Course;
+
+/// A camera that casts rays. For comparison, not for flying.
+pub struct ReferenceCamera {
+    settings: CameraSettings,
+    surfaces: TriMesh,
+}
+
+impl ReferenceCamera {
+    /// A camera in this course.
+    ///
+    /// # Errors
+    /// [`TriMeshBuilderError`] if the course's surfaces are no triangle mesh.
+    pub fn new(settings: &CameraSettings, course: &Course) -> Result<Self, TriMeshBuilderError> {
+        let mesh = course.mesh();
+        let vertices = mesh.vertices.iter().map(|v| Vector::new(v.x, v.y, v.z)).collect();
+        let triangles = mesh.triangles().into_iter().map(|(triangle, _)| triangle).collect();
+        Ok(Self {
+            settings: settings.clone(),
+            surfaces: TriMesh::new(vertices, triangles)?,
+        })
+    }
+
+    /// What the camera sees with the body at `world_from_body`: see [`DepthCamera::render`](super::DepthCamera::render).
+    pub fn render(&self, world_from_body: &Isometry3<f32>, image: &mut [u8; IMAGE_PIXELS]) {
+        let view = self.settings.view(world_from_body);
+        for (number, pixel) in image.iter_mut().enumerate() {
+            let column = (number % IMAGE_WIDTH) as f32 + 0.5;
+            let row = (number / IMAGE_WIDTH) as f32 + 0.5;
+            *pixel = self.grey(&view, column, row);
+        }
+    }
+
+    /// Grey level at a point of the image, in pixels from its left and upper border.
+    pub(super) fn grey(&self, view: &View, column: f32, row: f32) -> u8 {
+        let share = self.depth_m(view, column, row) / self.settings.range_m;
+        (255.0 * share.min(1.0)).round() as u8
+    }
+
+    /// Depth of the first surface that faces the camera beyond the near distance; infinite if there is none in range.
+    fn depth_m(&self, view: &View, column: f32, row: f32) -> f32 {
+        let focal = self.settings.focal_px();
+        let [across, along] = [(column - MIDDLE_PX[0]) / focal, (row - MIDDLE_PX[1]) / focal];
+        // One unit of this direction is one metre of depth, so the time of impact is the depth.
+        let direction = view.forward + view.right * across + view.down * along;
+        let begin = view.eye + direction * self.settings.near_m;
+        let to_parry = |v: Vector3<f32>| Vector::new(v.x, v.y, v.z);
+        let ray = Ray::new(to_parry(begin.coords), to_parry(direction));
+        let left_m = self.settings.range_m - self.settings.near_m;
+        self.surfaces
+            .cast_local_ray_with_culling(&ray, left_m, RayCullingMode::IgnoreBackfaces)
+            .map_or(f32::INFINITY, |hit| self.settings.near_m + hit.time_of_impact)
+    }
+}
