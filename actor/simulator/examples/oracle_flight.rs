@@ -1,0 +1,63 @@
+//! Flies the oracle pilot through every shipped course with every drone and prints how many flights arrived.
+//!
+//! `cargo run --release -p skein-simulator --example oracle_flight [flights]` (100 per course, drone and start level by default).
+//! Below 99 % either the course or the drone is wrong.
+
+use std::error::Error;
+use std::path::Path;
+use std::sync::Arc;
+
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
+use skein_simulator::course::Course;
+use skein_simulator::oracle::Oracle;
+use skein_simulator::simulator::{Outcome, Simulator, SimulatorSettings};
+use skein_simulator::vehicle::{Preset, VehicleSettings};
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let flights: u64 = std::env::args().nth(1).map_or(Ok(100), |argument| argument.parse())?;
+    let mut files: Vec<_> = std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses"))?
+        .map(|entry| entry.map(|entry| entry.path()))
+        .collect::<Result<_, _>>()?;
+    files.sort();
+
+    println!(
+        "{:<20} {:<12} arrived of {flights}, from the start of each level",
+        "course", "drone"
+    );
+    for file in &files {
+        let course = Arc::new(Course::load(file)?);
+        for preset in [Preset::Airsim, Preset::Hummingbird, Preset::Point] {
+            let settings = SimulatorSettings {
+                vehicle: VehicleSettings {
+                    preset,
+                    ..Default::default()
+                },
+                ..Default::default()
+            };
+            let mut simulator = Simulator::new(course.clone(), &settings)?;
+            print!("{:<20} {:<12}", course.name(), format!("{preset:?}").to_lowercase());
+            for level in 1..=course.levels() {
+                let mut arrived = 0;
+                for flight in 0..flights {
+                    if fly(&mut simulator, level, flight)? == Outcome::ReachedEnd {
+                        arrived += 1;
+                    }
+                }
+                print!(" {arrived:>5}");
+            }
+            println!();
+        }
+    }
+    Ok(())
+}
+
+fn fly(simulator: &mut Simulator, level: u8, seed: u64) -> Result<Outcome, Box<dyn Error>> {
+    simulator.reset(level, &mut Pcg64Mcg::seed_from_u64(seed))?;
+    loop {
+        let action = Oracle::act(simulator.course(), &simulator.state());
+        if let Some(outcome) = simulator.step(action)?.outcome {
+            return Ok(outcome);
+        }
+    }
+}

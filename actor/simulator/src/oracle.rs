@@ -1,0 +1,126 @@
+//! A pilot that sees the course itself instead of the depth image: proof that a course can be flown by a given drone.
+
+use crate::course::{Course, Wall};
+use crate::vehicle::VehicleState;
+
+/// A wall is behind the drone once its tail has left the opening; m from the drone's centre to its tail, with some to spare.
+const TAIL_M: f32 = 0.6;
+
+/// Velocity asked for per metre of distance to the safe point, 1/s.
+const APPROACH_PER_SEC: f32 = 0.8;
+
+/// Share of the present velocity taken off the one asked for, so that a sluggish drone does not overshoot.
+const DAMPING: f32 = 0.5;
+
+/// Flies to the next opening's safe point.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Oracle;
+
+impl Oracle {
+    /// The action `[v_y, v_z]` for this moment, each in [-1, 1] m/s.
+    #[must_use]
+    pub fn act(course: &Course, state: &VehicleState) -> [f32; 2] {
+        let Some(wall) = next_wall(course, state) else {
+            return [0.0, 0.0];
+        };
+        let [y_m, z_m] = wall.safe_point();
+        let steer =
+            |error_m: f32, velocity_mps: f32| (APPROACH_PER_SEC * error_m - DAMPING * velocity_mps).clamp(-1.0, 1.0);
+        let velocity = state.heading_velocity_mps();
+        [
+            steer(y_m - state.position_m.y, velocity.y),
+            steer(z_m - state.position_m.z, velocity.z),
+        ]
+    }
+}
+
+/// The first wall that the drone has not left entirely.
+fn next_wall<'a>(course: &'a Course, state: &VehicleState) -> Option<&'a Wall> {
+    let tail_m = state.position_m.x - TAIL_M;
+    course
+        .walls()
+        .iter()
+        .find(|wall| wall.x_m() + course.wall_thickness_m() > tail_m)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+    use std::sync::Arc;
+
+    use nalgebra::{Point3, Vector3};
+    use rand::SeedableRng;
+    use rand_pcg::Pcg64Mcg;
+
+    use super::*;
+    use crate::course::test_course;
+    use crate::simulator::{Outcome, Simulator, SimulatorSettings};
+    use crate::vehicle::{Preset, VehicleSettings};
+
+    /// Per course and drone, spread over the levels; `examples/oracle_flight.rs` flies a hundred from each.
+    const FLIGHTS: u64 = 10;
+
+    #[test]
+    fn every_shipped_course_can_be_flown_from_every_level_with_every_drone() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
+        let files: Vec<_> = folder.read_dir().unwrap().map(|entry| entry.unwrap().path()).collect();
+        assert!(files.len() >= 4, "the shipped courses are missing: {files:?}");
+        for file in files {
+            let course = Arc::new(Course::load(&file).unwrap());
+            for preset in [Preset::Airsim, Preset::Hummingbird, Preset::Point] {
+                let vehicle = VehicleSettings {
+                    preset,
+                    ..Default::default()
+                };
+                let settings = SimulatorSettings {
+                    vehicle,
+                    ..Default::default()
+                };
+                let mut simulator = Simulator::new(course.clone(), &settings).unwrap();
+                for flight in 0..FLIGHTS {
+                    let level = 1 + (flight % u64::from(course.levels())) as u8;
+                    simulator.reset(level, &mut Pcg64Mcg::seed_from_u64(flight)).unwrap();
+                    let outcome = fly(&mut simulator);
+                    let at = simulator.state().position_m;
+                    assert_eq!(
+                        outcome,
+                        Outcome::ReachedEnd,
+                        "{}, {preset:?}, level {level}: at {at}",
+                        course.name()
+                    );
+                }
+            }
+        }
+    }
+
+    fn fly(simulator: &mut Simulator) -> Outcome {
+        loop {
+            let action = Oracle::act(simulator.course(), &simulator.state());
+            if let Some(outcome) = simulator.step(action).unwrap().outcome {
+                return outcome;
+            }
+        }
+    }
+
+    #[test]
+    fn pilot_steers_towards_the_opening_and_brakes_before_it() {
+        let course = test_course();
+        let [y_m, z_m] = course.walls()[0].safe_point();
+        let below_right = VehicleState::at_rest(Point3::new(5.0, y_m - 2.0, z_m - 2.0));
+        assert_eq!(Oracle::act(&course, &below_right), [1.0, 1.0]);
+        let arriving = VehicleState {
+            velocity_mps: Vector3::new(1.0, 1.0, 0.0),
+            ..VehicleState::at_rest(Point3::new(5.0, y_m - 0.1, z_m))
+        };
+        assert!(Oracle::act(&course, &arriving)[0] < 0.0);
+    }
+
+    #[test]
+    fn pilot_holds_still_until_its_tail_has_left_the_wall() {
+        let course = test_course();
+        let wall = &course.walls()[0];
+        let [y_m, z_m] = wall.safe_point();
+        let inside = VehicleState::at_rest(Point3::new(wall.x_m() + course.wall_thickness_m() + 0.5, y_m, z_m));
+        assert_eq!(Oracle::act(&course, &inside), [0.0, 0.0]);
+    }
+}

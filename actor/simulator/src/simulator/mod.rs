@@ -1,0 +1,224 @@
+//! One flight at a time through a course: [`Simulator::reset`] starts it, [`Simulator::step`] lets one control period pass.
+//!
+//! A flight is a pure function of course, settings, start and actions. Numbers that are not finite never get further than the
+//! step they appear in: it returns [`SimulationError::NonFinite`] and the flight is over.
+
+mod report;
+mod settings;
+#[cfg(test)]
+mod tests;
+
+use std::sync::Arc;
+
+use nalgebra::Vector3;
+use rand::Rng;
+
+pub use report::{LevelUp, Outcome, SimulationError, StepReport};
+pub use settings::{SimulatorError, SimulatorSettings};
+
+use crate::camera::{DepthCamera, IMAGE_PIXELS};
+use crate::course::{Course, NoSuchLevel};
+use crate::vehicle::{Vehicle, VehicleState};
+use crate::world::{Contact, World};
+
+/// A drone in a course.
+pub struct Simulator {
+    course: Arc<Course>,
+    max_steps: u32,
+    physics_steps: u32,
+    dt_secs: f32,
+    forward_speed_mps: f32,
+    pristine_vehicle: Vehicle,
+    vehicle: Vehicle,
+    world: World,
+    camera: DepthCamera,
+    flight: Flight,
+}
+
+/// Where a flight stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Flight {
+    phase: Phase,
+    steps: u32,
+    /// Walls of the course whose back face the drone's centre has left behind, those before its start included.
+    walls_behind: usize,
+    walls_behind_at_start: usize,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    Flying,
+    Over,
+}
+
+impl Simulator {
+    /// A simulator of `course`, in which no flight is under way yet.
+    ///
+    /// # Errors
+    /// [`SimulatorError`] names the setting or the course at fault.
+    pub fn new(course: Arc<Course>, settings: &SimulatorSettings) -> Result<Self, SimulatorError> {
+        settings.vehicle.validate()?;
+        if settings.max_steps == 0 {
+            return Err(SimulatorError::NoSteps);
+        }
+        let (physics_steps, dt_secs) = settings.vehicle.physics_steps();
+        let vehicle = Vehicle::trimmed(&settings.vehicle);
+        let world = World::new(&course, vehicle.body(), dt_secs).map_err(|source| SimulatorError::Mesh {
+            course: course.name().to_owned(),
+            source,
+        })?;
+        Ok(Self {
+            camera: DepthCamera::new(&settings.camera, &course)?,
+            course,
+            max_steps: settings.max_steps,
+            physics_steps,
+            dt_secs,
+            forward_speed_mps: settings.vehicle.forward_speed_mps,
+            pristine_vehicle: vehicle.clone(),
+            vehicle,
+            world,
+            flight: Flight {
+                phase: Phase::Over,
+                steps: 0,
+                walls_behind: 0,
+                walls_behind_at_start: 0,
+            },
+        })
+    }
+
+    /// Starts a flight: hovering at the start of `level` (1 = before the first wall), jittered by `rng` as the course says.
+    ///
+    /// # Errors
+    /// [`NoSuchLevel`] if the course has fewer walls.
+    pub fn reset(&mut self, level: u8, rng: &mut impl Rng) -> Result<(), NoSuchLevel> {
+        let position_m = self.course.start_position(level, rng)?;
+        self.vehicle = self.pristine_vehicle.clone();
+        self.world.reset(&position_m);
+        let walls_behind = self.walls_behind(position_m.x);
+        self.flight = Flight {
+            phase: Phase::Flying,
+            steps: 0,
+            walls_behind,
+            walls_behind_at_start: walls_behind,
+        };
+        Ok(())
+    }
+
+    /// Flies one control period with `action` = `[v_y, v_z]`, m/s in the heading frame, each clamped to [-1, 1].
+    ///
+    /// The flight ends within the step at the physics step that touches something; the state is then the one at that moment.
+    ///
+    /// # Errors
+    /// [`SimulationError::NonFinite`] names what is NaN or infinite, be it the action or the physics, and ends the flight;
+    /// [`SimulationError::NotFlying`] after a flight's end.
+    pub fn step(&mut self, action: [f32; 2]) -> Result<StepReport, SimulationError> {
+        if self.flight.phase == Phase::Over {
+            return Err(SimulationError::NotFlying);
+        }
+        self.flight.steps += 1;
+        let walls_behind_before = self.flight.walls_behind;
+
+        let velocity_mps = self.commanded_velocity(action)?;
+        let contact = self.fly_until_contact(&velocity_mps)?;
+        let outcome = self.outcome(contact);
+
+        if outcome.is_some() {
+            self.flight.phase = Phase::Over;
+        }
+        Ok(StepReport {
+            walls_passed: self.walls_passed(),
+            level_up: if self.flight.walls_behind > walls_behind_before {
+                LevelUp::Yes
+            } else {
+                LevelUp::No
+            },
+            outcome,
+        })
+    }
+
+    /// Draws what the depth camera sees now into `image`, row by row from the top.
+    pub fn render(&mut self, image: &mut [u8; IMAGE_PIXELS]) {
+        self.camera.render(&self.world.state().pose(), image);
+    }
+
+    /// Where the drone is and how it moves.
+    #[must_use]
+    pub fn state(&self) -> VehicleState {
+        self.world.state()
+    }
+
+    /// The level the drone is in: 1 before the first wall, one more behind each.
+    #[must_use]
+    pub fn level(&self) -> u8 {
+        // A course has at most `MAX_WALLS` walls.
+        self.flight.walls_behind as u8 + 1
+    }
+
+    /// Walls passed in this flight so far.
+    #[must_use]
+    pub fn walls_passed(&self) -> u8 {
+        (self.flight.walls_behind - self.flight.walls_behind_at_start) as u8
+    }
+
+    /// The course flown.
+    #[must_use]
+    pub fn course(&self) -> &Course {
+        &self.course
+    }
+
+    fn commanded_velocity(&mut self, action: [f32; 2]) -> Result<Vector3<f32>, SimulationError> {
+        if !action.iter().all(|v| v.is_finite()) {
+            return Err(self.break_off("action"));
+        }
+        let [left, up] = action.map(|v| v.clamp(-1.0, 1.0));
+        Ok(Vector3::new(self.forward_speed_mps, left, up))
+    }
+
+    fn fly_until_contact(&mut self, velocity_mps: &Vector3<f32>) -> Result<Contact, SimulationError> {
+        for _ in 0..self.physics_steps {
+            let actuation = self.vehicle.actuate(&self.world.state(), velocity_mps, self.dt_secs);
+            self.world.advance(&actuation);
+
+            if self.world.is_quarantined() {
+                return Err(self.break_off("the body's pose or velocity"));
+            }
+            // A wall passed stays passed, should the drone be blown back.
+            self.flight.walls_behind = self
+                .flight
+                .walls_behind
+                .max(self.walls_behind(self.world.position_x_m()));
+            match self.world.contact() {
+                Contact::Nothing => {}
+                contact => return Ok(contact),
+            }
+        }
+        Ok(Contact::Nothing)
+    }
+
+    fn outcome(&self, contact: Contact) -> Option<Outcome> {
+        match contact {
+            Contact::Obstacle => Some(Outcome::Collided),
+            Contact::EndWall => Some(Outcome::ReachedEnd),
+            Contact::Nothing if self.flight.steps >= self.max_steps => Some(Outcome::TimedOut),
+            Contact::Nothing => None,
+        }
+    }
+
+    /// Number of walls whose back face lies before `x_m`.
+    fn walls_behind(&self, x_m: f32) -> usize {
+        let thickness_m = self.course.wall_thickness_m();
+        self.course
+            .walls()
+            .iter()
+            .take_while(|wall| wall.x_m() + thickness_m < x_m)
+            .count()
+    }
+
+    fn break_off(&mut self, what: &'static str) -> SimulationError {
+        self.flight.phase = Phase::Over;
+        SimulationError::NonFinite {
+            what,
+            step: self.flight.steps,
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! The drone: what it is (presets), how it is commanded, and what it exerts on its body at each physics step.
+//!
+//! Three presets share one interface. `airsim` and `hummingbird` are quadrotors whose controller turns a velocity command into
+//! tilt, tilt into torques and torques into rotor thrust; `point` follows the command with a plain first-order lag.
+//! Nothing here integrates motion: that is rapier's part, see [`crate::world`].
+
+mod airframe;
+mod controller;
+mod rotors;
+mod settings;
+#[cfg(test)]
+mod step_response;
+
+pub use settings::{Preset, VehicleSettings, VehicleSettingsError};
+
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+
+use airframe::Airframe;
+pub(crate) use airframe::GRAVITY_MPS2;
+use controller::Cascade;
+use rotors::Rotors;
+
+/// Where the drone is and how it moves. World frame: x along the corridor, y left, z up. Body frame: x forward, y left, z up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VehicleState {
+    /// Centre of mass, world frame, m.
+    pub position_m: Point3<f32>,
+    /// Attitude: turns body vectors into world vectors.
+    pub world_from_body: UnitQuaternion<f32>,
+    /// Velocity of the centre of mass, world frame, m/s.
+    pub velocity_mps: Vector3<f32>,
+    /// Angular velocity about the body's axes, rad/s.
+    pub body_rates_radps: Vector3<f32>,
+}
+
+impl VehicleState {
+    /// Level and motionless at `position_m`, facing along the corridor.
+    pub fn at_rest(position_m: Point3<f32>) -> Self {
+        Self {
+            position_m,
+            world_from_body: UnitQuaternion::identity(),
+            velocity_mps: Vector3::zeros(),
+            body_rates_radps: Vector3::zeros(),
+        }
+    }
+
+    /// Position and attitude as one transform, as the depth camera takes it.
+    pub fn pose(&self) -> Isometry3<f32> {
+        Isometry3::from_parts(Translation3::from(self.position_m), self.world_from_body)
+    }
+
+    /// Velocity in the heading frame: x where the nose points, y left of it, z up, m/s. What a real drone knows of itself.
+    pub fn heading_velocity_mps(&self) -> Vector3<f32> {
+        let (_, _, yaw) = self.world_from_body.euler_angles();
+        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -yaw) * self.velocity_mps
+    }
+}
+
+/// What the vehicle does to its rigid body during one physics step; world frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Actuation {
+    /// Force at the centre of mass (gravity not included), N, and torque, N·m.
+    Wrench {
+        force_n: Vector3<f32>,
+        torque_nm: Vector3<f32>,
+    },
+    /// Velocity to have during the step, m/s; the body neither falls nor turns.
+    Velocity(Vector3<f32>),
+}
+
+/// Mass and size of the rigid body that rapier integrates.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct BodyProperties {
+    pub(crate) mass_kg: f32,
+    pub(crate) inertia_kgm2: Vector3<f32>,
+    pub(crate) half_extents_m: Vector3<f32>,
+}
+
+/// A drone and its controller, as it stands at some moment of a flight.
+#[derive(Debug, Clone)]
+pub(crate) enum Vehicle {
+    Quadrotor {
+        airframe: Airframe,
+        cascade: Cascade,
+        rotors: Rotors,
+    },
+    Point {
+        time_constant_secs: f32,
+    },
+}
+
+impl Vehicle {
+    /// The vehicle as it starts a flight: rotors and controller trimmed for hover.
+    pub(crate) fn trimmed(settings: &VehicleSettings) -> Self {
+        let quadrotor = |airframe: Airframe| Self::Quadrotor {
+            airframe,
+            cascade: Cascade::trimmed(&airframe),
+            rotors: Rotors::at(airframe.hover_command()),
+        };
+        match settings.preset {
+            Preset::Airsim => quadrotor(Airframe::AIRSIM),
+            Preset::Hummingbird => quadrotor(Airframe::HUMMINGBIRD),
+            Preset::Point => Self::Point {
+                time_constant_secs: settings.point_time_constant_secs,
+            },
+        }
+    }
+
+    /// Mass and size of its body. The point drone borrows AirSim's: its size decides what it touches, its mass decides nothing.
+    pub(crate) fn body(&self) -> BodyProperties {
+        let airframe = match self {
+            Self::Quadrotor { airframe, .. } => airframe,
+            Self::Point { .. } => &Airframe::AIRSIM,
+        };
+        BodyProperties {
+            mass_kg: airframe.mass_kg,
+            inertia_kgm2: airframe.inertia_kgm2,
+            half_extents_m: airframe.half_extents_m,
+        }
+    }
+
+    /// Lets controller and rotors work for `dt_secs` towards `velocity_mps` (heading frame).
+    pub(crate) fn actuate(&mut self, state: &VehicleState, velocity_mps: &Vector3<f32>, dt_secs: f32) -> Actuation {
+        match self {
+            Self::Quadrotor {
+                airframe,
+                cascade,
+                rotors,
+            } => {
+                let command = cascade.command(&airframe.gains, state, velocity_mps, dt_secs);
+                let wrench = rotors.advance(airframe, &command, dt_secs);
+                let force_n = Vector3::z() * wrench.thrust_n + drag_n(airframe, state);
+                Actuation::Wrench {
+                    force_n: state.world_from_body * force_n,
+                    torque_nm: state.world_from_body * wrench.torque_nm,
+                }
+            }
+            Self::Point { time_constant_secs } => {
+                // The lag's exact answer over one step, so that the step's length does not show.
+                let reached = 1.0 - (-dt_secs / *time_constant_secs).exp();
+                Actuation::Velocity(state.velocity_mps + (velocity_mps - state.velocity_mps) * reached)
+            }
+        }
+    }
+}
+
+/// Quadratic drag, body frame, N.
+fn drag_n(airframe: &Airframe, state: &VehicleState) -> Vector3<f32> {
+    let velocity_mps = state.world_from_body.inverse_transform_vector(&state.velocity_mps);
+    -airframe
+        .drag_n_per_mps2
+        .component_mul(&velocity_mps.map(|v| v * v.abs()))
+}

@@ -1,0 +1,269 @@
+//! The rigid body among the course's surfaces: rapier integrates it, parry says what it touches.
+//!
+//! Any contact ends a flight, so contact forces never act and rapier's solver has nothing to solve: the course is not in
+//! rapier's world at all. After each step the body's cuboid is tested, exactly, against the triangles that the depth camera
+//! also draws; a bounding-volume tree makes that some 0.1 µs when nothing is near. The body moves centimetres a step and is
+//! longer than that in every direction it can move, so it cannot pass a surface between two tests.
+//!
+//! rapier and parry speak glam, the rest of this crate nalgebra: they meet here and nowhere else.
+
+use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
+use rapier3d::dynamics::{MassProperties, RigidBodyBuilder, RigidBodyHandle};
+use rapier3d::math::Vector;
+use rapier3d::parry::query::{DefaultQueryDispatcher, QueryDispatcher};
+use rapier3d::parry::shape::{Cuboid, Shape, TriMesh, TriMeshBuilderError};
+use rapier3d::pipeline::PhysicsWorld;
+
+use crate::course::{Course, SurfaceKind};
+use crate::vehicle::{Actuation, BodyProperties, GRAVITY_MPS2, VehicleState};
+
+/// What the body touches.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Contact {
+    Nothing,
+    /// The corridor, a wall, or the inside of an opening.
+    Obstacle,
+    /// The wall at the corridor's end, and nothing else.
+    EndWall,
+}
+
+/// The vehicle's body in the course.
+pub(crate) struct World {
+    obstacles: TriMesh,
+    end_wall_m: f32,
+    body_shape: Cuboid,
+    properties: BodyProperties,
+    dt_secs: f32,
+    physics: PhysicsWorld,
+    body: RigidBodyHandle,
+}
+
+impl World {
+    /// Surfaces of `course` and a body at rest at the corridor's start, advancing `dt_secs` a step.
+    ///
+    /// # Errors
+    /// parry's reason if the course's surfaces make no triangle mesh.
+    pub(crate) fn new(course: &Course, properties: BodyProperties, dt_secs: f32) -> Result<Self, TriMeshBuilderError> {
+        let (physics, body) = pristine_physics(&properties, dt_secs, &Point3::origin());
+        Ok(Self {
+            obstacles: obstacles(course)?,
+            end_wall_m: course.corridor().length_m,
+            body_shape: Cuboid::new(glam(&properties.half_extents_m)),
+            properties,
+            dt_secs,
+            physics,
+            body,
+        })
+    }
+
+    /// Puts the body at rest at `position_m`. Physics is rebuilt, so that nothing of an earlier flight remains in rapier's
+    /// caches: a flight is a function of its start and actions alone.
+    pub(crate) fn reset(&mut self, position_m: &Point3<f32>) {
+        (self.physics, self.body) = pristine_physics(&self.properties, self.dt_secs, position_m);
+    }
+
+    /// Integrates one physics step. A state that is no longer finite shows in [`World::is_quarantined`].
+    pub(crate) fn advance(&mut self, actuation: &Actuation) {
+        let body = &mut self.physics.bodies[self.body];
+        match actuation {
+            Actuation::Wrench { force_n, torque_nm } => {
+                body.reset_forces(false);
+                body.reset_torques(false);
+                let weight_n = Vector3::z() * (self.properties.mass_kg * GRAVITY_MPS2);
+                body.add_force(glam(&(force_n - weight_n)), true);
+                body.add_torque(glam(torque_nm), true);
+            }
+            Actuation::Velocity(velocity_mps) => body.set_linvel(glam(velocity_mps), true),
+        }
+        self.physics.step();
+    }
+
+    /// Pose and motion of the body.
+    pub(crate) fn state(&self) -> VehicleState {
+        let body = &self.physics.bodies[self.body];
+        let rotation = body.rotation();
+        let world_from_body =
+            UnitQuaternion::from_quaternion(Quaternion::new(rotation.w, rotation.x, rotation.y, rotation.z));
+        VehicleState {
+            position_m: Point3::from(nalgebra(body.translation())),
+            world_from_body,
+            velocity_mps: nalgebra(body.linvel()),
+            body_rates_radps: world_from_body.inverse_transform_vector(&nalgebra(body.angvel())),
+        }
+    }
+
+    /// How far along the corridor the body's centre is, m.
+    pub(crate) fn position_x_m(&self) -> f32 {
+        self.physics.bodies[self.body].translation().x
+    }
+
+    /// `true` once rapier has met a pose or velocity that is not finite in the last step and has switched the body off.
+    pub(crate) fn is_quarantined(&self) -> bool {
+        !self.physics.quarantine().is_empty()
+    }
+
+    /// What the body touches now.
+    pub(crate) fn contact(&self) -> Contact {
+        let world_from_body = self.physics.bodies[self.body].position();
+        let body_from_world = world_from_body.inverse();
+        let touches_obstacle = DefaultQueryDispatcher
+            .intersection_test(&body_from_world, &self.body_shape, &self.obstacles)
+            // A cuboid against a triangle mesh is a pair that parry's dispatcher knows.
+            .is_ok_and(|test| test.intersecting);
+        if touches_obstacle {
+            Contact::Obstacle
+        } else if self.body_shape.compute_aabb(world_from_body).maxs.x >= self.end_wall_m {
+            Contact::EndWall
+        } else {
+            Contact::Nothing
+        }
+    }
+}
+
+/// A rapier world that holds nothing but the body, at rest at `position_m`.
+fn pristine_physics(
+    properties: &BodyProperties,
+    dt_secs: f32,
+    position_m: &Point3<f32>,
+) -> (PhysicsWorld, RigidBodyHandle) {
+    let mut physics = PhysicsWorld::new();
+    // Weight is one of the forces in `advance`: the point drone has none.
+    physics.gravity = Vector::ZERO;
+    physics.integration_parameters.dt = dt_secs;
+    // Solver iterations are for contacts and joints, of which there are none.
+    physics.integration_parameters.num_solver_iterations = 1;
+    let mass = MassProperties::new(Vector::ZERO, properties.mass_kg, glam(&properties.inertia_kgm2));
+    let body = RigidBodyBuilder::dynamic()
+        .translation(glam(&position_m.coords))
+        .additional_mass_properties(mass)
+        .gyroscopic_forces_enabled(true)
+        .can_sleep(false);
+    let body = physics.insert_body(body);
+    (physics, body)
+}
+
+/// All surfaces but the end wall, as triangles.
+fn obstacles(course: &Course) -> Result<TriMesh, TriMeshBuilderError> {
+    let mesh = course.mesh();
+    let vertices = mesh.vertices.iter().map(|vertex| glam(&vertex.coords)).collect();
+    let triangles = mesh
+        .triangles()
+        .into_iter()
+        .filter(|&(_, surface)| mesh.surfaces[surface].kind != SurfaceKind::EndWall)
+        .map(|(triangle, _)| triangle)
+        .collect();
+    TriMesh::new(vertices, triangles)
+}
+
+fn glam(v: &Vector3<f32>) -> Vector {
+    Vector::new(v.x, v.y, v.z)
+}
+
+fn nalgebra(v: Vector) -> Vector3<f32> {
+    Vector3::new(v.x, v.y, v.z)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::course::test_course;
+
+    const PROPERTIES: BodyProperties = BodyProperties {
+        mass_kg: 2.0,
+        inertia_kgm2: Vector3::new(0.01, 0.02, 0.04),
+        half_extents_m: Vector3::new(0.5, 0.4, 0.1),
+    };
+
+    fn world_at(position_m: Point3<f32>) -> World {
+        let mut world = World::new(&test_course(), PROPERTIES, 0.005).unwrap();
+        world.reset(&position_m);
+        world
+    }
+
+    fn push(world: &mut World, force_n: Vector3<f32>, torque_nm: Vector3<f32>, secs: f32) {
+        for _ in 0..(secs / 0.005).round() as u32 {
+            world.advance(&Actuation::Wrench { force_n, torque_nm });
+        }
+    }
+
+    #[test]
+    fn body_without_thrust_falls() {
+        let mut world = world_at(Point3::new(5.0, 0.0, 6.0));
+        push(&mut world, Vector3::zeros(), Vector3::zeros(), 1.0);
+        let state = world.state();
+        assert!((state.velocity_mps.z + 9.81).abs() < 1e-3, "{}", state.velocity_mps);
+        // Half a step's length more than g/2, for velocity is stepped before position.
+        assert!(
+            (state.position_m.z - (6.0 - 4.905)).abs() < 0.03,
+            "{}",
+            state.position_m
+        );
+    }
+
+    #[test]
+    fn force_and_torque_act_through_mass_and_inertia() {
+        for (axis, rate_radps) in [(Vector3::x(), 1.0), (Vector3::y(), 0.5), (Vector3::z(), 0.25)] {
+            let mut world = world_at(Point3::new(5.0, 0.0, 3.5));
+            push(&mut world, Vector3::new(1.0, 0.0, 2.0 * 9.81), axis * 0.1, 0.1);
+            let state = world.state();
+            assert!(
+                (state.velocity_mps - Vector3::new(0.05, 0.0, 0.0)).norm() < 1e-4,
+                "{}",
+                state.velocity_mps
+            );
+            assert!(
+                (state.body_rates_radps - axis * rate_radps).norm() < 1e-3,
+                "{}",
+                state.body_rates_radps
+            );
+        }
+    }
+
+    #[test]
+    fn contact_begins_where_surfaces_meet() {
+        // The corridor's left side is at y = 3, its floor at z = 0, the body 0.4 m and 0.1 m to each side.
+        for (y_m, z_m, contact) in [
+            (2.599, 3.5, Contact::Nothing),
+            (2.601, 3.5, Contact::Obstacle),
+            (0.0, 0.101, Contact::Nothing),
+            (0.0, 0.099, Contact::Obstacle),
+        ] {
+            assert_eq!(
+                world_at(Point3::new(5.0, y_m, z_m)).contact(),
+                contact,
+                "y = {y_m}, z = {z_m}"
+            );
+        }
+    }
+
+    #[test]
+    fn tilted_body_reaches_lower() {
+        let mut world = world_at(Point3::new(5.0, 0.0, 0.15));
+        assert_eq!(world.contact(), Contact::Nothing);
+        // Pitched by some 0.25 rad, its corners hang 0.5 m · sin(0.25) below the middle and more.
+        push(&mut world, Vector3::z() * 2.0 * 9.81, Vector3::y() * 0.1, 0.32);
+        assert!((world.state().position_m.z - 0.15).abs() < 1e-3);
+        assert_eq!(world.contact(), Contact::Obstacle);
+    }
+
+    #[test]
+    fn end_wall_is_reached_by_the_nose_but_not_along_a_side() {
+        assert_eq!(world_at(Point3::new(59.499, 0.0, 3.5)).contact(), Contact::Nothing);
+        assert_eq!(world_at(Point3::new(59.501, 0.0, 3.5)).contact(), Contact::EndWall);
+        assert_eq!(world_at(Point3::new(59.501, 2.7, 3.5)).contact(), Contact::Obstacle);
+    }
+
+    #[test]
+    fn opening_is_free_and_its_edge_is_not() {
+        let course = test_course();
+        let wall = &course.walls()[0];
+        let [y_m, z_m] = wall.safe_point();
+        let mid_wall_m = wall.x_m() + course.wall_thickness_m() / 2.0;
+        assert_eq!(world_at(Point3::new(mid_wall_m, y_m, z_m)).contact(), Contact::Nothing);
+        let beside_m = y_m + wall.clearance_m();
+        assert_eq!(
+            world_at(Point3::new(mid_wall_m, beside_m, z_m)).contact(),
+            Contact::Obstacle
+        );
+    }
+}
