@@ -29,7 +29,7 @@ pub struct Ticket {
 }
 
 /// Where a flight is flown.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum CourseChoice {
     /// The training course.
     Training,
