@@ -151,3 +151,33 @@ fn drag_n(airframe: &Airframe, state: &VehicleState) -> Vector3<f32> {
         .drag_n_per_mps2
         .component_mul(&velocity_mps.map(|v| v * v.abs()))
 }
+
+#[cfg(test)]
+mod tests {
+    use std::f32::consts::FRAC_PI_2;
+
+    use super::*;
+
+    #[test]
+    fn heading_velocity_turns_with_the_nose_but_not_with_the_tilt() {
+        // Nose to the left, rolled: flying left is flying forward, and up stays up.
+        let state = VehicleState {
+            world_from_body: UnitQuaternion::from_euler_angles(0.3, 0.0, FRAC_PI_2),
+            velocity_mps: Vector3::new(0.0, 2.0, 0.5),
+            ..VehicleState::at_rest(Point3::origin())
+        };
+        assert!((state.heading_velocity_mps() - Vector3::new(2.0, 0.0, 0.5)).norm() < 1e-5);
+    }
+
+    #[test]
+    fn drag_acts_along_the_bodys_axes_against_the_motion() {
+        let mut state = VehicleState {
+            velocity_mps: Vector3::new(2.0, 0.0, -1.0),
+            ..VehicleState::at_rest(Point3::origin())
+        };
+        assert!((drag_n(&Airframe::AIRSIM, &state) - Vector3::new(-0.0264, 0.0, 0.1347)).norm() < 1e-5);
+        // Nose straight down: what was forward is now up for the body.
+        state.world_from_body = UnitQuaternion::from_euler_angles(0.0, FRAC_PI_2, 0.0);
+        assert!((drag_n(&Airframe::AIRSIM, &state) - Vector3::new(-0.0066, 0.0, -4.0 * 0.1347)).norm() < 1e-5);
+    }
+}
