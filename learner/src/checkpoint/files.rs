@@ -1,6 +1,7 @@
 //! The files of a checkpoint: from state to bytes and back.
 
 use std::borrow::Cow;
+use std::collections::HashSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -121,6 +122,14 @@ fn block_name(number: u64) -> String {
 }
 
 fn write_tensors(path: &Path, tensors: Vec<(String, Borrowed<'_>)>) -> Result<(), CheckpointError> {
+    let mut names = HashSet::new();
+    if let Some((name, _)) = tensors.iter().find(|(name, _)| !names.insert(name)) {
+        let problem = format!("two tensors are called {name}, and one would be lost");
+        return Err(CheckpointError::Content {
+            path: path.to_owned(),
+            problem,
+        });
+    }
     safetensors::serialize_to_file(tensors, None, path).map_err(|error| match error {
         safetensors::SafeTensorError::IoError(source) => CheckpointError::io("write", path)(source),
         other => CheckpointError::Content {

@@ -1,10 +1,11 @@
 //! The manifest: what a checkpoint consists of, and how each part is recognised as undamaged.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{self, BufReader};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
-use xxhash_rust::xxh3::xxh3_64;
+use xxhash_rust::xxh3::{Xxh3Default, xxh3_64};
 
 use super::CheckpointError;
 
@@ -13,6 +14,9 @@ pub(super) const NAME: &str = "manifest.json";
 
 /// Changes with everything that makes older checkpoints unreadable.
 const FORMAT: u32 = 1;
+
+/// Bytes of a file that are read at once for its checksum.
+const PIECE: usize = 1 << 20;
 
 /// Format, configuration, and the files with their checksums.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -45,11 +49,15 @@ impl Manifest {
     ) -> Result<Self, CheckpointError> {
         let entry = |name: &&str| {
             let path = directory.join(name);
-            let content = fs::read(&path).map_err(CheckpointError::io("read", &path))?;
+            // Piece by piece: depth images can be larger than what is wise to hold twice.
+            let mut hasher = Xxh3Default::new();
+            let bytes = File::open(&path)
+                .and_then(|file| io::copy(&mut BufReader::with_capacity(PIECE, file), &mut hasher))
+                .map_err(CheckpointError::io("read", &path))?;
             Ok(Entry {
                 name: (*name).to_owned(),
-                bytes: content.len() as u64,
-                xxh3: hex(xxh3_64(&content)),
+                bytes,
+                xxh3: hex(hasher.digest()),
             })
         };
         let files = names.iter().map(entry).collect::<Result<_, _>>()?;

@@ -105,6 +105,16 @@ fn what_is_saved_is_what_is_loaded() {
 }
 
 #[test]
+fn two_tensors_of_one_name_are_refused_before_anything_is_in_place() {
+    let (_directory, store) = store(2);
+    let mut ambiguous = state(500);
+    ambiguous.tensors.push(ambiguous.tensors[0].clone());
+    let error = store.save(&ambiguous).unwrap_err().to_string();
+    assert!(error.contains("adam.steps"), "{error}");
+    assert!(store.list().unwrap().is_empty());
+}
+
+#[test]
 fn a_frozen_vaes_checkpoint_has_no_images_and_says_so() {
     let (_directory, store) = store(2);
     let mut frozen = state(500);

@@ -37,22 +37,22 @@ scalars! {
     WindowReturn => "window/return",
     /// Walls passed, averaged over the window. The paper's Fig. 10.
     WindowWallsPassed => "window/walls_passed",
-    /// Squared error of both Q outputs against the soft Bellman target. It rises as returns rise: watch it for explosions, not for progress.
+    /// Half the squared distance of the two Q outputs from the soft Bellman target. It rises with the returns: watch it for explosions, not for progress.
     CriticLoss => "sac/critic_loss",
     /// What the policy minimises: temperature times log-probability, minus Q.
     PolicyLoss => "sac/policy_loss",
-    /// What the temperature minimises; zero when the entropy is at its target.
-    TemperatureLoss => "sac/temperature_loss",
-    /// Weight of the entropy against the reward.
+    /// Weight of the entropy against the reward: the price of certainty.
     Temperature => "sac/temperature",
-    /// The policy's entropy in nats, estimated on the minibatches. Steered towards the target entropy.
+    /// The policy's entropy in nats, estimated on the minibatches. Steered towards the target entropy by the temperature.
     Entropy => "sac/entropy",
-    /// Mean of the smaller Q output on the minibatches: the discounted soft return that the critic expects.
-    MeanQ => "sac/mean_q",
-    /// Squared error summed over the image's pixels, plus the weighted Kullback-Leibler term.
+    /// The smaller Q output on the minibatches, on average: the discounted return, entropy bonus included, that the critic expects.
+    MeanValue => "sac/mean_value",
+    /// What the VAE minimises: squared error summed over an image's pixels, plus the weighted divergence.
     VaeLoss => "vae/loss",
-    /// Reconstruction error per pixel, depth in [0, 1].
-    VaeReconstruction => "vae/reconstruction_error",
+    /// Squared error of a reconstructed pixel, depth in [0, 1].
+    VaePixelError => "vae/pixel_error",
+    /// Kullback-Leibler divergence of the code from the standard normal distribution in nats: how much the code tells of the image.
+    VaeDivergence => "vae/divergence",
     /// Transitions in the replay buffer.
     ReplayTransitions => "replay/transitions",
     /// Transitions in its success part.
