@@ -1,1 +1,11 @@
-//! Placeholder, replaced in the first build-up.
+//! Starts, watches and stops the processes of a run, shows their progress, and draws what they leave behind.
+//!
+//! A run is prepared ([`prepare`](mod@prepare)), supervised ([`supervisor`]) under the eyes of a [`display`], drawn ([`reports`]) and told
+//! ([`conclusion`](mod@conclusion)), in this order. The supervisor knows the learner and the actors as programs only: it shares no memory with them,
+//! so that nothing that happens to them can harm it.
+
+pub mod conclusion;
+pub mod display;
+pub mod prepare;
+pub mod reports;
+pub mod supervisor;

@@ -1,0 +1,146 @@
+//! What the user is told at the end of a run: the evaluation, and where everything lies.
+
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+use serde::de::DeserializeOwned;
+use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::run::RunDirectory;
+use skein_protocol::summary::{Ending, Summary};
+
+use crate::display::Clock;
+
+/// The evaluation table, the run in one sentence, and the paths of everything it left, for standard output. What a run did not come to write is left out.
+pub fn conclusion(run: &RunDirectory) -> String {
+    let mut text = String::new();
+    if let Some(report) = read::<EvaluationReport>(&run.evaluation_json()) {
+        push(
+            &mut text,
+            &format!(
+                "Best snapshot (version {}), flown without exploration:\n{report}\n",
+                report.policy_version
+            ),
+        );
+    }
+    if let Some(summary) = read::<Summary>(&run.summary_json()) {
+        push(&mut text, &sentence(&summary));
+    }
+    push(&mut text, &format!("{}:", run.root().display()));
+    for (path, meaning) in artefacts(run) {
+        let shown = path.strip_prefix(run.root()).unwrap_or(&path).display().to_string();
+        push(&mut text, &format!("  {shown:<30} {meaning}"));
+    }
+    text
+}
+
+fn push(text: &mut String, line: &str) {
+    writeln!(text, "{line}").expect("writing to a string cannot fail");
+}
+
+fn read<T: DeserializeOwned>(path: &Path) -> Option<T> {
+    serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+}
+
+fn sentence(summary: &Summary) -> String {
+    let ending = match summary.ending {
+        Ending::Completed => "Completed",
+        Ending::Interrupted => "Interrupted",
+    };
+    format!(
+        "{ending} after {}: {} flights, {} steps, {} updates, {} VAE updates. Policy {}.\n",
+        Clock(summary.wall_secs),
+        summary.flights,
+        summary.steps,
+        summary.updates,
+        summary.vae_updates,
+        summary.policy_sha256.get(..16).unwrap_or(&summary.policy_sha256)
+    )
+}
+
+/// What is there, and what it is.
+fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
+    let plot = |name: &str| run.plots().join(name);
+    [
+        (run.config(), "the resolved configuration"),
+        (run.flights_csv(), "one row per training flight"),
+        (run.evaluation_json(), "the table above"),
+        (run.summary_json(), "counts, times, policy_sha256"),
+        (plot("return.png"), "return over the training flights"),
+        (plot("walls_passed.png"), "walls passed over the training flights"),
+        (
+            plot("reconstructions.png"),
+            "depth images and what the VAE makes of them",
+        ),
+        (plot("flight_paths.png"), "evaluation flights through the walls"),
+        (run.best_snapshot(), "the best snapshot: launch/evaluate.sh --run DIR"),
+        (run.latest_snapshot(), "the last snapshot"),
+        (run.checkpoints(), "everything the learner knew"),
+        (run.tensorboard(), "curves: tensorboard --logdir DIR"),
+        (run.logs(), "a log for each process"),
+    ]
+    .into_iter()
+    .filter(|(path, _)| path.exists())
+    .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+    use std::fs;
+
+    use skein_protocol::evaluation::CourseEvaluation;
+    use skein_protocol::ids::{PolicyVersion, RunId};
+
+    use super::*;
+
+    #[test]
+    fn a_finished_run_is_told_with_its_table_and_paths() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let report = EvaluationReport {
+            policy_version: PolicyVersion(42),
+            policy_sha256: "00".to_owned(),
+            courses: vec![CourseEvaluation::of("training", 5, &[])],
+        };
+        let summary = Summary {
+            skein_version: "0".to_owned(),
+            run: RunId(1),
+            seed: 1,
+            ending: Ending::Completed,
+            policy_sha256: "0123456789abcdef0000".to_owned(),
+            final_version: PolicyVersion(50),
+            best_version: None,
+            best_confirmed_r: None,
+            flights: 100,
+            steps: 2000,
+            updates: 300,
+            vae_updates: 40,
+            evaluation_flights: 0,
+            tickets_reissued: 0,
+            records_refused: 0,
+            wall_secs: 75.0,
+            phase_secs: BTreeMap::new(),
+        };
+        fs::write(run.evaluation_json(), serde_json::to_string(&report).unwrap()).unwrap();
+        fs::write(run.summary_json(), serde_json::to_string(&summary).unwrap()).unwrap();
+        let text = conclusion(&run);
+        for part in [
+            "version 42",
+            "training",
+            "Completed after 1:15: 100 flights, 2000 steps",
+            "summary.json",
+        ] {
+            assert!(text.contains(part), "`{part}` is missing in\n{text}");
+        }
+        assert!(
+            !text.contains("flights.csv"),
+            "what is not there is not listed:\n{text}"
+        );
+    }
+
+    #[test]
+    fn a_run_that_left_nothing_has_a_conclusion_still() {
+        let directory = tempfile::tempdir().unwrap();
+        assert!(conclusion(&RunDirectory::new(directory.path())).contains(&directory.path().display().to_string()));
+    }
+}

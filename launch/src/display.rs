@@ -1,0 +1,241 @@
+//! The progress of a run, on a terminal or in a log.
+//!
+//! A terminal gets a bar with two lines of figures beneath that renew themselves; anything else gets a plain line every few seconds. Both go to
+//! standard error, so that what a run comes to stands alone on standard output.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use skein_protocol::progress::{Phase, Progress};
+
+use crate::supervisor::Watcher;
+
+/// Between two plain lines.
+const LINE_INTERVAL: Duration = Duration::from_secs(5);
+/// The pace of the last so many seconds says how long the rest will take: the VAE's part of a run is slower than what follows.
+const PACE_SECS: f64 = 60.0;
+
+/// Shows how a run gets on.
+pub struct Display {
+    surface: Surface,
+    pace: Pace,
+}
+
+enum Surface {
+    Terminal(ProgressBar),
+    Plain { last: Option<(Instant, Phase)> },
+}
+
+impl Display {
+    /// A display for this process's standard error.
+    pub fn new() -> Self {
+        let surface = if std::io::stderr().is_terminal() {
+            let bar = ProgressBar::new(0);
+            let style =
+                ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}").expect("the template is well-formed");
+            bar.set_style(style.progress_chars("━━─"));
+            Surface::Terminal(bar)
+        } else {
+            Surface::Plain { last: None }
+        };
+        Self {
+            surface,
+            pace: Pace::default(),
+        }
+    }
+
+    /// Removes the bar, so that other things can be printed.
+    pub fn finish(&self) {
+        if let Surface::Terminal(bar) = &self.surface {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+impl Default for Display {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Watcher for Display {
+    fn progress(&mut self, progress: &Progress) {
+        let left_secs = self.pace.secs_left(progress);
+        match &mut self.surface {
+            Surface::Terminal(bar) => {
+                let (position, length) = match progress.phase {
+                    Phase::Evaluating => progress.evaluation_flights,
+                    Phase::Flying | Phase::Learning | Phase::Finishing => (progress.flights, progress.total_flights),
+                };
+                bar.set_length(length);
+                bar.set_position(position);
+                bar.set_message(format!("{}\n{}", Head { progress, left_secs }, Figures(progress)));
+            }
+            Surface::Plain { last } => {
+                let due = last.is_none_or(|(when, phase)| {
+                    when.elapsed() >= LINE_INTERVAL
+                        || (phase == Phase::Evaluating) != (progress.phase == Phase::Evaluating)
+                });
+                if due {
+                    *last = Some((Instant::now(), progress.phase));
+                    eprintln!("{} · {}", Head { progress, left_secs }, Figures(progress));
+                }
+            }
+        }
+    }
+
+    fn warn(&mut self, text: &str) {
+        match &self.surface {
+            Surface::Terminal(bar) => bar.suspend(|| eprintln!("skein: {text}")),
+            Surface::Plain { .. } => eprintln!("skein: {text}"),
+        }
+    }
+}
+
+/// Where the run is, and how much longer it will take.
+struct Head<'a> {
+    progress: &'a Progress,
+    left_secs: Option<f64>,
+}
+
+impl fmt::Display for Head<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Progress {
+            flights,
+            total_flights,
+            elapsed_secs,
+            ..
+        } = *self.progress;
+        match self.progress.phase {
+            Phase::Evaluating => {
+                let (flown, total) = self.progress.evaluation_flights;
+                write!(f, "evaluating {flown}/{total} · flight {flights}/{total_flights}")?;
+            }
+            Phase::Finishing => write!(f, "finishing · flight {flights}/{total_flights}")?,
+            Phase::Flying | Phase::Learning => write!(f, "flight {flights}/{total_flights}")?,
+        }
+        write!(f, " · {}", Clock(elapsed_secs))?;
+        match self.left_secs {
+            Some(left) => write!(f, ", {} left", Clock(left)),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The figures that show whether it learns.
+struct Figures<'a>(&'a Progress);
+
+impl fmt::Display for Figures<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let progress = self.0;
+        write!(
+            f,
+            "{:.0} steps/s · {:.0} updates/s",
+            progress.steps_per_sec, progress.updates_per_sec
+        )?;
+        for (name, value, digits) in [
+            ("walls passed", progress.walls_passed, 2),
+            ("return", progress.mean_return, 2),
+            ("temperature", progress.temperature, 3),
+            ("VAE loss", progress.vae_loss, 1),
+        ] {
+            if let Some(value) = value {
+                write!(f, " · {name} {value:.digits$}")?;
+            }
+        }
+        let plural = if progress.actors == 1 { "" } else { "s" };
+        write!(f, " · {} actor{plural}", progress.actors)
+    }
+}
+
+/// A duration as `m:ss` or `h:mm:ss`.
+pub(crate) struct Clock(pub(crate) f64);
+
+impl fmt::Display for Clock {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let secs = self.0.max(0.0).round() as u64;
+        let (hours, minutes, secs) = (secs / 3600, secs / 60 % 60, secs % 60);
+        match hours {
+            0 => write!(f, "{minutes}:{secs:02}"),
+            _ => write!(f, "{hours}:{minutes:02}:{secs:02}"),
+        }
+    }
+}
+
+/// The pace of the training flights over the last [`PACE_SECS`].
+#[derive(Debug, Default)]
+struct Pace {
+    /// Elapsed seconds and flights, oldest first.
+    reports: VecDeque<(f64, u64)>,
+}
+
+impl Pace {
+    /// Seconds until all training flights are flown at the present pace; `None` before there is a pace.
+    fn secs_left(&mut self, progress: &Progress) -> Option<f64> {
+        let (now_secs, flights) = (progress.elapsed_secs, progress.flights);
+        self.reports.push_back((now_secs, flights));
+        while self.reports.len() > 2 && self.reports[1].0 < now_secs - PACE_SECS {
+            self.reports.pop_front();
+        }
+        let &(then_secs, flown) = self.reports.front()?;
+        let flights_per_sec = flights.checked_sub(flown)? as f64 / (now_secs - then_secs);
+        let left = progress.total_flights.saturating_sub(flights) as f64;
+        (flights_per_sec > 0.0 && flights_per_sec.is_finite()).then(|| left / flights_per_sec)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn progress(elapsed_secs: f64, flights: u64) -> Progress {
+        Progress {
+            phase: Phase::Flying,
+            flights,
+            total_flights: 2000,
+            evaluation_flights: (0, 0),
+            steps: 10_000,
+            updates: 4000,
+            vae_updates: 100,
+            steps_per_sec: 151.6,
+            updates_per_sec: 63.2,
+            walls_passed: Some(1.234),
+            mean_return: None,
+            temperature: Some(0.0512),
+            vae_loss: None,
+            actors: 1,
+            elapsed_secs,
+        }
+    }
+
+    #[test]
+    fn a_plain_line_shows_what_is_known_and_nothing_else() {
+        let progress = progress(3725.0, 512);
+        let line = format!(
+            "{} · {}",
+            Head {
+                progress: &progress,
+                left_secs: Some(61.0)
+            },
+            Figures(&progress)
+        );
+        let expected = "flight 512/2000 · 1:02:05, 1:01 left · 152 steps/s · 63 updates/s · walls passed 1.23 · temperature 0.051 · 1 actor";
+        assert_eq!(line, expected);
+    }
+
+    #[test]
+    fn time_left_follows_the_present_pace() {
+        let mut pace = Pace::default();
+        assert_eq!(pace.secs_left(&progress(0.0, 0)), None);
+        assert_eq!(pace.secs_left(&progress(10.0, 100)), Some(190.0));
+        // Ten times slower from here on: after a minute the first seconds are forgotten.
+        for second in 11..=200 {
+            pace.secs_left(&progress(f64::from(second), 100 + (second as u64 - 10)));
+        }
+        let left = pace.secs_left(&progress(201.0, 291)).unwrap();
+        assert!((left - 1709.0).abs() < 1.0, "{left}");
+    }
+}

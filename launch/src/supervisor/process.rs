@@ -1,0 +1,163 @@
+//! One child process: how it is started, told to end, and reaped.
+
+use std::ffi::OsString;
+use std::fmt;
+use std::fs::OpenOptions;
+use std::io;
+use std::os::unix::process::ExitStatusExt;
+use std::path::{Path, PathBuf};
+use std::process::{ExitStatus, Stdio};
+
+use rustix::process::{Pid, Signal, getppid, kill_process, set_parent_process_death_signal};
+use tokio::process::{Child, Command};
+use tokio::sync::watch;
+
+/// What a process is told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Order {
+    /// Go on.
+    Run,
+    /// SIGTERM: end in order.
+    Terminate,
+    /// SIGKILL.
+    Kill,
+}
+
+/// How a process ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Exit {
+    /// Status 0.
+    Success,
+    /// Anything else, in words.
+    Failure(String),
+}
+
+impl Exit {
+    fn of(status: io::Result<ExitStatus>) -> Self {
+        match status {
+            Ok(status) if status.success() => Self::Success,
+            Ok(status) => match (status.code(), status.signal()) {
+                (Some(code), _) => Self::Failure(format!("exit status {code}")),
+                (None, Some(signal)) => Self::Failure(format!("killed by signal {signal}")),
+                (None, None) => Self::Failure(status.to_string()),
+            },
+            Err(error) => Self::Failure(format!("cannot be waited for: {error}")),
+        }
+    }
+}
+
+impl fmt::Display for Exit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Success => f.write_str("exit status 0"),
+            Self::Failure(how) => f.write_str(how),
+        }
+    }
+}
+
+/// What is done when the supervisor dies without being able to end its children.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Orphaned {
+    /// SIGTERM: it still has something to save.
+    Terminate,
+    /// SIGKILL: nobody needs it any more.
+    Kill,
+}
+
+/// Where a process writes its standard output.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Output {
+    /// To the supervisor.
+    Piped,
+    /// Into its log file, as its standard error always does.
+    Logged,
+}
+
+/// A program to start: which, with what arguments, and where its output goes.
+#[derive(Debug)]
+pub(super) struct Launch<'a> {
+    pub(super) program: &'a Path,
+    pub(super) arguments: Vec<OsString>,
+    /// Threads its tensor libraries may use; more than its share would slow everybody down.
+    pub(super) threads: usize,
+    pub(super) log: PathBuf,
+    pub(super) output: Output,
+    pub(super) orphaned: Orphaned,
+}
+
+impl Launch<'_> {
+    /// Starts the program.
+    ///
+    /// It leads a process group of its own, so that Ctrl-C in the terminal reaches only the supervisor, which knows the order of things. It ends
+    /// when the *thread* that started it ends: to be called on the main thread.
+    ///
+    /// # Errors
+    /// When its log cannot be opened or the program cannot be started.
+    pub(super) fn start(&self) -> io::Result<Child> {
+        let log = OpenOptions::new().create(true).append(true).open(&self.log)?;
+        let output = match self.output {
+            Output::Piped => Stdio::piped(),
+            Output::Logged => log.try_clone()?.into(),
+        };
+        let signal = match self.orphaned {
+            Orphaned::Terminate => Signal::TERM,
+            Orphaned::Kill => Signal::KILL,
+        };
+        let supervisor = rustix::process::getpid();
+        let mut command = Command::new(self.program);
+        command
+            .args(&self.arguments)
+            .env("OMP_NUM_THREADS", self.threads.to_string())
+            .env("MKL_NUM_THREADS", self.threads.to_string())
+            .env("OMP_DYNAMIC", "false")
+            // A waiting thread gives its core to an actor instead of spinning on it.
+            .env("OMP_WAIT_POLICY", "passive")
+            .env("GOMP_SPINCOUNT", "0")
+            .stdin(Stdio::null())
+            .stdout(output)
+            .stderr(log)
+            .process_group(0)
+            .kill_on_drop(true);
+        // SAFETY: between fork and exec only system calls are made (prctl, getppid), no memory is allocated and no lock is taken.
+        unsafe {
+            command.pre_exec(move || {
+                set_parent_process_death_signal(Some(signal))?;
+                // The supervisor may have died before the call above: then no signal would ever come.
+                if getppid() == Some(supervisor) {
+                    Ok(())
+                } else {
+                    Err(io::ErrorKind::NotConnected.into())
+                }
+            });
+        }
+        command.spawn()
+    }
+}
+
+/// Waits for `child`, passing on what `orders` say. Returns only when it is reaped: nothing is left of it then.
+pub(super) async fn reap(mut child: Child, mut orders: watch::Receiver<Order>) -> Exit {
+    let mut listening = true;
+    loop {
+        tokio::select! {
+            status = child.wait() => return Exit::of(status),
+            changed = orders.changed(), if listening => {
+                listening = changed.is_ok();
+                // Whoever gave the orders is gone without an order: nobody wants the process any more.
+                let order = if listening { *orders.borrow_and_update() } else { Order::Kill };
+                obey(&child, order);
+            }
+        }
+    }
+}
+
+fn obey(child: &Child, order: Order) {
+    let signal = match order {
+        Order::Run => return,
+        Order::Terminate => Signal::TERM,
+        Order::Kill => Signal::KILL,
+    };
+    // A child that is not reaped keeps its number, so the signal cannot reach a stranger; and that it has just ended is no error.
+    if let Some(pid) = child.id().and_then(|id| Pid::from_raw(id.cast_signed())) {
+        let _ = kill_process(pid, signal);
+    }
+}

@@ -1,0 +1,209 @@
+//! Supervision of small shell scripts that behave, or misbehave, as a learner and its actors may.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+
+use tempfile::TempDir;
+use tokio::sync::mpsc;
+
+use super::*;
+
+/// What was shown to the user.
+#[derive(Default)]
+struct Seen {
+    flights: Vec<u64>,
+    warnings: String,
+}
+
+impl Watcher for Seen {
+    fn progress(&mut self, progress: &Progress) {
+        self.flights.push(progress.flights);
+    }
+
+    fn warn(&mut self, text: &str) {
+        self.warnings.push_str(text);
+        self.warnings.push('\n');
+    }
+}
+
+const PROGRESS: &str = r#"{"phase":"flying","flights":7,"total_flights":9,"evaluation_flights":[0,0],"steps":1,"updates":0,"vae_updates":0,"steps_per_sec":1.0,"updates_per_sec":0.0,"walls_passed":null,"mean_return":null,"temperature":null,"vae_loss":null,"actors":1,"elapsed_secs":1.0}"#;
+
+/// An actor that flies until the learner's script says stop.
+const FAITHFUL_ACTOR: &str = "while [ ! -e $dir/stop ]; do sleep 0.02; done";
+/// A learner that runs until it is told to stop.
+const ENDLESS_LEARNER: &str = "trap 'touch $dir/saved $dir/stop; exit 0' TERM; while :; do sleep 0.02; done";
+
+struct Stage {
+    directory: TempDir,
+    plan: Plan,
+}
+
+impl Stage {
+    /// Two actors and a learner, given as shell commands that find the run's directory in `$dir` and the actor's id in `$id`. Each notes its process
+    /// id in the directory.
+    fn new(learner: &str, actor: &str) -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        fs::create_dir(run.logs()).unwrap();
+        let script = |name: &str, body: &str| {
+            let path = directory.path().join(name);
+            fs::write(
+                &path,
+                format!("#!/bin/sh\ndir=$2 id=$4\necho $$ >> $dir/pids\n{body}\n"),
+            )
+            .unwrap();
+            fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
+            path
+        };
+        let programs = Programs {
+            learner: script("learner", learner),
+            actor: script("actor", actor),
+        };
+        let plan = Plan {
+            run,
+            programs,
+            actors: vec![ActorId(0), ActorId(1)],
+            learner_threads: 1,
+        };
+        Self { directory, plan }
+    }
+
+    fn has(&self, name: &str) -> bool {
+        self.directory.path().join(name).exists()
+    }
+
+    /// Supervises; `interrupt` is called with the sender of interruptions.
+    fn run<F: Future<Output = ()> + Send + 'static>(
+        &self,
+        interrupt: impl FnOnce(mpsc::Sender<()>) -> F,
+    ) -> (Result<Ended, SupervisorError>, Seen) {
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .unwrap();
+        let mut seen = Seen::default();
+        let result = runtime.block_on(async {
+            let (sender, mut interrupts) = mpsc::channel(4);
+            tokio::spawn(interrupt(sender));
+            run(&self.plan, &mut interrupts, &mut seen).await
+        });
+        self.assert_nothing_is_left();
+        (result, seen)
+    }
+
+    /// Neither a process nor a zombie of those that were started.
+    fn assert_nothing_is_left(&self) {
+        let pids = fs::read_to_string(self.directory.path().join("pids")).unwrap();
+        for pid in pids.lines() {
+            assert!(!Path::new("/proc").join(pid).exists(), "process {pid} is left");
+        }
+    }
+}
+
+async fn until(condition: impl Fn() -> bool) {
+    while !condition() {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+async fn never(_: mpsc::Sender<()>) {}
+
+#[test]
+fn a_run_ends_when_its_learner_does() {
+    let stage = Stage::new(
+        &format!("echo '{PROGRESS}'; echo a remark; touch $dir/stop"),
+        FAITHFUL_ACTOR,
+    );
+    let (result, seen) = stage.run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert_eq!(seen.flights, [7]);
+    assert_eq!(seen.warnings, "a remark\n");
+}
+
+#[test]
+fn a_dead_actor_is_started_again() {
+    let actor = format!(
+        "if mkdir $dir/died-$id 2>/dev/null; then kill -9 $$; fi; touch $dir/second-life-$id; {FAITHFUL_ACTOR}"
+    );
+    let learner =
+        "while [ ! -e $dir/second-life-0 ] || [ ! -e $dir/second-life-1 ]; do sleep 0.02; done; touch $dir/stop";
+    let (result, seen) = Stage::new(learner, &actor).run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert!(
+        seen.warnings
+            .contains("actor 1 ended with killed by signal 9; it is started again"),
+        "{}",
+        seen.warnings
+    );
+}
+
+#[test]
+fn a_learner_that_dies_ends_the_run_and_its_last_words_are_told() {
+    let stage = Stage::new("echo 'no such device' >&2; exit 3", "while :; do sleep 0.02; done");
+    let (result, _) = stage.run(never);
+    let error = result.unwrap_err().to_string();
+    assert!(
+        error.contains("exit status 3") && error.contains("learner.log"),
+        "{error}"
+    );
+    assert!(error.contains("no such device"), "{error}");
+}
+
+#[test]
+fn actors_that_keep_dying_end_the_run_but_what_was_learned_is_saved() {
+    let stage = Stage::new(ENDLESS_LEARNER, "echo 'cannot fly' >&2; exit 1");
+    let (result, _) = stage.run(never);
+    let error = result.unwrap_err().to_string();
+    assert!(
+        error.contains("no actor is left") && error.contains("cannot fly"),
+        "{error}"
+    );
+    assert!(stage.has("saved"));
+}
+
+#[test]
+fn the_first_interruption_stops_in_order() {
+    let stage = Stage::new(&format!("echo '{PROGRESS}'; {ENDLESS_LEARNER}"), FAITHFUL_ACTOR);
+    let learner_up = stage.plan.run.root().join("pids");
+    let (result, _) = stage.run(|interrupts| async move {
+        until(|| fs::read_to_string(&learner_up).is_ok_and(|pids| pids.lines().count() == 3)).await;
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        interrupts.send(()).await.unwrap();
+    });
+    assert_eq!(result.unwrap(), Ended::Interrupted);
+    assert!(stage.has("saved"), "the learner was not given time to save");
+}
+
+#[test]
+fn the_second_interruption_stops_at_once() {
+    let deaf = "trap '' TERM; while :; do sleep 0.02; done";
+    let stage = Stage::new(deaf, deaf);
+    let pids = stage.plan.run.root().join("pids");
+    let begun = std::time::Instant::now();
+    let (result, _) = stage.run(|interrupts| async move {
+        until(|| fs::read_to_string(&pids).is_ok_and(|pids| pids.lines().count() == 3)).await;
+        interrupts.send(()).await.unwrap();
+        interrupts.send(()).await.unwrap();
+    });
+    assert_eq!(result.unwrap(), Ended::Interrupted);
+    assert!(begun.elapsed() < ACTOR_GRACE, "took {:?}", begun.elapsed());
+}
+
+#[test]
+fn a_program_that_cannot_be_started_leaves_nothing_behind() {
+    let mut stage = Stage::new(ENDLESS_LEARNER, "");
+    stage.plan.programs.actor = PathBuf::from("/nowhere/skein-actor");
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    let (_sender, mut interrupts) = mpsc::channel(1);
+    let error = runtime
+        .block_on(run(&stage.plan, &mut interrupts, &mut Seen::default()))
+        .unwrap_err();
+    assert!(error.to_string().contains("/nowhere/skein-actor"), "{error}");
+    if stage.has("pids") {
+        stage.assert_nothing_is_left();
+    }
+}
