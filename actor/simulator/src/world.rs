@@ -110,9 +110,11 @@ impl World {
             .intersection_test(&body_from_world, &self.body_shape, &self.obstacles)
             // A cuboid against a triangle mesh is a pair that parry's dispatcher knows.
             .is_ok_and(|test| test.intersecting);
+        // The end wall fills the whole section: a body that touches nothing else meets it as it would meet a plane.
+        let past_end_wall = self.body_shape.compute_aabb(world_from_body).maxs.x >= self.end_wall_m;
         if touches_obstacle {
             Contact::Obstacle
-        } else if self.body_shape.compute_aabb(world_from_body).maxs.x >= self.end_wall_m {
+        } else if past_end_wall {
             Contact::EndWall
         } else {
             Contact::Nothing

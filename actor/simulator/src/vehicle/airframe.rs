@@ -85,8 +85,9 @@ impl Airframe {
 
     /// AscTec Hummingbird with a quicker controller of our own.
     ///
-    /// Source of mass, inertia, arm, thrust and torque coefficients, lag, drag: RotorPy, `hummingbird_params.py`; of the rotors'
-    /// top speed, 838 rad/s: RotorS; of the body's size, 0.54 × 0.54 × 0.0855 m: the maker's data sheet.
+    /// Source of mass, inertia, arm, rotor radius 0.1 m, thrust and torque coefficients, lag, drag: RotorPy,
+    /// `hummingbird_params.py`. Its rotor speed limit, 1500 rad/s, would lift ten times the weight; the limit of RotorS'
+    /// `hummingbird.xacro`, 838 rad/s, lifts three times. Height 0.12 m: RotorS.
     pub(crate) const HUMMINGBIRD: Self = Self {
         mass_kg: 0.5,
         inertia_kgm2: Vector3::new(3.65e-3, 3.68e-3, 7.03e-3),
@@ -95,7 +96,8 @@ impl Airframe {
         rotor_torque_nm: 1.36e-7 * 838.0 * 838.0,
         rotor_lag_secs: 0.005,
         drag_n_per_mps2: Vector3::new(0.005, 0.005, 0.01),
-        half_extents_m: Vector3::new(0.27, 0.27, 0.04275),
+        // The square around the rotors' discs, 2 · (0.17 m / √2 + 0.1 m) = 0.44 m.
+        half_extents_m: Vector3::new(0.22, 0.22, 0.06),
         gains: Gains {
             // Poles placed by hand, each stage some four times as quick as the one above it: velocity 2.5 /s (g · 0.255 rad per
             // m/s), attitude 12 /s, rates 51 /s (one unit of command turns 515 rad/s² about x), climb 7.8 /s.

@@ -2,7 +2,7 @@
 //!
 //! Three presets share one interface. `airsim` and `hummingbird` are quadrotors whose controller turns a velocity command into
 //! tilt, tilt into torques and torques into rotor thrust; `point` follows the command with a plain first-order lag.
-//! Nothing here integrates motion: that is rapier's part, see [`crate::world`].
+//! Nothing here integrates motion: that is rapier's part, in `world.rs`.
 
 mod airframe;
 mod controller;

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 pub enum Preset {
     /// AirSim's generic quadrotor with its SimpleFlight controller: 1 kg, 0.98 m across, sluggish (lateral time constant 0.9 s).
     Airsim,
-    /// AscTec Hummingbird with a quicker controller: 0.5 kg, 0.54 m across, lateral time constant 0.4 s.
+    /// AscTec Hummingbird with a quicker controller: 0.5 kg, 0.44 m across, lateral time constant 0.4 s.
     Hummingbird,
     /// No attitude, only a first-order velocity lag, in AirSim's collision body.
     Point,
