@@ -179,16 +179,12 @@ mod tests {
     use rand_pcg::Pcg64Mcg;
     use skein_protocol::snapshot::SnapshotLayout;
 
-    /// Uniform in PyTorch's default range, so that values neither vanish nor explode.
+    use crate::testing::random_snapshot;
+
     fn parameters(seed: u64) -> (SnapshotLayout, Vec<f32>) {
         let layout = SnapshotLayout::new(LATENT, 1);
-        let mut rng = Pcg64Mcg::seed_from_u64(seed);
-        let mut values = vec![0.0; layout.values()];
-        for tensor in layout.tensors() {
-            let bound = (tensor.shape[0] as f32 / tensor.range.len() as f32).sqrt().min(0.5);
-            values[tensor.range.clone()].fill_with(|| rng.random_range(-bound..bound));
-        }
-        (layout, values)
+        let snapshot = random_snapshot(&layout, seed);
+        (layout, snapshot.values)
     }
 
     fn image(seed: u64) -> Box<[u8; IMAGE_PIXELS]> {

@@ -60,7 +60,9 @@ pub(super) fn multiply(
 pub(super) fn add_bias_relu(values: &mut [f32], bias: &[f32]) {
     for row in values.chunks_exact_mut(bias.len()) {
         for (value, bias) in row.iter_mut().zip(bias) {
-            *value = (*value + bias).max(0.0);
+            let sum = *value + bias;
+            // Unlike `max`, this lets through what is not a number: the simulator refuses it, where a silent zero would fly on.
+            *value = if sum < 0.0 { 0.0 } else { sum };
         }
     }
 }
@@ -97,6 +99,14 @@ mod tests {
             2,
         );
         assert_eq!(outputs, [14.0, 140.0, 32.0, 320.0]);
+    }
+
+    #[test]
+    fn cutting_negatives_hides_no_fault() {
+        let mut values = [-1.0, 2.0, f32::NAN, -3.0];
+        add_bias_relu(&mut values, &[0.5, 0.5]);
+        assert_eq!(values[..2], [0.0, 2.5]);
+        assert!(values[2].is_nan() && values[3] == 0.0);
     }
 
     #[test]

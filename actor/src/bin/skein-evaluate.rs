@@ -1,0 +1,196 @@
+//! `skein-evaluate`: flies a trained snapshot and counts.
+
+use std::fs;
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use anyhow::{Context, bail};
+use clap::{Args, Parser};
+use skein_actor::courses::Courses;
+use skein_actor::evaluation::{Evaluation, Keep};
+use skein_actor::recording::{COLUMNS, write_recording};
+use skein_protocol::config::Config;
+use skein_protocol::run::RunDirectory;
+use skein_protocol::snapshot::Snapshot;
+
+/// Flies a trained snapshot through courses and prints how it fares.
+///
+/// Every flight takes off from the start of level 1 and follows the policy without noise. The flights are the same each time, whatever the number of threads:
+/// their seeds derive from the seed of the run that trained the snapshot, whose configuration lies in the snapshot file.
+///
+/// R is the average rate of walls passed, (t_1 + … + t_n) / (n · flights), where t_i counts the flights that passed wall i.
+#[derive(Parser)]
+#[command(version, after_long_help = columns_help())]
+struct Arguments {
+    #[command(flatten)]
+    subject: Subject,
+    /// A course file to fly, once for each course. By default the evaluation courses of the run that trained the snapshot.
+    #[arg(long, value_name = "FILE")]
+    course: Vec<PathBuf>,
+    /// Flights per course. By default evaluation.flights of that run.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    flights: Option<u64>,
+    /// Also write the result to this file, as JSON.
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Also write every step of every flight to this file, as .npz; takes 9.3 KiB of memory for each step, about 1 MiB for each whole flight.
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
+    /// Threads to fly on. By default one a core.
+    #[arg(long, value_name = "N")]
+    threads: Option<NonZeroUsize>,
+}
+
+/// What is flown.
+#[derive(Args)]
+#[group(required = true, multiple = false)]
+struct Subject {
+    /// Directory of a run: its best snapshot is flown, or the latest where none has been confirmed as best.
+    #[arg(long, value_name = "DIR")]
+    run: Option<PathBuf>,
+    /// A snapshot file (.safetensors).
+    #[arg(long, value_name = "FILE")]
+    snapshot: Option<PathBuf>,
+}
+
+fn main() -> ExitCode {
+    match run(&Arguments::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("skein-evaluate: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    for file in [&arguments.json, &arguments.record].into_iter().flatten() {
+        check_writable(file)?;
+    }
+    let path = snapshot_path(&arguments.subject)?;
+    let (snapshot, config) = Snapshot::load(&path)?;
+    let files = match arguments.course.as_slice() {
+        [] => evaluation_courses(&config, &path)?,
+        given => given.to_vec(),
+    };
+    let courses = Arc::new(Courses::of_files(&config, &files)?);
+    let flights = arguments.flights.unwrap_or(config.evaluation.flights);
+    let threads = arguments
+        .threads
+        .map_or_else(std::thread::available_parallelism, Ok)
+        .unwrap_or(NonZeroUsize::MIN);
+    eprintln!(
+        "snapshot {} of {}: {flights} flights on each of {} courses, {threads} threads",
+        snapshot.version,
+        path.display(),
+        files.len()
+    );
+
+    let keep = if arguments.record.is_some() {
+        Keep::Records
+    } else {
+        Keep::Scores
+    };
+    let evaluation = Evaluation {
+        snapshot: &snapshot,
+        config: &config,
+        courses: Arc::clone(&courses),
+        flights,
+        threads,
+        keep,
+    };
+    let evaluated = evaluation.run()?;
+
+    println!("{}", evaluated.report);
+    if let Some(file) = &arguments.json {
+        let json = serde_json::to_string_pretty(&evaluated.report).context("the result is no JSON")?;
+        fs::write(file, json + "\n").with_context(|| format!("cannot write {}", file.display()))?;
+    }
+    if let Some(file) = &arguments.record {
+        let names: Vec<_> = courses.evaluation().iter().map(|course| course.name()).collect();
+        write_recording(file, &names, &evaluated.flights)?;
+    }
+    Ok(())
+}
+
+/// Minutes of flying must not end in a mistyped folder.
+fn check_writable(file: &Path) -> anyhow::Result<()> {
+    let folder = match file.parent() {
+        Some(folder) if folder != Path::new("") => folder,
+        _ => Path::new("."),
+    };
+    if !folder.is_dir() {
+        bail!(
+            "cannot write {}: there is no folder {}; create it, or name another",
+            file.display(),
+            folder.display()
+        );
+    }
+    Ok(())
+}
+
+fn snapshot_path(subject: &Subject) -> anyhow::Result<PathBuf> {
+    let Some(run) = &subject.run else {
+        return subject
+            .snapshot
+            .clone()
+            .context("neither --run nor --snapshot is given");
+    };
+    let directory = RunDirectory::new(run);
+    let candidates = [directory.best_snapshot(), directory.latest_snapshot()];
+    let found = candidates.iter().find(|path| path.is_file()).cloned();
+    found.with_context(|| {
+        format!(
+            "{} holds neither snapshots/best.safetensors nor snapshots/latest.safetensors: is it the directory of a run, and has its first epoch ended?",
+            run.display()
+        )
+    })
+}
+
+/// The evaluation courses of the run that trained the snapshot: where its configuration says, or else in the run's directory, which may have moved.
+fn evaluation_courses(config: &Config, snapshot: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let run = snapshot.parent().and_then(Path::parent).map(RunDirectory::new);
+    let find = |path: &PathBuf| {
+        let moved = run
+            .as_ref()
+            .zip(path.file_name())
+            .map(|(run, name)| run.courses().join(name));
+        let found = moved
+            .into_iter()
+            .chain([path.clone()])
+            .find(|candidate| candidate.is_file());
+        found.with_context(|| {
+            format!(
+                "the course {} that the snapshot's run was evaluated on is not there any more; name the course files to fly with --course",
+                path.display()
+            )
+        })
+    };
+    config.courses.evaluation.iter().map(find).collect()
+}
+
+/// The arrays of a recording, for the long help.
+fn columns_help() -> String {
+    let rows = COLUMNS.iter().map(|column| {
+        let shape: Vec<_> = std::iter::once("n".to_owned())
+            .chain(column.shape.iter().map(usize::to_string))
+            .collect();
+        format!(
+            "  {:<13} {:<4} {:<14} {}\n",
+            column.name,
+            column.kind,
+            format!("[{}]", shape.join(", ")),
+            column.meaning
+        )
+    });
+    format!(
+        "Arrays in the file of --record, read by numpy.load(FILE); a row for each observation, flights and courses in order:\n{}  {:<13} {:<4} {:<14} {}",
+        rows.collect::<String>(),
+        "course_names",
+        "<U",
+        "[courses]",
+        "names of the courses"
+    )
+}

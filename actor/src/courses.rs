@@ -1,0 +1,152 @@
+//! The courses of a run, and a simulator for each, built when a ticket first asks for it.
+
+use std::collections::HashMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use skein_protocol::config::Config;
+use skein_protocol::ticket::CourseChoice;
+use skein_simulator::course::{Course, CourseError, RangesError};
+use skein_simulator::simulator::{Simulator, SimulatorError, SimulatorSettings};
+
+/// The courses a ticket may name, and how they are flown. Shared by the threads that fly them.
+#[derive(Debug)]
+pub struct Courses {
+    settings: SimulatorSettings,
+    training: Option<Arc<Course>>,
+    evaluation: Vec<Arc<Course>>,
+}
+
+/// Simulators of one thread.
+pub struct Simulators {
+    courses: Arc<Courses>,
+    fixed: HashMap<CourseChoice, Simulator>,
+    /// A generated course is flown once, so only the last is kept: a ticket issued again may come back to it.
+    generated: Option<(u64, Simulator)>,
+}
+
+impl Courses {
+    /// The courses that a run's configuration names.
+    ///
+    /// # Errors
+    /// [`CoursesError`] names the file or the key.
+    pub fn of_run(config: &Config) -> Result<Self, CoursesError> {
+        let evaluation = config.courses.evaluation.iter().map(|path| load(path));
+        Ok(Self {
+            settings: simulator_settings(config)?,
+            training: Some(load(&config.courses.training)?),
+            evaluation: evaluation.collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// The courses in the files `paths`, as evaluation courses, and no others.
+    ///
+    /// # Errors
+    /// [`CoursesError`] names the file or the key.
+    pub fn of_files<P: AsRef<Path>>(config: &Config, paths: &[P]) -> Result<Self, CoursesError> {
+        Ok(Self {
+            settings: simulator_settings(config)?,
+            training: None,
+            evaluation: paths.iter().map(|path| load(path.as_ref())).collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// The evaluation courses in order.
+    pub fn evaluation(&self) -> &[Arc<Course>] {
+        &self.evaluation
+    }
+
+    fn course(&self, choice: CourseChoice) -> Result<Arc<Course>, NoCourse> {
+        match choice {
+            CourseChoice::Training => self.training.clone().ok_or(NoCourse::NotLoaded { choice }),
+            CourseChoice::Evaluation(index) => self
+                .evaluation
+                .get(index as usize)
+                .cloned()
+                .ok_or(NoCourse::NotLoaded { choice }),
+            CourseChoice::Generated(seed) => Ok(Arc::new(Course::generate(seed, &self.settings.generator)?)),
+        }
+    }
+}
+
+impl Simulators {
+    /// No simulator yet of any of `courses`.
+    pub fn new(courses: Arc<Courses>) -> Self {
+        Self {
+            courses,
+            fixed: HashMap::new(),
+            generated: None,
+        }
+    }
+
+    /// How courses are flown.
+    pub fn settings(&self) -> &SimulatorSettings {
+        &self.courses.settings
+    }
+
+    /// The simulator of the course a ticket names.
+    ///
+    /// # Errors
+    /// [`NoCourse`] says what is wrong with the choice.
+    pub fn of(&mut self, choice: CourseChoice) -> Result<&mut Simulator, NoCourse> {
+        let Self {
+            courses,
+            fixed,
+            generated,
+        } = self;
+        let build = || Ok::<_, NoCourse>(Simulator::new(courses.course(choice)?, &courses.settings)?);
+        match choice {
+            CourseChoice::Generated(seed) => {
+                if generated.as_ref().is_none_or(|(built, _)| *built != seed) {
+                    *generated = Some((seed, build()?));
+                }
+                Ok(&mut generated.as_mut().expect("it was built in the lines above").1)
+            }
+            CourseChoice::Training | CourseChoice::Evaluation(_) => {
+                use std::collections::hash_map::Entry;
+                Ok(match fixed.entry(choice) {
+                    Entry::Occupied(entry) => entry.into_mut(),
+                    Entry::Vacant(entry) => entry.insert(build()?),
+                })
+            }
+        }
+    }
+}
+
+fn load(path: &Path) -> Result<Arc<Course>, CoursesError> {
+    Ok(Arc::new(Course::load(path)?))
+}
+
+fn simulator_settings(config: &Config) -> Result<SimulatorSettings, CoursesError> {
+    toml::Value::Table(config.simulator.clone())
+        .try_into()
+        .map_err(|error: toml::de::Error| CoursesError::Settings(error.to_string().trim_end().replace('\n', " ")))
+}
+
+/// Why the courses of a run or an evaluation cannot be had.
+#[derive(Debug, thiserror::Error)]
+pub enum CoursesError {
+    /// A course file cannot be read or flown.
+    #[error(transparent)]
+    Course(#[from] CourseError),
+    /// The configuration's simulator section is wrong.
+    #[error("[simulator] {0}")]
+    Settings(String),
+}
+
+/// Why a ticket's course cannot be flown.
+#[derive(Debug, thiserror::Error)]
+pub enum NoCourse {
+    /// There is none of this number.
+    #[error("the ticket names {choice:?}, which this process has not loaded")]
+    NotLoaded {
+        /// What the ticket names.
+        choice: CourseChoice,
+    },
+    /// None can be generated.
+    #[error(transparent)]
+    Ranges(#[from] RangesError),
+    /// It cannot be simulated.
+    #[error(transparent)]
+    Simulator(#[from] SimulatorError),
+}

@@ -1,0 +1,272 @@
+//! Evaluation without a learner: how a snapshot flies, course by course.
+//!
+//! The flights are those of the environment loop, with tickets written here: mode action, start of level 1, seeds from the run's. They are spread over all
+//! cores; which thread flies which changes nothing.
+
+use std::convert::Infallible;
+use std::num::NonZeroUsize;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use bytemuck::Zeroable;
+use skein_protocol::config::Config;
+use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
+use skein_protocol::ids::{ActorId, Attempt, FlightId, Incarnation, RunId};
+use skein_protocol::seeds::{Purpose, derive};
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+use skein_protocol::transition::TransitionRecord;
+
+use crate::agent::Agent;
+use crate::courses::{Courses, Simulators};
+use crate::environment_loop::{Directive, FlightError, FlightFault, Pilot, RecordLink};
+use crate::inference::Network;
+
+/// What is to be flown.
+#[derive(Debug)]
+pub struct Evaluation<'a> {
+    /// The policy.
+    pub snapshot: &'a Snapshot,
+    /// The configuration it was trained with.
+    pub config: &'a Config,
+    /// Each of its evaluation courses is flown.
+    pub courses: Arc<Courses>,
+    /// Flights per course.
+    pub flights: u64,
+    /// Threads to fly on; without influence on the result.
+    pub threads: NonZeroUsize,
+    /// What to keep of the flights.
+    pub keep: Keep,
+}
+
+/// What to keep of the flights.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Keep {
+    /// Their scores.
+    Scores,
+    /// Every record, 9.3 KiB for each step.
+    Records,
+}
+
+/// How it went.
+#[derive(Debug)]
+pub struct Evaluated {
+    /// Course by course.
+    pub report: EvaluationReport,
+    /// Course by course, flight by flight.
+    pub flights: Vec<Vec<EvaluatedFlight>>,
+}
+
+/// One flight of an evaluation.
+#[derive(Debug, Clone)]
+pub struct EvaluatedFlight {
+    /// What it came to.
+    pub score: FlightScore,
+    /// Its steps and its closing record, if they were to be kept.
+    pub records: Vec<Box<TransitionRecord>>,
+}
+
+/// Why an evaluation came to nothing.
+#[derive(Debug, thiserror::Error)]
+#[error("course \"{course}\", flight {flight}: {fault}")]
+pub struct EvaluationError {
+    /// The course.
+    pub course: String,
+    /// The flight's number on that course, from 0.
+    pub flight: u64,
+    /// What went wrong.
+    #[source]
+    pub fault: FlightFault,
+}
+
+impl Evaluation<'_> {
+    /// Flies all flights.
+    ///
+    /// # Errors
+    /// [`EvaluationError`] names the first flight, in course and flight order, that cannot be flown.
+    pub fn run(&self) -> Result<Evaluated, EvaluationError> {
+        let network = Network::new(self.snapshot, &SnapshotLayout::of(self.config));
+        let next = AtomicU64::new(0);
+        let mut flown: Vec<_> = std::thread::scope(|scope| {
+            let threads: Vec<_> = (0..self.threads.get())
+                .map(|_| scope.spawn(|| self.fly_next_until_done(&network, &next)))
+                .collect();
+            threads
+                .into_iter()
+                .flat_map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+                .collect()
+        });
+        flown.sort_by_key(|(index, _)| *index);
+
+        let mut flights = flown.into_iter().map(|(_, flight)| flight);
+        let mut courses = Vec::new();
+        let mut by_course = Vec::new();
+        for course in self.courses.evaluation() {
+            let flights: Vec<_> = flights.by_ref().take(self.flights as usize).collect::<Result<_, _>>()?;
+            let scores: Vec<_> = flights.iter().map(|flight: &EvaluatedFlight| flight.score).collect();
+            courses.push(CourseEvaluation::of(course.name(), course.walls().len(), &scores));
+            by_course.push(flights);
+        }
+        let report = EvaluationReport {
+            policy_version: self.snapshot.version,
+            policy_sha256: self.snapshot.sha256(),
+            courses,
+        };
+        Ok(Evaluated {
+            report,
+            flights: by_course,
+        })
+    }
+
+    /// One thread's share: whatever flight is next. The number counts flights through all courses.
+    fn fly_next_until_done(
+        &self,
+        network: &Network,
+        next: &AtomicU64,
+    ) -> Vec<(u64, Result<EvaluatedFlight, EvaluationError>)> {
+        let simulators = Simulators::new(Arc::clone(&self.courses));
+        let agent = Agent::new(self.config.learning.observation);
+        let mut pilot = Pilot::new(ActorId(0), Incarnation(0), simulators, agent);
+        let total = self.flights * self.courses.evaluation().len() as u64;
+        let mut flown = Vec::new();
+        loop {
+            let index = next.fetch_add(1, Ordering::Relaxed);
+            if index >= total {
+                return flown;
+            }
+            flown.push((
+                index,
+                self.fly(&mut pilot, network, index / self.flights, index % self.flights),
+            ));
+        }
+    }
+
+    fn fly(
+        &self,
+        pilot: &mut Pilot,
+        network: &Network,
+        course: u64,
+        flight: u64,
+    ) -> Result<EvaluatedFlight, EvaluationError> {
+        let ticket = Ticket {
+            run: RunId(0),
+            flight: FlightId(FlightId::FIRST_EVALUATION.0 + flight),
+            attempt: Attempt(0),
+            policy_version: self.snapshot.version,
+            course: CourseChoice::Evaluation(course as u32),
+            start_level: 1,
+            exploration: Exploration::Mode,
+            seed: derive(self.config.run.seed, Purpose::EvaluationFlight, flight),
+        };
+        let mut memory = Memory {
+            keep: self.keep,
+            spare: Vec::new(),
+            sent: Vec::new(),
+        };
+        match pilot.fly(&ticket, network, &mut memory) {
+            Ok(score) => Ok(EvaluatedFlight {
+                score,
+                records: memory.sent,
+            }),
+            Err(FlightError::Fault(fault)) => {
+                let course = self.courses.evaluation()[course as usize].name().to_owned();
+                Err(EvaluationError { course, flight, fault })
+            }
+            Err(FlightError::Link(never)) => match never {},
+            Err(FlightError::Abandoned) => unreachable!("nobody tells an evaluation to stop"),
+        }
+    }
+}
+
+/// Records in plain memory.
+struct Memory {
+    keep: Keep,
+    spare: Vec<Box<TransitionRecord>>,
+    sent: Vec<Box<TransitionRecord>>,
+}
+
+impl RecordLink for Memory {
+    type Loan = Box<TransitionRecord>;
+    type Error = Infallible;
+
+    fn loan(&mut self) -> Result<Box<TransitionRecord>, Infallible> {
+        Ok(self.spare.pop().unwrap_or_else(|| Box::new(TransitionRecord::zeroed())))
+    }
+
+    fn send(&mut self, record: Box<TransitionRecord>) -> Result<(), Infallible> {
+        match self.keep {
+            Keep::Scores => self.spare.push(record),
+            Keep::Records => self.sent.push(record),
+        }
+        Ok(())
+    }
+
+    fn directive(&mut self) -> Result<Directive, Infallible> {
+        Ok(Directive::Continue)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{config, random_snapshot};
+
+    fn evaluated(threads: usize, keep: Keep) -> Evaluated {
+        let mut config = config("");
+        config.courses.evaluation.truncate(2);
+        let snapshot = random_snapshot(&SnapshotLayout::of(&config), 3);
+        let courses = Arc::new(Courses::of_files(&config, &config.courses.evaluation).unwrap());
+        let threads = NonZeroUsize::new(threads).unwrap();
+        Evaluation {
+            snapshot: &snapshot,
+            config: &config,
+            courses,
+            flights: 5,
+            threads,
+            keep,
+        }
+        .run()
+        .unwrap()
+    }
+
+    #[test]
+    fn the_number_of_threads_changes_nothing() {
+        let one = evaluated(1, Keep::Records);
+        let bytes = |evaluated: &Evaluated| {
+            let records = evaluated.flights.iter().flatten().flat_map(|flight| &flight.records);
+            records
+                .flat_map(|record| bytemuck::bytes_of(&**record).to_vec())
+                .collect::<Vec<u8>>()
+        };
+        for threads in [2, 7] {
+            let many = evaluated(threads, Keep::Records);
+            assert_eq!(many.report, one.report);
+            assert!(bytes(&many) == bytes(&one));
+        }
+    }
+
+    #[test]
+    fn keeping_records_changes_no_score_and_every_course_has_its_flights() {
+        let (scores, records) = (evaluated(2, Keep::Scores), evaluated(2, Keep::Records));
+        assert_eq!(scores.report, records.report);
+        assert_eq!(
+            scores
+                .report
+                .courses
+                .iter()
+                .map(|course| course.flights)
+                .collect::<Vec<_>>(),
+            [5, 5]
+        );
+        assert_ne!(scores.report.courses[0].course, scores.report.courses[1].course);
+        assert!(scores.flights.iter().flatten().all(|flight| flight.records.is_empty()));
+        let starts: Vec<_> = records.flights[0]
+            .iter()
+            .map(|flight| flight.records[0].position_m)
+            .collect();
+        assert!(
+            starts.windows(2).all(|pair| pair[0] != pair[1]),
+            "a hundred flights are a hundred different ones"
+        );
+    }
+}

@@ -1,0 +1,95 @@
+//! `skein-actor`: an actor process of a run.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use anyhow::Context;
+use clap::Parser;
+use signal_hook::consts::{SIGINT, SIGTERM};
+use skein_actor::agent::Agent;
+use skein_actor::courses::{Courses, Simulators};
+use skein_actor::environment_loop::Pilot;
+use skein_actor::service::{Ending, LearnerLine, serve};
+use skein_actor::weights::Weights;
+use skein_protocol::ids::{ActorId, Incarnation};
+use skein_protocol::logging::{LogFormat, log_to_file};
+use skein_protocol::run::RunDirectory;
+use skein_protocol::services::ActorPorts;
+use skein_protocol::snapshot::SnapshotLayout;
+use tracing::{error, info};
+
+/// Flies for a run, beside its learner and other actors, until the run is over.
+///
+/// Actors come and go as they like: what is learned does not depend on them. The log goes to logs/actor-ID.log in the run's directory (RUST_LOG says what is
+/// logged, SKEIN_LOG_FORMAT=json how). Exit status: 0 when the run is over or on SIGTERM or SIGINT, 1 on an error, 3 when the learner has been silent for
+/// transport.learner_silence_secs.
+#[derive(Parser)]
+#[command(version)]
+struct Arguments {
+    /// Directory of the run.
+    #[arg(long, value_name = "DIR")]
+    run: PathBuf,
+    /// Number of this actor, unique within the run; by default the first that is free.
+    #[arg(long, value_name = "ID")]
+    id: Option<u32>,
+}
+
+/// The learner is gone, and nobody has said that the run is over.
+const EXIT_LEARNER_SILENT: u8 = 3;
+
+fn main() -> ExitCode {
+    match run(&Arguments::parse()) {
+        Ok(Ending::Stopped | Ending::Signalled) => ExitCode::SUCCESS,
+        Ok(Ending::LearnerSilent) => {
+            eprintln!("skein-actor: nothing was heard of the learner for transport.learner_silence_secs; leaving");
+            ExitCode::from(EXIT_LEARNER_SILENT)
+        }
+        Err(error) => {
+            error!("{error:#}");
+            eprintln!("skein-actor: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
+    let told_to_end = end_on_signal()?;
+    let directory = RunDirectory::new(&arguments.run);
+    let (identity, config) = directory.open()?;
+    let actor = match arguments.id {
+        Some(id) => ActorId(id),
+        None => directory.claim_actor()?,
+    };
+    let log = directory.actor_log(actor);
+    log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
+
+    let incarnation = incarnation();
+    info!(%actor, %incarnation, pid = std::process::id(), run = %identity.run, "actor started");
+    let simulators = Simulators::new(Arc::new(Courses::of_run(&config)?));
+    let mut pilot = Pilot::new(actor, incarnation, simulators, Agent::new(config.learning.observation));
+    let ports = ActorPorts::open(&identity, &config)?;
+    let weights = Weights::new(SnapshotLayout::of(&config));
+    let mut line = LearnerLine::new(ports, actor, incarnation, weights, &config.transport, &told_to_end);
+    Ok(serve(&mut pilot, &mut line)?)
+}
+
+/// A flag that the first SIGTERM or SIGINT sets; a second one ends the process on the spot.
+fn end_on_signal() -> anyhow::Result<Arc<AtomicBool>> {
+    let told_to_end = Arc::new(AtomicBool::new(false));
+    for signal in [SIGTERM, SIGINT] {
+        // In this order: the second signal finds the flag set by the first.
+        signal_hook::flag::register_conditional_default(signal, Arc::clone(&told_to_end))
+            .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&told_to_end)))
+            .context("cannot listen for SIGTERM and SIGINT")?;
+    }
+    Ok(told_to_end)
+}
+
+/// A number no earlier life of this actor had.
+fn incarnation() -> Incarnation {
+    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH);
+    Incarnation(since_epoch.map_or(0, |elapsed| elapsed.as_nanos() as u64))
+}

@@ -1,0 +1,356 @@
+//! Recordings of evaluation flights: a `.npz` file, which NumPy alone reads (`numpy.load(FILE)`).
+//!
+//! One row for every observation: the steps of a flight in order, its closing observation last; flights in order, courses in order. [`COLUMNS`] lists the
+//! arrays. The format is a zip file with one `.npy` file an array; rows are written as they lie in memory, so nothing is held twice.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use skein_protocol::transition::{RecordKind, TransitionRecord};
+use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_WIDTH, LATENT};
+use zip::ZipWriter;
+use zip::write::SimpleFileOptions;
+
+use crate::evaluation::EvaluatedFlight;
+
+// The arrays' types below say little-endian, and rows are copied from memory.
+const _: () = assert!(cfg!(target_endian = "little"));
+
+/// An array of a recording.
+pub struct Column {
+    /// Its name.
+    pub name: &'static str,
+    /// NumPy's name for its type.
+    pub kind: &'static str,
+    /// Its shape after the first axis, which counts rows.
+    pub shape: &'static [usize],
+    /// What it holds.
+    pub meaning: &'static str,
+    write: fn(&Row<'_>, &mut Vec<u8>),
+}
+
+/// One observation of a recording.
+struct Row<'a> {
+    course: i32,
+    flight: i32,
+    record: &'a TransitionRecord,
+}
+
+/// Every array with a row for each observation. `course_names` comes besides them.
+pub const COLUMNS: [Column; 15] = [
+    Column::new("course", "<i4", &[], "index into course_names", |row, out| {
+        put(out, &[row.course])
+    }),
+    Column::new("flight", "<i4", &[], "flight on that course, from 0", |row, out| {
+        put(out, &[row.flight])
+    }),
+    Column::new("step", "<i4", &[], "step of the flight, from 0", |row, out| {
+        put(out, &[row.record.step])
+    }),
+    Column::new(
+        "closing",
+        "|u1",
+        &[],
+        "1 in the last row of a flight, on which no action follows",
+        |row, out| {
+            out.push(u8::from(row.record.kind == RecordKind::Closing.code()));
+        },
+    ),
+    Column::new(
+        "position_m",
+        "<f4",
+        &[3],
+        "along the corridor, left, up; metres, world frame",
+        |row, out| {
+            put(out, &row.record.position_m);
+        },
+    ),
+    Column::new(
+        "orientation",
+        "<f4",
+        &[4],
+        "world from body, unit quaternion (i, j, k, w)",
+        |row, out| {
+            put(out, &row.record.orientation);
+        },
+    ),
+    Column::new(
+        "velocity_mps",
+        "<f4",
+        &[3],
+        "forward, left, up; metres per second, world frame",
+        |row, out| {
+            put(out, &row.record.velocity_mps);
+        },
+    ),
+    Column::new(
+        "depth",
+        "|u1",
+        &[IMAGE_HEIGHT, IMAGE_WIDTH],
+        "depth image, top row first; 255 is farthest",
+        |row, out| {
+            out.extend_from_slice(&row.record.depth);
+        },
+    ),
+    Column::new(
+        "latent",
+        "<f4",
+        &[LATENT],
+        "latent code of the depth image",
+        |row, out| put(out, &row.record.latent),
+    ),
+    Column::new(
+        "action",
+        "<f4",
+        &[ACTION],
+        "commanded velocity left, up, in [-1, 1]; 0 in closing rows",
+        |row, out| {
+            put(out, &row.record.action);
+        },
+    ),
+    Column::new(
+        "reward_terms",
+        "<f4",
+        &[4],
+        "collision, level-up, destination, action; for the action above",
+        |row, out| {
+            put(out, &row.record.reward_terms);
+        },
+    ),
+    Column::new("reward", "<f4", &[], "sum of reward_terms", |row, out| {
+        put(out, &[row.record.reward])
+    }),
+    Column::new(
+        "walls_passed",
+        "|u1",
+        &[],
+        "in this flight, after the step",
+        |row, out| {
+            out.push(row.record.walls_passed);
+        },
+    ),
+    Column::new(
+        "terminated",
+        "|u1",
+        &[],
+        "1 where the step ended in a collision or at the destination",
+        |row, out| {
+            out.push(row.record.terminated);
+        },
+    ),
+    Column::new(
+        "truncated",
+        "|u1",
+        &[],
+        "1 where the step limit ended the flight",
+        |row, out| {
+            out.push(row.record.truncated);
+        },
+    ),
+];
+
+impl Column {
+    const fn new(
+        name: &'static str,
+        kind: &'static str,
+        shape: &'static [usize],
+        meaning: &'static str,
+        write: fn(&Row<'_>, &mut Vec<u8>),
+    ) -> Self {
+        Self {
+            name,
+            kind,
+            shape,
+            meaning,
+            write,
+        }
+    }
+}
+
+/// Why a recording was not written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot write the recording {}: {source}", path.display())]
+pub struct RecordingError {
+    /// The file.
+    pub path: PathBuf,
+    /// Why.
+    #[source]
+    pub source: io::Error,
+}
+
+/// Writes the records of `flights`, course by course, to `path`; in place at once, or not at all.
+///
+/// # Errors
+/// [`RecordingError`] names the file.
+pub fn write_recording(path: &Path, courses: &[&str], flights: &[Vec<EvaluatedFlight>]) -> Result<(), RecordingError> {
+    let aside = path.with_extension("npz.tmp");
+    write_npz(&aside, courses, flights)
+        .and_then(|()| fs::rename(&aside, path))
+        .map_err(|source| RecordingError {
+            path: path.to_owned(),
+            source,
+        })
+}
+
+fn write_npz(path: &Path, courses: &[&str], flights: &[Vec<EvaluatedFlight>]) -> io::Result<()> {
+    let rows: Vec<Row<'_>> = (0i32..)
+        .zip(flights)
+        .flat_map(|(course, flights)| rows_of(course, flights))
+        .collect();
+    let mut zip = ZipWriter::new(BufWriter::new(File::create(path)?));
+    for column in &COLUMNS {
+        start_array(&mut zip, column.name, column.kind, rows.len(), column.shape)?;
+        let mut bytes = Vec::new();
+        for row in &rows {
+            bytes.clear();
+            (column.write)(row, &mut bytes);
+            zip.write_all(&bytes)?;
+        }
+    }
+    // NumPy's strings have a fixed number of four-byte characters.
+    let longest = courses
+        .iter()
+        .map(|name| name.chars().count())
+        .max()
+        .unwrap_or(0)
+        .max(1);
+    start_array(&mut zip, "course_names", &format!("<U{longest}"), courses.len(), &[])?;
+    for name in courses {
+        let letters = name.chars().map(u32::from).chain(std::iter::repeat(0)).take(longest);
+        zip.write_all(&letters.flat_map(u32::to_le_bytes).collect::<Vec<_>>())?;
+    }
+    zip.finish().map_err(io::Error::from)?.into_inner()?.sync_all()
+}
+
+fn rows_of(course: i32, flights: &[EvaluatedFlight]) -> impl Iterator<Item = Row<'_>> {
+    (0i32..)
+        .zip(flights)
+        .flat_map(move |(flight, flown)| flown.records.iter().map(move |record| Row { course, flight, record }))
+}
+
+/// Begins a `.npy` file. Source: numpy.lib.format, version 1.0.
+fn start_array(
+    zip: &mut ZipWriter<BufWriter<File>>,
+    name: &str,
+    kind: &str,
+    rows: usize,
+    shape: &[usize],
+) -> io::Result<()> {
+    const PREFIX: usize = 10;
+    let options = SimpleFileOptions::default().compression_level(Some(1)).large_file(true);
+    zip.start_file(format!("{name}.npy"), options)
+        .map_err(io::Error::from)?;
+    let axes: String = shape.iter().map(|length| format!(" {length},")).collect();
+    let mut header = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({rows},{axes}), }}");
+    // The data begins at a multiple of 64 bytes, after the newline that ends the header.
+    let padding = (PREFIX + header.len() + 1).next_multiple_of(64) - PREFIX - header.len() - 1;
+    header.extend(std::iter::repeat_n(' ', padding));
+    header.push('\n');
+    zip.write_all(b"\x93NUMPY\x01\x00")?;
+    zip.write_all(&(header.len() as u16).to_le_bytes())?;
+    zip.write_all(header.as_bytes())
+}
+
+fn put<T: bytemuck::NoUninit>(out: &mut Vec<u8>, values: &[T]) {
+    out.extend_from_slice(bytemuck::cast_slice(values));
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+
+    use bytemuck::Zeroable;
+    use skein_protocol::evaluation::FlightScore;
+    use skein_protocol::transition::Outcome;
+
+    use super::*;
+
+    fn flight(first: u8, records: u8) -> EvaluatedFlight {
+        let record = |number: u8| {
+            let mut record = Box::new(TransitionRecord::zeroed());
+            record.depth.fill(number);
+            record.position_m = [f32::from(number), 0.5, -1.0];
+            record
+        };
+        let score = FlightScore {
+            walls_passed: 0,
+            flight_return: 0.0,
+            outcome: Outcome::Collided,
+        };
+        EvaluatedFlight {
+            score,
+            records: (first..first + records).map(record).collect(),
+        }
+    }
+
+    /// Header and data of an array.
+    fn array(file: &Path, name: &str) -> (String, Vec<u8>) {
+        let mut zip = zip::ZipArchive::new(File::open(file).unwrap()).unwrap();
+        let mut bytes = Vec::new();
+        zip.by_name(&format!("{name}.npy"))
+            .unwrap()
+            .read_to_end(&mut bytes)
+            .unwrap();
+        assert_eq!(&bytes[..8], b"\x93NUMPY\x01\x00");
+        let end = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
+        assert!(end % 64 == 0 && bytes[end - 1] == b'\n');
+        (
+            String::from_utf8(bytes[10..end].to_vec()).unwrap(),
+            bytes[end..].to_vec(),
+        )
+    }
+
+    /// The values of an array's data.
+    fn values<T: bytemuck::AnyBitPattern>(bytes: &[u8]) -> Vec<T> {
+        bytes
+            .chunks_exact(size_of::<T>())
+            .map(bytemuck::pod_read_unaligned)
+            .collect()
+    }
+
+    #[test]
+    fn rows_are_all_observations_in_course_and_flight_order() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("flights.npz");
+        let flights = [vec![flight(1, 2), flight(3, 1)], vec![flight(4, 1)]];
+        write_recording(&file, &["near", "far \u{e4}"], &flights).unwrap();
+
+        let (header, depth) = array(&file, "depth");
+        assert!(
+            header.starts_with("{'descr': '|u1', 'fortran_order': False, 'shape': (4, 72, 128,), }"),
+            "{header}"
+        );
+        assert_eq!(
+            depth.iter().step_by(72 * 128).copied().collect::<Vec<_>>(),
+            [1, 2, 3, 4]
+        );
+        let integers = |name| values::<i32>(&array(&file, name).1);
+        assert_eq!(integers("course"), [0, 0, 0, 1]);
+        assert_eq!(integers("flight"), [0, 0, 1, 0]);
+        let (header, position) = array(&file, "position_m");
+        assert!(header.contains("'<f4'") && header.contains("(4, 3,)"), "{header}");
+        assert_eq!(values::<f32>(&position)[3..6], [2.0, 0.5, -1.0]);
+        let (header, names) = array(&file, "course_names");
+        assert!(header.contains("'<U5'") && header.contains("(2,)"), "{header}");
+        assert_eq!(values::<u32>(&names)[9], 0xe4);
+    }
+
+    #[test]
+    fn every_array_has_as_many_values_as_its_header_says() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("flights.npz");
+        write_recording(&file, &["near"], &[vec![flight(0, 3)]]).unwrap();
+        for column in &COLUMNS {
+            let value_bytes: usize = column.kind[2..].parse().unwrap();
+            let expected = 3 * column.shape.iter().product::<usize>() * value_bytes;
+            assert_eq!(array(&file, column.name).1.len(), expected, "{}", column.name);
+        }
+    }
+
+    #[test]
+    fn a_file_that_cannot_be_written_is_named() {
+        let error = write_recording(Path::new("/nonexistent/flights.npz"), &[], &[]).unwrap_err();
+        assert!(error.to_string().contains("/nonexistent/flights.npz"));
+    }
+}
