@@ -82,10 +82,22 @@ fn main() -> ExitCode {
         Ok(Ended::Finished) => ExitCode::SUCCESS,
         Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
         Err(error) => {
-            eprintln!("skein: {error:#}");
+            eprintln!("skein: {}", with_causes(&error));
             ExitCode::FAILURE
         }
     }
+}
+
+/// The error and those of its causes that it does not quote itself.
+fn with_causes(error: &anyhow::Error) -> String {
+    error
+        .chain()
+        .map(ToString::to_string)
+        .fold(String::new(), |text, cause| match text.as_str() {
+            "" => cause,
+            said if said.contains(&cause) => text,
+            said => format!("{said}: {cause}"),
+        })
 }
 
 fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {

@@ -149,7 +149,7 @@ impl Curve {
                     self.values
                         .iter()
                         .enumerate()
-                        .map(|point| Circle::new(at(point), px(2), STRONG.mix(0.18).filled())),
+                        .map(|point| Circle::new(at(point), px(2), STRONG.mix(0.28).filled())),
                 )?
                 .label("one flight")
                 .legend(|(x, y)| Circle::new((x + px(12) as i32, y), px(3), STRONG.mix(0.4).filled()));

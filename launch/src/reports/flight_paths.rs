@@ -16,7 +16,7 @@ const LEFT: u32 = 70;
 const RIGHT: u32 = 20;
 const TOP: u32 = 52;
 const CAPTION: u32 = 34;
-const PANEL_GAP: u32 = 10;
+const PANEL_GAP: u32 = 20;
 const AXIS: u32 = 44;
 
 const CORRIDOR: RGBColor = RGBColor(0xf3, 0xf5, 0xf8);
@@ -184,7 +184,10 @@ impl Panel<'_> {
             self.rectangle((0.0, length_m), (low, high)),
             CORRIDOR.filled(),
         ))?;
-        for flight in flights {
+        // What went wrong is drawn over what went well: it is what the reader looks for.
+        let (well, wrong): (Vec<_>, Vec<_>) =
+            flights.iter().partition(|flight| flight.outcome == Outcome::ReachedEnd);
+        for flight in well.into_iter().chain(wrong) {
             self.draw_flight(area, flight)?;
         }
         for wall in self.course.walls() {
@@ -206,9 +209,9 @@ impl Panel<'_> {
             .map(|&point| self.at(point[0], self.view.across_m(point)))
             .collect();
         let (colour, opacity) = match flight.outcome {
-            Outcome::ReachedEnd => (STRONG, 0.35),
-            Outcome::Collided => (REFERENCE, 0.8),
-            Outcome::TimedOut => (TIMED_OUT, 0.8),
+            Outcome::ReachedEnd => (STRONG, 0.3),
+            Outcome::Collided => (REFERENCE, 0.9),
+            Outcome::TimedOut => (TIMED_OUT, 0.9),
         };
         area.draw(&PathElement::new(
             points.clone(),
