@@ -10,12 +10,13 @@ Flies a trained snapshot from the start of level 1, without exploration noise, a
 each wall, the share R of walls passed, and how many courses were completed.
 
 Options:
-  --run DIR        evaluate the best snapshot of this run
+  --run DIR        evaluate the best snapshot of this run (the latest, if none was confirmed as best)
   --snapshot FILE  evaluate this snapshot
-  --course FILE    fly this course; may be repeated [default: all courses of the run's config]
-  --flights N      flights per course [default: 100]
+  --course FILE    fly this course; may be repeated [default: the evaluation courses of the snapshot's run]
+  --flights N      flights per course [default: evaluation.flights of that run, 100 as shipped]
   --json FILE      write the table as JSON as well
-  --record FILE    write every step (pose, velocity, depth image, latent, action, reward terms) for reading from Python
+  --record FILE    write every step (pose, velocity, depth image, latent, action, reward terms) as .npz, for numpy
+  --threads N      threads to fly on; the result does not depend on it [default: one a core]
   -h, --help       this text
 
 Exit status: 0 evaluated, 1 failed.
