@@ -185,8 +185,7 @@ impl Panel<'_> {
             CORRIDOR.filled(),
         ))?;
         // What went wrong is drawn over what went well: it is what the reader looks for.
-        let (well, wrong): (Vec<_>, Vec<_>) =
-            flights.iter().partition(|flight| flight.outcome == Outcome::ReachedEnd);
+        let (well, wrong): (Vec<_>, Vec<_>) = flights.iter().partition(|flight| flight.outcome == Outcome::ReachedEnd);
         for flight in well.into_iter().chain(wrong) {
             self.draw_flight(area, flight)?;
         }

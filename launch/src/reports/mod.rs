@@ -79,3 +79,59 @@ pub fn draw_all(run: &RunDirectory, courses: &[Course], window: usize) -> Result
 fn existing(path: PathBuf) -> Option<PathBuf> {
     path.exists().then_some(path)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::Path;
+
+    use safetensors::Dtype;
+    use safetensors::tensor::TensorView;
+
+    use super::*;
+
+    fn training() -> Course {
+        Course::load(Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/courses/training.toml")).unwrap()
+    }
+
+    fn write_flights(run: &RunDirectory) {
+        let rows = "flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
+                    0,0,0,0,1,12,0,-0.9,collided\n1,0,0,1,1,33,1,0.2,collided\n";
+        fs::write(run.flights_csv(), rows).unwrap();
+    }
+
+    #[test]
+    fn a_whole_run_has_four_pictures() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        write_flights(&run);
+        let rows =
+            "course,flight,step,x_m,y_m,z_m,outcome\ntraining,0,0,1.5,0,3,collided\ntraining,0,1,9.7,1,3,collided\n";
+        fs::write(run.evaluation_paths_csv(), rows).unwrap();
+        let image = vec![7; skein_protocol::IMAGE_PIXELS];
+        let shape = vec![1, skein_protocol::IMAGE_HEIGHT, skein_protocol::IMAGE_WIDTH];
+        let view = TensorView::new(Dtype::U8, shape, &image).unwrap();
+        let tensors = [("depth", view.clone()), ("reconstruction", view)];
+        fs::write(run.reconstructions(), safetensors::serialize(tensors, None).unwrap()).unwrap();
+
+        let pictures = draw_all(&run, &[training()], 50).unwrap();
+        assert_eq!(pictures.len(), 4);
+        for picture in pictures {
+            let bytes = fs::read(&picture).unwrap();
+            assert!(
+                bytes.starts_with(b"\x89PNG") && bytes.ends_with(b"IEND\xaeB`\x82"),
+                "{}",
+                picture.display()
+            );
+        }
+    }
+
+    #[test]
+    fn a_run_that_ended_early_has_the_pictures_it_can_have() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        assert!(draw_all(&run, &[training()], 50).unwrap().is_empty());
+        write_flights(&run);
+        assert_eq!(draw_all(&run, &[training()], 50).unwrap().len(), 2);
+    }
+}
