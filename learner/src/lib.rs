@@ -1,1 +1,26 @@
-//! Placeholder, replaced in the first build-up.
+//! The learner: hands out tickets, commits the flights flown for them, trains VAE and policy on them, and publishes snapshots.
+//!
+//! Training is a function of configuration and seed: flights are taken in flight order, every random draw has a seed of its own, and nothing here
+//! depends on who flew a flight, or when.
+
+pub mod best;
+pub mod checkpoint;
+pub mod curriculum;
+pub mod device;
+mod error;
+pub mod evaluation;
+pub mod flight;
+pub mod flights;
+pub mod metrics;
+pub mod networks;
+pub mod noise;
+pub mod optimizer;
+pub mod replay;
+pub mod report;
+pub mod sac;
+pub mod state;
+pub mod trainer;
+pub mod training;
+pub mod vae;
+
+pub use error::UpdateError;

@@ -16,6 +16,8 @@ pub struct EvaluationSection {
     pub window_flights: u64,
     /// Training flights between two candidates at least. Default 50.
     pub every_flights: u64,
+    /// How far below that of the best snapshot so far a candidate's average may lie, in walls: the average of so few flights is noisy. Default 0.3.
+    pub candidate_margin: f64,
 }
 
 impl Default for EvaluationSection {
@@ -25,6 +27,7 @@ impl Default for EvaluationSection {
             confirm_flights: 20,
             window_flights: 50,
             every_flights: 50,
+            candidate_margin: 0.3,
         }
     }
 }
@@ -39,6 +42,11 @@ impl EvaluationSection {
         ] {
             require((1..=1_000_000).contains(&value), key, value, "is outside 1..=1000000")?;
         }
-        Ok(())
+        require(
+            self.candidate_margin >= 0.0 && self.candidate_margin.is_finite(),
+            "evaluation.candidate_margin",
+            self.candidate_margin,
+            "is negative or not finite",
+        )
     }
 }

@@ -1,0 +1,163 @@
+//! Which flight is flown where: tickets as a function of configuration, seed and flight number.
+
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use skein_protocol::config::Config;
+use skein_protocol::ids::{Attempt, Epoch, FlightId, PolicyVersion, RunId};
+use skein_protocol::seeds::{Purpose, derive};
+use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+
+/// Evaluations are numbered this far apart, so that no two of their flights share a number.
+const EVALUATION_STRIDE: u64 = 1 << 24;
+
+/// Epochs of the whole run; the last may be shorter.
+pub fn epochs(config: &Config) -> u64 {
+    config.run.flights.div_ceil(config.learning.flights_per_epoch)
+}
+
+/// Tickets of `epoch`, in flight order.
+pub fn training(
+    config: &Config,
+    run: RunId,
+    epoch: Epoch,
+    version: PolicyVersion,
+    exploration: Exploration,
+) -> Vec<Ticket> {
+    let first = epoch.0 * config.learning.flights_per_epoch;
+    let end = (first + config.learning.flights_per_epoch).min(config.run.flights);
+    let ticket = |flight| Ticket {
+        run,
+        flight: FlightId(flight),
+        attempt: Attempt(0),
+        policy_version: version,
+        course: training_course(config, flight),
+        start_level: start_level(config, flight),
+        exploration,
+        seed: derive(config.run.seed, Purpose::Flight, flight),
+    };
+    (first..end).map(ticket).collect()
+}
+
+/// Tickets of `flights` evaluation flights on each of `courses`, course by course.
+///
+/// Flight i has the same seed on every course and in every evaluation, so that snapshots are compared on the same starts. `evaluation` numbers the
+/// evaluations of a run.
+pub fn evaluation(
+    config: &Config,
+    run: RunId,
+    evaluation: u64,
+    version: PolicyVersion,
+    courses: std::ops::Range<u32>,
+    flights: u64,
+) -> Vec<Ticket> {
+    let first = FlightId::FIRST_EVALUATION.0 + evaluation * EVALUATION_STRIDE;
+    let ticket = |(number, (course, flight))| Ticket {
+        run,
+        flight: FlightId(first + number),
+        attempt: Attempt(0),
+        policy_version: version,
+        course: CourseChoice::Evaluation(course),
+        start_level: 1,
+        exploration: Exploration::Mode,
+        seed: derive(config.run.seed, Purpose::EvaluationFlight, flight),
+    };
+    let flown = courses.flat_map(|course| (0..flights).map(move |flight| (course, flight)));
+    (0..).zip(flown).map(ticket).collect()
+}
+
+/// The level training flight `flight` starts at: the next one every few flights, then the first again (paper, section 4.2).
+fn start_level(config: &Config, flight: u64) -> u8 {
+    let step = flight / config.learning.flights_per_level;
+    (step % u64::from(config.learning.levels)) as u8 + 1
+}
+
+/// Where training flight `flight` is flown.
+fn training_course(config: &Config, flight: u64) -> CourseChoice {
+    let mut rng = Pcg64Mcg::seed_from_u64(derive(config.run.seed, Purpose::Course, flight));
+    if rng.random::<f64>() < config.courses.generated_share {
+        CourseChoice::Generated(rng.random())
+    } else {
+        CourseChoice::Training
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tickets(config: &Config) -> Vec<Ticket> {
+        (0..epochs(config))
+            .flat_map(|epoch| {
+                training(
+                    config,
+                    RunId(1),
+                    Epoch(epoch),
+                    PolicyVersion(epoch),
+                    Exploration::Sample,
+                )
+            })
+            .collect()
+    }
+
+    #[test]
+    fn every_flight_is_in_exactly_one_epoch() {
+        let mut config = Config::default();
+        (config.run.flights, config.learning.flights_per_epoch) = (23, 10);
+        let flights: Vec<u64> = tickets(&config).iter().map(|ticket| ticket.flight.0).collect();
+        assert_eq!(flights, (0..23).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn the_start_level_rises_every_ten_flights_and_returns() {
+        let mut config = Config::default();
+        config.run.flights = 60;
+        let levels: Vec<u8> = tickets(&config).iter().map(|ticket| ticket.start_level).collect();
+        assert_eq!(
+            levels.chunks(10).map(|chunk| chunk[0]).collect::<Vec<_>>(),
+            [1, 2, 3, 4, 5, 1]
+        );
+        assert!(
+            levels
+                .chunks(10)
+                .all(|chunk| chunk.iter().all(|level| *level == chunk[0]))
+        );
+    }
+
+    #[test]
+    fn the_generated_share_is_about_the_configured_one_and_courses_differ() {
+        let mut config = Config::default();
+        (config.run.flights, config.courses.generated_share) = (1000, 0.25);
+        let generated: std::collections::BTreeSet<u64> = tickets(&config)
+            .iter()
+            .filter_map(|ticket| match ticket.course {
+                CourseChoice::Generated(seed) => Some(seed),
+                _ => None,
+            })
+            .collect();
+        assert!(
+            (200..300).contains(&generated.len()),
+            "{} distinct courses",
+            generated.len()
+        );
+    }
+
+    #[test]
+    fn evaluations_compare_snapshots_on_the_same_starts() {
+        let config = Config::default();
+        let first = evaluation(&config, RunId(1), 0, PolicyVersion(3), 0..2, 5);
+        let second = evaluation(&config, RunId(1), 1, PolicyVersion(4), 0..1, 5);
+        let seeds = |tickets: &[Ticket]| tickets.iter().map(|ticket| ticket.seed).collect::<Vec<_>>();
+        assert_eq!(seeds(&first[..5]), seeds(&second));
+        assert_eq!(seeds(&first[..5]), seeds(&first[5..]));
+        assert!(
+            first
+                .iter()
+                .all(|ticket| second.iter().all(|other| other.flight != ticket.flight))
+        );
+        assert!(
+            first
+                .iter()
+                .all(|ticket| ticket.exploration == Exploration::Mode && ticket.start_level == 1)
+        );
+    }
+}

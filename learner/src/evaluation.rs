@@ -1,0 +1,159 @@
+//! What is written of the final evaluation: the report, where the flights flew, and what the VAE makes of what they saw.
+
+use std::collections::HashMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use safetensors::tensor::{Dtype, TensorView};
+use serde::Serialize;
+use skein_protocol::config::Config;
+use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::run::RunDirectory;
+use skein_protocol::transition::Outcome;
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+
+use crate::flight::CommittedFlight;
+use crate::trainer::Trainer;
+
+/// Flights a course of which the path is written.
+const PATHS: usize = 25;
+/// Images that are shown beside their reconstructions.
+const PICTURES: usize = 8;
+
+/// Why an evaluation cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot write {}: {problem}", path.display())]
+pub struct EvaluationError {
+    /// The file.
+    pub path: PathBuf,
+    /// Why.
+    pub problem: String,
+}
+
+fn failed<E: ToString>(path: &Path) -> impl Fn(E) -> EvaluationError {
+    |error| EvaluationError {
+        path: path.to_owned(),
+        problem: error.to_string(),
+    }
+}
+
+/// A row of `evaluation_paths.csv`.
+#[derive(Debug, Serialize)]
+struct PathRow<'a> {
+    course: &'a str,
+    flight: usize,
+    step: usize,
+    x_m: f32,
+    y_m: f32,
+    z_m: f32,
+    outcome: Outcome,
+}
+
+/// Writes `evaluation.json` and `evaluation_paths.csv` from the evaluation flights of all courses, course by course.
+///
+/// # Errors
+/// [`EvaluationError`] names the file.
+pub fn write_report(
+    directory: &RunDirectory,
+    config: &Config,
+    policy_version: PolicyVersion,
+    policy_sha256: &str,
+    flown: &[CommittedFlight],
+) -> Result<EvaluationReport, EvaluationError> {
+    let path = directory.evaluation_paths_csv();
+    let mut paths = csv::Writer::from_path(&path).map_err(failed(&path))?;
+    let mut courses = Vec::new();
+    for (course, flights) in config
+        .courses
+        .evaluation
+        .iter()
+        .zip(flown.chunks(config.evaluation.flights as usize))
+    {
+        let name = course
+            .file_stem()
+            .map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
+        let scores: Vec<FlightScore> = flights.iter().map(score).collect();
+        let walls = flights.first().map_or(0, |flight| flight.course_walls.into());
+        courses.push(CourseEvaluation::of(&name, walls, &scores));
+        for (number, flight) in flights.iter().take(PATHS).enumerate() {
+            write_path(&mut paths, &name, number, flight).map_err(failed(&path))?;
+        }
+    }
+    paths.flush().map_err(failed(&path))?;
+    let report = EvaluationReport {
+        policy_version,
+        policy_sha256: policy_sha256.to_owned(),
+        courses,
+    };
+    let path = directory.evaluation_json();
+    let json = serde_json::to_string_pretty(&report).map_err(failed(&path))?;
+    fs::write(&path, json).map_err(failed(&path))?;
+    Ok(report)
+}
+
+fn score(flight: &CommittedFlight) -> FlightScore {
+    FlightScore {
+        walls_passed: flight.walls_passed.into(),
+        flight_return: flight.total_reward().into(),
+        outcome: flight.outcome,
+    }
+}
+
+fn write_path(
+    paths: &mut csv::Writer<fs::File>,
+    course: &str,
+    number: usize,
+    flight: &CommittedFlight,
+) -> Result<(), csv::Error> {
+    for (step, observation) in flight.observations.iter().enumerate() {
+        let [x_m, y_m, z_m] = observation.position_m;
+        paths.serialize(PathRow {
+            course,
+            flight: number,
+            step,
+            x_m,
+            y_m,
+            z_m,
+            outcome: flight.outcome,
+        })?;
+    }
+    Ok(())
+}
+
+/// Writes depth images of a flight beside their reconstructions, `reconstructions.safetensors`.
+///
+/// # Errors
+/// [`EvaluationError`] names the file.
+pub fn write_reconstructions(
+    directory: &RunDirectory,
+    trainer: &Trainer,
+    flights: &[CommittedFlight],
+) -> Result<(), EvaluationError> {
+    let path = directory.reconstructions();
+    let depth = flights
+        .iter()
+        .filter_map(|flight| flight.depth.as_deref())
+        .flat_map(|depth| depth.chunks(IMAGE_PIXELS));
+    let images: Vec<&[u8]> = depth.collect();
+    let stride = (images.len() / PICTURES).max(1);
+    let chosen: Vec<u8> = images
+        .iter()
+        .step_by(stride)
+        .take(PICTURES)
+        .copied()
+        .flatten()
+        .copied()
+        .collect();
+    let reconstruction = trainer.reconstruct(&chosen);
+    let shape = vec![chosen.len() / IMAGE_PIXELS, IMAGE_HEIGHT, IMAGE_WIDTH];
+    let mut tensors = HashMap::new();
+    for (name, bytes) in [("depth", &chosen), ("reconstruction", &reconstruction)] {
+        tensors.insert(
+            name,
+            TensorView::new(Dtype::U8, shape.clone(), bytes).map_err(failed(&path))?,
+        );
+    }
+    let file = safetensors::serialize(tensors, None).map_err(failed(&path))?;
+    fs::write(&path, file).map_err(failed(&path))
+}

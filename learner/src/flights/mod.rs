@@ -1,0 +1,8 @@
+//! From tickets to committed flights: orders go out, whole flights come back, in the order they were ordered.
+//!
+//! [`desk`] is the book-keeping, a state machine without clock or transport: who holds which ticket, what has arrived of it, what must be issued again.
+//! [`assembly`] puts the records of one flight together. [`reception`] is the thread that owns the transport and feeds the desk.
+
+pub mod assembly;
+pub mod desk;
+pub mod reception;

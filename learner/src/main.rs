@@ -1,0 +1,72 @@
+//! `skein-learner --run DIR`: trains the run that was prepared in a directory.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context, Result};
+use clap::Parser;
+use skein_learner::training;
+use skein_protocol::logging::{LogFormat, log_to_file};
+use skein_protocol::run::RunDirectory;
+use tokio::signal::unix::{SignalKind, signal};
+
+/// The learner of a run: hands out tickets, trains on the flights that come back, publishes snapshots. Started by run_local.sh.
+///
+/// Progress goes to standard output, one JSON object a line. SIGTERM or SIGINT ends the training in order: what was learned is saved.
+#[derive(Parser)]
+#[command(version)]
+struct Arguments {
+    /// Directory of the run.
+    #[arg(long)]
+    run: PathBuf,
+}
+
+fn main() -> ExitCode {
+    match run(&Arguments::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            tracing::error!(error = format!("{error:#}"), "learner failed");
+            eprintln!("skein-learner: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(arguments: &Arguments) -> Result<()> {
+    let directory = RunDirectory::new(&arguments.run);
+    let (identity, config) = directory.open()?;
+    let log = directory.learner_log();
+    log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
+    tracing::info!(run = %identity.run, seed = config.run.seed, device = %config.run.device, "learner starts");
+    let stop = stop_on_signals().context("cannot listen to signals")?;
+    let summary = training::run(&directory, &identity, &config, &stop)?;
+    let path = directory.summary_json();
+    let json = serde_json::to_string_pretty(&summary).context("cannot write the summary")?;
+    std::fs::write(&path, json).with_context(|| format!("cannot write {}", path.display()))?;
+    tracing::info!(ending = ?summary.ending, policy_sha256 = summary.policy_sha256, "learner ends");
+    Ok(())
+}
+
+/// A flag that SIGTERM and SIGINT set.
+fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = stop.clone();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build()?;
+    let (mut terminate, mut interrupt) = {
+        let _entered = runtime.enter();
+        (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?)
+    };
+    std::thread::Builder::new().name("signals".to_owned()).spawn(move || {
+        runtime.block_on(async {
+            tokio::select! {
+                _ = terminate.recv() => {}
+                _ = interrupt.recv() => {}
+            }
+        });
+        tracing::info!("told to stop");
+        flag.store(true, Ordering::Relaxed);
+    })?;
+    Ok(stop)
+}

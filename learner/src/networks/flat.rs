@@ -1,0 +1,224 @@
+//! All parameters of a network in one flat tensor, of which the layers' tensors are views.
+//!
+//! One vector makes everything around a network simple: the optimizer's state is two more vectors, a target network follows by one operation, a
+//! snapshot is a copy of bytes, and nothing can be forgotten in a checkpoint.
+
+use std::ops::Range;
+
+use tch::{Device, Tensor, no_grad_guard};
+
+use crate::noise::Noise;
+
+/// One tensor of a network.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ParameterSpec {
+    /// Its name, such as `encoder.conv1.weight`.
+    pub name: String,
+    /// Its shape, in PyTorch's conventions.
+    pub shape: Vec<i64>,
+    /// Its initial elements are drawn evenly from `[-bound, bound)`.
+    pub initial_bound: f32,
+}
+
+impl ParameterSpec {
+    /// Number of its elements.
+    pub fn len(&self) -> usize {
+        self.shape.iter().product::<i64>() as usize
+    }
+
+    /// Whether it has no element.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// The tensors of a network in the order they lie in its flat vector; filled as the layers are described.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Layout {
+    tensors: Vec<ParameterSpec>,
+}
+
+impl Layout {
+    /// Appends a tensor; returns its place in the order.
+    pub(super) fn push(&mut self, name: String, shape: &[i64], initial_bound: f32) -> usize {
+        self.tensors.push(ParameterSpec {
+            name,
+            shape: shape.to_vec(),
+            initial_bound,
+        });
+        self.tensors.len() - 1
+    }
+
+    /// The tensors in order.
+    pub fn tensors(&self) -> &[ParameterSpec] {
+        &self.tensors
+    }
+
+    /// Number of all elements described so far.
+    pub fn len(&self) -> usize {
+        self.tensors.iter().map(ParameterSpec::len).sum()
+    }
+
+    /// Whether nothing was described yet.
+    pub fn is_empty(&self) -> bool {
+        self.tensors.is_empty()
+    }
+}
+
+/// The numbers of a network: one flat f32 vector, and the layers' tensors as views of it.
+#[derive(Debug)]
+pub struct Parameters {
+    layout: Layout,
+    flat: Tensor,
+    /// Leaves of the gradient graph that share `flat`'s storage.
+    views: Vec<Tensor>,
+}
+
+impl Parameters {
+    /// Draws initial values, tensor by tensor in order. They depend on the seed alone, not on the device.
+    pub fn initialise(layout: Layout, seed: u64, device: Device) -> Self {
+        let mut noise = Noise::new(seed);
+        let mut values = Vec::with_capacity(layout.len());
+        for tensor in layout.tensors() {
+            values.extend((0..tensor.len()).map(|_| noise.uniform(tensor.initial_bound)));
+        }
+        Self::of(layout, Tensor::from_slice(&values).to_device(device))
+    }
+
+    /// The same numbers once more, in storage of their own.
+    pub fn duplicate(&self) -> Self {
+        Self::of(self.layout.clone(), self.flat.copy())
+    }
+
+    fn of(layout: Layout, flat: Tensor) -> Self {
+        let _guard = no_grad_guard();
+        let mut start = 0;
+        let views = layout
+            .tensors()
+            .iter()
+            .map(|tensor| {
+                let len = tensor.len() as i64;
+                let view = flat.narrow(0, start, len).view(tensor.shape.as_slice());
+                start += len;
+                view.set_requires_grad(true)
+            })
+            .collect();
+        Self { layout, flat, views }
+    }
+
+    /// The same numbers in double precision, for checks against finite differences.
+    #[cfg(test)]
+    pub(crate) fn to_double(&self) -> Self {
+        Self::of(self.layout.clone(), self.flat.to_kind(tch::Kind::Double))
+    }
+
+    /// The names and shapes of the tensors.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// All numbers, `[layout().len()]`.
+    pub fn flat(&self) -> &Tensor {
+        &self.flat
+    }
+
+    /// All numbers, to be changed in place; every view changes with them. Only with gradients switched off.
+    pub fn flat_mut(&mut self) -> &mut Tensor {
+        &mut self.flat
+    }
+
+    /// The tensor at this place of the layout.
+    pub(super) fn tensor(&self, place: usize) -> &Tensor {
+        &self.views[place]
+    }
+
+    /// Gradient of the scalar `loss` with respect to all numbers, flat; the graph behind `loss` is consumed.
+    pub fn gradient(&self, loss: &Tensor) -> Tensor {
+        let gradients = Tensor::run_backward(&[loss], &self.views, false, false);
+        let flattened: Vec<Tensor> = gradients.iter().map(|gradient| gradient.reshape([-1])).collect();
+        Tensor::cat(&flattened, 0)
+    }
+
+    /// Moves every number by the share `rate` towards the one in `leader`.
+    pub fn follow(&mut self, leader: &Self, rate: f64) {
+        let _guard = no_grad_guard();
+        let _ = self.flat.lerp_(&leader.flat, rate);
+    }
+
+    /// Copies a range of the numbers.
+    ///
+    /// # Panics
+    /// When the range is outside the vector, or `into` is of another length.
+    pub fn copy_range(&self, range: Range<usize>, into: &mut [f32]) {
+        assert_eq!(into.len(), range.len(), "one place for each number");
+        let part = self.flat.narrow(0, range.start as i64, range.len() as i64);
+        part.to_device(Device::Cpu).copy_data(into, range.len());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Kind;
+
+    use super::*;
+
+    fn two_tensors() -> Layout {
+        let mut layout = Layout::default();
+        layout.push("a".into(), &[2, 3], 0.5);
+        layout.push("b".into(), &[4], 2.0);
+        layout
+    }
+
+    #[test]
+    fn views_share_the_flat_vectors_storage() {
+        let mut parameters = Parameters::initialise(two_tensors(), 1, Device::Cpu);
+        let _guard = no_grad_guard();
+        parameters
+            .flat_mut()
+            .copy_(&Tensor::arange(10, (Kind::Float, Device::Cpu)));
+        assert_eq!(parameters.tensor(0).double_value(&[1, 2]), 5.0);
+        assert_eq!(parameters.tensor(1).double_value(&[0]), 6.0);
+    }
+
+    #[test]
+    fn initial_values_stay_within_their_tensors_bound() {
+        let parameters = Parameters::initialise(two_tensors(), 1, Device::Cpu);
+        let largest = |place: usize| parameters.tensor(place).abs().max().double_value(&[]);
+        assert!(largest(0) <= 0.5 && largest(0) > 0.05);
+        assert!(largest(1) <= 2.0 && largest(1) > 0.2);
+    }
+
+    #[test]
+    fn the_gradient_lies_in_the_order_of_the_vector() {
+        let parameters = Parameters::initialise(two_tensors(), 1, Device::Cpu);
+        // d/da of the sum of squares of a is 2a; d/db of three times the sum of b is 3.
+        let loss = parameters.tensor(0).square().sum(None) + 3.0 * parameters.tensor(1).sum(None);
+        let gradient = parameters.gradient(&loss);
+        assert_eq!(gradient.narrow(0, 0, 6), 2.0 * parameters.flat().narrow(0, 0, 6));
+        assert_eq!(Vec::<f32>::try_from(gradient.narrow(0, 6, 4)).unwrap(), [3.0; 4]);
+    }
+
+    #[test]
+    fn a_follower_moves_by_the_rate_and_leaves_its_leader_alone() {
+        let leader = Parameters::initialise(two_tensors(), 1, Device::Cpu);
+        let mut follower = Parameters::initialise(two_tensors(), 2, Device::Cpu);
+        let (was, goal) = (follower.flat().copy(), leader.flat().copy());
+        follower.follow(&leader, 0.25);
+        assert!(
+            follower
+                .flat()
+                .allclose(&(&was * 0.75 + &goal * 0.25), 0.0, 1e-6, false)
+        );
+        assert_eq!(leader.flat(), &goal);
+    }
+
+    #[test]
+    fn a_copied_range_holds_the_numbers_from_there() {
+        let parameters = Parameters::initialise(two_tensors(), 1, Device::Cpu);
+        let mut copy = [0.0; 3];
+        parameters.copy_range(5..8, &mut copy);
+        let expected: [f32; 3] =
+            std::array::from_fn(|place| parameters.flat().double_value(&[5 + place as i64]) as f32);
+        assert_eq!(copy, expected);
+    }
+}

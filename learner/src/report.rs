@@ -1,0 +1,123 @@
+//! What the learner tells while it runs: progress lines on standard output, and where its time goes.
+
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use skein_protocol::progress::{Phase, Progress};
+
+use crate::flights::reception::Shared;
+
+/// Time between two lines.
+const INTERVAL: Duration = Duration::from_millis(500);
+/// Rates are averaged over this many intervals.
+const RATE_INTERVALS: usize = 10;
+
+/// Prints the learner's progress at intervals, whatever the training thread is doing.
+#[derive(Debug)]
+pub struct Reporter {
+    progress: Arc<Mutex<Progress>>,
+    ended: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Reporter {
+    /// Starts reporting on a run of `total_flights` training flights.
+    ///
+    /// # Errors
+    /// When the system grants no thread.
+    pub fn start(total_flights: u64, reception: Arc<Shared>) -> std::io::Result<Self> {
+        let progress = Arc::new(Mutex::new(Progress {
+            phase: Phase::Flying,
+            flights: 0,
+            total_flights,
+            evaluation_flights: (0, 0),
+            steps: 0,
+            updates: 0,
+            vae_updates: 0,
+            steps_per_sec: 0.0,
+            updates_per_sec: 0.0,
+            walls_passed: None,
+            mean_return: None,
+            temperature: None,
+            vae_loss: None,
+            actors: 0,
+            elapsed_secs: 0.0,
+        }));
+        let ended = Arc::new(AtomicBool::new(false));
+        let (of_thread, end_of_thread) = (progress.clone(), ended.clone());
+        let thread = thread::Builder::new()
+            .name("progress".to_owned())
+            .spawn(move || report(&of_thread, &end_of_thread, &reception))?;
+        Ok(Self {
+            progress,
+            ended,
+            thread: Some(thread),
+        })
+    }
+
+    /// Changes what the next line says.
+    pub fn update(&self, change: impl FnOnce(&mut Progress)) {
+        change(&mut self.progress.lock().unwrap_or_else(PoisonError::into_inner));
+    }
+}
+
+impl Drop for Reporter {
+    fn drop(&mut self) {
+        self.ended.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // A panic of that thread was logged by the hook; it has no result that could be lost.
+            let _ = thread.join();
+        }
+    }
+}
+
+fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared) {
+    let started = Instant::now();
+    let mut marks: Vec<(f64, u64, u64)> = Vec::new();
+    loop {
+        let last = ended.load(Ordering::Relaxed);
+        let mut line = progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        line.elapsed_secs = started.elapsed().as_secs_f64();
+        line.actors = reception.actors.load(Ordering::Relaxed);
+        marks.push((line.elapsed_secs, line.steps, line.updates));
+        let (since, steps, updates) = marks[marks.len().saturating_sub(RATE_INTERVALS + 1)];
+        let secs = (line.elapsed_secs - since).max(1e-9);
+        if line.elapsed_secs > since {
+            line.steps_per_sec = (line.steps - steps) as f64 / secs;
+            line.updates_per_sec = (line.updates - updates) as f64 / secs;
+        }
+        if let Ok(json) = serde_json::to_string(&line) {
+            // Nobody may be listening; then nobody misses the line.
+            let _ = writeln!(std::io::stdout().lock(), "{json}");
+        }
+        if last {
+            return;
+        }
+        thread::sleep(INTERVAL);
+    }
+}
+
+/// Seconds by what the training thread did.
+#[derive(Debug, Default)]
+pub struct Phases {
+    secs: BTreeMap<&'static str, f64>,
+}
+
+impl Phases {
+    /// Adds the time since `started` to `phase`.
+    pub fn add(&mut self, phase: &'static str, started: Instant) {
+        *self.secs.entry(phase).or_default() += started.elapsed().as_secs_f64();
+    }
+
+    /// For the summary.
+    pub fn to_map(&self) -> BTreeMap<String, f64> {
+        self.secs
+            .iter()
+            .map(|(phase, secs)| ((*phase).to_owned(), *secs))
+            .collect()
+    }
+}

@@ -1,0 +1,220 @@
+//! One SAC update, in reading order.
+
+use skein_protocol::ACTION;
+use skein_protocol::config::{Observation, SacSection};
+use skein_protocol::seeds::{Purpose, derive};
+use tch::{Device, Tensor, no_grad_guard};
+
+use super::Batch;
+use super::losses::{critic_loss, policy_loss, soft_targets, temperature_loss};
+use crate::error::{UpdateError, finite};
+use crate::networks::{Critic, Layout, Parameters, Policy};
+use crate::noise::Noise;
+use crate::optimizer::Adam;
+use crate::state::{NamedTensors, Stateful};
+
+/// Policy, critic, target critic and temperature, each with its optimizer.
+#[derive(Debug)]
+pub struct Sac {
+    policy: Policy,
+    policy_parameters: Parameters,
+    policy_optimizer: Adam,
+    critic: Critic,
+    critic_parameters: Parameters,
+    critic_optimizer: Adam,
+    /// A critic that follows the learned one slowly, and steadies the targets.
+    target_parameters: Parameters,
+    /// log α, `[1]`.
+    log_temperature: Tensor,
+    temperature_optimizer: Adam,
+    discount: f64,
+    target_rate: f64,
+    target_entropy: f64,
+}
+
+/// What one SAC update reports.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SacMetrics {
+    /// Half the squared distance of the two Q estimates from their targets: rises when the policy meets something new, should not grow for long.
+    pub critic_loss: f32,
+    /// What the policy minimises, α log π - Q: falls as the value of its actions rises.
+    pub policy_loss: f32,
+    /// α before this update: the price of certainty, in units of reward for each nat of entropy.
+    pub temperature: f32,
+    /// Estimate of the policy's entropy in nats, -log π of drawn actions: held near the target entropy by the temperature.
+    pub entropy: f32,
+    /// The smaller Q estimate of the replayed actions: the return the critic expects, entropy bonus included.
+    pub mean_value: f32,
+}
+
+impl Sac {
+    /// Untrained networks whose parameters depend on the run's seed alone.
+    pub fn new(section: &SacSection, observation: Observation, run_seed: u64, device: Device) -> Self {
+        let (observation, width) = (observation.len() as i64, section.hidden_width as i64);
+        let mut layout = Layout::default();
+        let policy = Policy::describe(&mut layout, observation, width);
+        let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::SacParameters, 0), device);
+        let mut layout = Layout::default();
+        let critic = Critic::describe(&mut layout, observation, width);
+        let critic_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::SacParameters, 1), device);
+        let log_temperature = Tensor::from_slice(&[section.initial_temperature.ln() as f32])
+            .to_device(device)
+            .set_requires_grad(true);
+        Self {
+            policy,
+            policy_optimizer: Adam::new(policy_parameters.flat(), section.policy_learning_rate),
+            policy_parameters,
+            critic,
+            critic_optimizer: Adam::new(critic_parameters.flat(), section.critic_learning_rate),
+            target_parameters: critic_parameters.duplicate(),
+            critic_parameters,
+            temperature_optimizer: Adam::new(&log_temperature, section.temperature_learning_rate),
+            log_temperature,
+            discount: section.discount,
+            target_rate: section.target_rate,
+            target_entropy: section.target_entropy.value(),
+        }
+    }
+
+    /// One step of critic, policy and temperature, and of the target behind them.
+    ///
+    /// All three gradients are taken at the same parameters before any of them moves: an update is done whole or not at all.
+    ///
+    /// # Errors
+    /// [`UpdateError::NonFinite`] names what was not finite and the update's number; nothing was changed then.
+    ///
+    /// Source: arXiv:1812.05905, algorithm 1.
+    pub fn update(&mut self, batch: &Batch, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {
+        let action_shape = [batch.rows(), ACTION as i64];
+        let mut normal = || noise.normal(&action_shape, self.log_temperature.device());
+        let temperature = self.log_temperature.detach().exp();
+
+        // What the state after the action is worth, by the slow critic and under the present policy (eq. 3).
+        let targets = {
+            let _guard = no_grad_guard();
+            let next = self
+                .policy
+                .sample(&self.policy_parameters, &batch.next_observations, &normal());
+            let next_values = self
+                .critic
+                .smaller(&self.target_parameters, &batch.next_observations, &next.actions);
+            let Batch {
+                rewards, terminated, ..
+            } = batch;
+            soft_targets(
+                rewards,
+                terminated,
+                &next_values,
+                &next.log_prob,
+                &temperature,
+                self.discount,
+            )
+        };
+
+        // Both estimates are drawn towards it (eq. 5).
+        let values = self
+            .critic
+            .forward(&self.critic_parameters, &batch.observations, &batch.actions);
+        let critic_loss = critic_loss(&values, &targets);
+        let critic_gradient = self.critic_parameters.gradient(&critic_loss);
+
+        // The policy moves towards actions of higher value, as far as its entropy is worth less (eq. 7).
+        let drawn = self
+            .policy
+            .sample(&self.policy_parameters, &batch.observations, &normal());
+        let drawn_values = self
+            .critic
+            .smaller(&self.critic_parameters, &batch.observations, &drawn.actions);
+        let policy_loss = policy_loss(&drawn.log_prob, &drawn_values, &temperature);
+        let policy_gradient = self.policy_parameters.gradient(&policy_loss);
+
+        // The temperature rises while the policy is more certain than asked for, and falls otherwise (eq. 18).
+        let log_prob = drawn.log_prob.detach();
+        let temperature_loss = temperature_loss(&self.log_temperature, &log_prob, self.target_entropy);
+        let temperature_gradient =
+            Tensor::run_backward(&[&temperature_loss], &[&self.log_temperature], false, false).remove(0);
+
+        let [critic_loss, policy_loss, temperature, entropy, mean_value] = finite(
+            self.updates() + 1,
+            [
+                ("critic loss", &critic_loss),
+                ("policy loss", &policy_loss),
+                ("temperature", &temperature.squeeze()),
+                ("entropy", &-log_prob.mean(None)),
+                ("mean value", &values.amin(1, false).mean(None)),
+            ],
+            [
+                ("critic gradient", &critic_gradient),
+                ("policy gradient", &policy_gradient),
+                ("temperature gradient", &temperature_gradient),
+            ],
+        )?;
+        self.critic_optimizer
+            .step(self.critic_parameters.flat_mut(), &critic_gradient);
+        self.policy_optimizer
+            .step(self.policy_parameters.flat_mut(), &policy_gradient);
+        self.temperature_optimizer
+            .step(&mut self.log_temperature, &temperature_gradient);
+        self.target_parameters.follow(&self.critic_parameters, self.target_rate);
+        Ok(SacMetrics {
+            critic_loss,
+            policy_loss,
+            temperature,
+            entropy,
+            mean_value,
+        })
+    }
+
+    /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
+    pub fn mode(&self, observations: &Tensor) -> Tensor {
+        let _guard = no_grad_guard();
+        self.policy.mode(&self.policy_parameters, observations)
+    }
+
+    /// Names and shapes of what [`Sac::publish`] copies.
+    pub fn policy_layout(&self) -> &Layout {
+        self.policy_parameters.layout()
+    }
+
+    /// Length of the policy's parameters.
+    pub fn published_len(&self) -> usize {
+        self.policy_layout().len()
+    }
+
+    /// Copies the policy's part of a snapshot, in the snapshot layout's order.
+    ///
+    /// # Panics
+    /// When `into` is not [`Sac::published_len`] long.
+    pub fn publish(&self, into: &mut [f32]) {
+        self.policy_parameters.copy_range(0..self.published_len(), into);
+    }
+
+    /// Updates done so far.
+    pub fn updates(&self) -> u64 {
+        self.critic_optimizer.steps()
+    }
+}
+
+impl Stateful for Sac {
+    fn named_tensors(&self) -> NamedTensors {
+        let mut tensors = vec![
+            (
+                "sac.policy.parameters".to_owned(),
+                self.policy_parameters.flat().shallow_clone(),
+            ),
+            (
+                "sac.critic.parameters".to_owned(),
+                self.critic_parameters.flat().shallow_clone(),
+            ),
+            (
+                "sac.target.parameters".to_owned(),
+                self.target_parameters.flat().shallow_clone(),
+            ),
+            ("sac.log_temperature".to_owned(), self.log_temperature.detach()),
+        ];
+        tensors.extend(self.policy_optimizer.named_tensors("sac.policy.adam"));
+        tensors.extend(self.critic_optimizer.named_tensors("sac.critic.adam"));
+        tensors.extend(self.temperature_optimizer.named_tensors("sac.temperature.adam"));
+        tensors
+    }
+}

@@ -1,0 +1,306 @@
+//! What is trained, and how much of it is due.
+//!
+//! How many VAE steps and SAC updates an epoch brings follows from the steps flown so far alone, and every random draw is seeded by the epoch: a
+//! trainer restored from a checkpoint goes on bit for bit.
+
+use std::ops::ControlFlow;
+
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
+use skein_protocol::config::Config;
+use skein_protocol::ids::{Epoch, PolicyVersion};
+use skein_protocol::seeds::{Purpose, derive};
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::ticket::Exploration;
+use skein_protocol::{IMAGE_PIXELS, LATENT};
+use tch::{Device, Kind, Tensor};
+
+use crate::checkpoint::{NamedTensor, TensorValues};
+use crate::device::{self, DeviceError};
+use crate::error::UpdateError;
+use crate::flight::CommittedFlight;
+use crate::flights::assembly::Keep;
+use crate::noise::Noise;
+use crate::replay::{InsertError, Minibatch, Replay};
+use crate::sac::{Batch, Columns, Sac, SacMetrics};
+use crate::state::Stateful;
+use crate::vae::{Vae, VaeMetrics, images_from_bytes};
+
+/// Images encoded at once when stored codes are made anew.
+const ENCODE_CHUNK: usize = 64;
+
+/// Networks and replay buffer.
+#[derive(Debug)]
+pub struct Trainer {
+    config: Config,
+    layout: SnapshotLayout,
+    device: Device,
+    vae: Vae,
+    sac: Sac,
+    replay: Replay,
+    steps: u64,
+}
+
+impl Trainer {
+    /// Untrained networks and an empty buffer. Sets the calling thread's tensor threads: training belongs on this thread.
+    ///
+    /// # Errors
+    /// [`DeviceError`] when the configured device does not exist.
+    pub fn new(config: &Config) -> Result<Self, DeviceError> {
+        device::use_threads(config.run.learner_threads);
+        let device = device::open(config.run.device)?;
+        Ok(Self {
+            layout: SnapshotLayout::of(config),
+            device,
+            vae: Vae::new(&config.vae, config.run.seed, device),
+            sac: Sac::new(&config.sac, config.learning.observation, config.run.seed, device),
+            replay: Replay::new(config),
+            steps: 0,
+            config: config.clone(),
+        })
+    }
+
+    /// Environment steps taken in.
+    pub fn steps(&self) -> u64 {
+        self.steps
+    }
+
+    /// SAC updates done.
+    pub fn updates(&self) -> u64 {
+        self.sac.updates()
+    }
+
+    /// VAE steps done.
+    pub fn vae_updates(&self) -> u64 {
+        self.vae.updates()
+    }
+
+    /// The replay buffer.
+    pub fn replay(&self) -> &Replay {
+        &self.replay
+    }
+
+    /// How the next flights to be ordered choose their actions.
+    pub fn exploration(&self) -> Exploration {
+        if self.steps < self.config.learning.warmup_steps as u64 {
+            Exploration::Uniform
+        } else {
+            Exploration::Sample
+        }
+    }
+
+    /// What is needed of the next flights to be ordered.
+    pub fn keep(&self) -> Keep {
+        if self.vae_is_frozen() {
+            Keep::Latents
+        } else {
+            Keep::Depth
+        }
+    }
+
+    fn vae_is_frozen(&self) -> bool {
+        self.replay.image_count().is_none()
+    }
+
+    /// Stores a flight's transitions.
+    ///
+    /// # Errors
+    /// [`InsertError`] when its parts do not belong together.
+    pub fn take_in(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
+        // With policy lag, flights still come in that were flown with an encoder older than the frozen one: their codes are made anew.
+        if self.vae_is_frozen()
+            && let Some(depth) = flight.depth.take()
+        {
+            for (observation, latent) in flight.observations.iter_mut().zip(self.encode(&depth)) {
+                observation.latent = latent;
+            }
+        }
+        self.steps += flight.steps() as u64;
+        self.replay.insert(flight)
+    }
+
+    /// Trains the VAE as far as the steps flown ask for, and freezes it when its time is over. `after_each` may do something between steps.
+    ///
+    /// # Errors
+    /// [`UpdateError`] when a number is no longer finite.
+    pub fn train_vae(
+        &mut self,
+        epoch: Epoch,
+        mut after_each: impl FnMut(&VaeMetrics),
+    ) -> Result<Option<VaeMetrics>, UpdateError> {
+        if self.vae_is_frozen() {
+            return Ok(None);
+        }
+        let section = &self.config.vae;
+        let counted = self.steps.min(section.train_steps as u64);
+        let due = (counted as f64 * section.updates_per_step) as u64;
+        let mut rng = self.rng(Purpose::VaeBatches, epoch);
+        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::VaeNoise, epoch.0));
+        let (mut images, mut last) = (Vec::new(), None);
+        while self.vae.updates() < due {
+            self.replay
+                .sample_images(&mut rng, self.config.vae.batch_size, &mut images);
+            let metrics = self.vae.update(&images_from_bytes(&images), &mut noise)?;
+            after_each(&metrics);
+            last = Some(metrics);
+        }
+        if self.steps >= self.config.vae.train_steps as u64 {
+            self.freeze_vae();
+        }
+        Ok(last)
+    }
+
+    fn freeze_vae(&mut self) {
+        tracing::info!(steps = self.steps, vae_updates = self.vae.updates(), "VAE frozen");
+        let Self { vae, replay, .. } = self;
+        let frozen: Result<(), std::convert::Infallible> =
+            replay.freeze_latents(ENCODE_CHUNK, |images| Ok(encode(vae, images)));
+        let Ok(()) = frozen;
+    }
+
+    /// Does the SAC updates that the steps flown since the warm-up ask for; returns the means of their metrics. `after_each` may do something
+    /// between updates, or end them early, which is then made up for in the next epoch.
+    ///
+    /// # Errors
+    /// [`UpdateError`] when a number is no longer finite.
+    pub fn train_policy(
+        &mut self,
+        epoch: Epoch,
+        mut after_each: impl FnMut(&SacMetrics) -> ControlFlow<()>,
+    ) -> Result<Option<SacMetrics>, UpdateError> {
+        let learning = &self.config.learning;
+        let counted = self.steps.saturating_sub(learning.warmup_steps as u64);
+        let due = (counted as f64 * learning.updates_per_step) as u64;
+        let mut rng = self.rng(Purpose::SacBatches, epoch);
+        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::SacNoise, epoch.0));
+        let mut minibatch = Minibatch::default();
+        let mut means = Means::default();
+        while self.sac.updates() < due {
+            self.replay.sample(&mut rng, self.config.sac.batch_size, &mut minibatch);
+            let metrics = self
+                .sac
+                .update(&Batch::new(columns(&minibatch), self.device), &mut noise)?;
+            means.add(&metrics);
+            if after_each(&metrics).is_break() {
+                break;
+            }
+        }
+        Ok(means.finish())
+    }
+
+    fn rng(&self, purpose: Purpose, epoch: Epoch) -> Pcg64Mcg {
+        Pcg64Mcg::seed_from_u64(derive(self.config.run.seed, purpose, epoch.0))
+    }
+
+    /// The parameters that actors fly with, as they are now.
+    pub fn snapshot(&self, version: PolicyVersion) -> Snapshot {
+        let mut values = vec![0.0; self.layout.values()];
+        self.vae.publish(&mut values[self.layout.encoder()]);
+        self.sac.publish(&mut values[self.layout.policy()]);
+        Snapshot { version, values }
+    }
+
+    /// `images` as the VAE sees them: `[n, 72, 128]` u8, both ways.
+    pub fn reconstruct(&self, images: &[u8]) -> Vec<u8> {
+        let depth = self.vae.reconstruct(&images_from_bytes(images));
+        let grey = (depth * 255.0)
+            .round()
+            .clamp(0.0, 255.0)
+            .to_kind(Kind::Uint8)
+            .to_device(Device::Cpu);
+        let mut bytes = vec![0; images.len()];
+        grey.copy_data(&mut bytes, images.len());
+        bytes
+    }
+
+    fn encode(&self, images: &[u8]) -> Vec<[f32; LATENT]> {
+        encode(&self.vae, images)
+    }
+
+    /// All tensors that updates change, copied to the processor.
+    pub fn tensors(&self) -> Vec<NamedTensor> {
+        let all = self.vae.named_tensors().into_iter().chain(self.sac.named_tensors());
+        all.map(|(name, tensor)| stored(name, &tensor)).collect()
+    }
+}
+
+fn encode(vae: &Vae, images: &[u8]) -> Vec<[f32; LATENT]> {
+    let codes = vae
+        .encode(&images_from_bytes(images))
+        .to_device(Device::Cpu)
+        .contiguous();
+    let mut values = vec![[0.0_f32; LATENT]; images.len() / IMAGE_PIXELS];
+    codes.copy_data(values.as_flattened_mut(), images.len() / IMAGE_PIXELS * LATENT);
+    values
+}
+
+fn columns(minibatch: &Minibatch) -> Columns<'_> {
+    Columns {
+        observations: &minibatch.observations,
+        actions: &minibatch.actions,
+        rewards: &minibatch.rewards,
+        next_observations: &minibatch.next_observations,
+        terminated: &minibatch.terminated,
+    }
+}
+
+fn stored(name: String, tensor: &Tensor) -> NamedTensor {
+    let tensor = tensor.detach().to_device(Device::Cpu).contiguous();
+    let count = tensor.numel();
+    macro_rules! values {
+        ($variant:ident, $zero:expr) => {{
+            let mut values = vec![$zero; count];
+            tensor.copy_data(&mut values, count);
+            TensorValues::$variant(values)
+        }};
+    }
+    let values = match tensor.kind() {
+        Kind::Int64 => values!(I64, 0_i64),
+        Kind::Double => values!(F64, 0.0_f64),
+        _ => values!(F32, 0.0_f32),
+    };
+    NamedTensor {
+        name,
+        shape: tensor.size().into_iter().map(|size| size as usize).collect(),
+        values,
+    }
+}
+
+/// Means of the metrics of an epoch's updates.
+#[derive(Default)]
+struct Means {
+    sums: [f64; 5],
+    count: usize,
+}
+
+impl Means {
+    fn add(&mut self, metrics: &SacMetrics) {
+        let SacMetrics {
+            critic_loss,
+            policy_loss,
+            temperature,
+            entropy,
+            mean_value,
+        } = *metrics;
+        for (sum, value) in self
+            .sums
+            .iter_mut()
+            .zip([critic_loss, policy_loss, temperature, entropy, mean_value])
+        {
+            *sum += f64::from(value);
+        }
+        self.count += 1;
+    }
+
+    fn finish(self) -> Option<SacMetrics> {
+        let [critic_loss, policy_loss, temperature, entropy, mean_value] =
+            self.sums.map(|sum| (sum / self.count.max(1) as f64) as f32);
+        (self.count > 0).then_some(SacMetrics {
+            critic_loss,
+            policy_loss,
+            temperature,
+            entropy,
+            mean_value,
+        })
+    }
+}
