@@ -1,6 +1,7 @@
 //! The courses of a run, and a simulator for each, built when a ticket first asks for it.
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -14,7 +15,16 @@ use skein_simulator::simulator::{Simulator, SimulatorError, SimulatorSettings};
 pub struct Courses {
     settings: SimulatorSettings,
     training: Option<Arc<Course>>,
-    evaluation: Vec<Arc<Course>>,
+    evaluation: Vec<EvaluationCourse>,
+}
+
+/// A course that evaluations fly.
+#[derive(Debug)]
+pub struct EvaluationCourse {
+    /// What reports call it: its file's name without the extension.
+    pub name: String,
+    /// The course.
+    pub course: Arc<Course>,
 }
 
 /// Simulators of one thread.
@@ -31,11 +41,10 @@ impl Courses {
     /// # Errors
     /// [`CoursesError`] names the file or the key.
     pub fn of_run(config: &Config) -> Result<Self, CoursesError> {
-        let evaluation = config.courses.evaluation.iter().map(|path| load(path));
         Ok(Self {
             settings: simulator_settings(config)?,
             training: Some(load(&config.courses.training)?),
-            evaluation: evaluation.collect::<Result<_, _>>()?,
+            evaluation: evaluation_courses(&config.courses.evaluation)?,
         })
     }
 
@@ -47,12 +56,12 @@ impl Courses {
         Ok(Self {
             settings: simulator_settings(config)?,
             training: None,
-            evaluation: paths.iter().map(|path| load(path.as_ref())).collect::<Result<_, _>>()?,
+            evaluation: evaluation_courses(paths)?,
         })
     }
 
     /// The evaluation courses in order.
-    pub fn evaluation(&self) -> &[Arc<Course>] {
+    pub fn evaluation(&self) -> &[EvaluationCourse] {
         &self.evaluation
     }
 
@@ -62,7 +71,7 @@ impl Courses {
             CourseChoice::Evaluation(index) => self
                 .evaluation
                 .get(index as usize)
-                .cloned()
+                .map(|evaluated| Arc::clone(&evaluated.course))
                 .ok_or(NoCourse::NotLoaded { choice }),
             CourseChoice::Generated(seed) => Ok(Arc::new(Course::generate(seed, &self.settings.generator)?)),
         }
@@ -102,15 +111,24 @@ impl Simulators {
                 }
                 Ok(&mut generated.as_mut().expect("it was built in the lines above").1)
             }
-            CourseChoice::Training | CourseChoice::Evaluation(_) => {
-                use std::collections::hash_map::Entry;
-                Ok(match fixed.entry(choice) {
-                    Entry::Occupied(entry) => entry.into_mut(),
-                    Entry::Vacant(entry) => entry.insert(build()?),
-                })
-            }
+            CourseChoice::Training | CourseChoice::Evaluation(_) => Ok(match fixed.entry(choice) {
+                Entry::Occupied(entry) => entry.into_mut(),
+                Entry::Vacant(entry) => entry.insert(build()?),
+            }),
         }
     }
+}
+
+fn evaluation_courses<P: AsRef<Path>>(paths: &[P]) -> Result<Vec<EvaluationCourse>, CoursesError> {
+    let load = |path: &P| {
+        let stem = path.as_ref().file_stem().unwrap_or_default();
+        let name = stem.to_string_lossy().into_owned();
+        Ok(EvaluationCourse {
+            name,
+            course: load(path.as_ref())?,
+        })
+    };
+    paths.iter().map(load).collect()
 }
 
 fn load(path: &Path) -> Result<Arc<Course>, CoursesError> {

@@ -14,7 +14,7 @@ use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
-use skein_simulator::course::NoSuchLevel;
+use skein_simulator::course::{Course, NoSuchLevel};
 use skein_simulator::reward::{RewardSettings, RewardTerms};
 use skein_simulator::simulator::{self, LevelUp, SimulationError, Simulator, StepReport};
 
@@ -95,11 +95,12 @@ impl Pilot {
             record = next;
             if let Some(ended) = report.outcome {
                 let outcome = outcome(ended);
-                close(&mut record, outcome, &report);
+                close(&mut record, outcome, &report, simulator.course());
                 link.send(record).map_err(FlightError::Link)?;
                 return Ok(FlightScore {
                     walls_passed: report.walls_passed.into(),
-                    flight_return,
+                    // As in `flights.csv`.
+                    flight_return: f64::from(flight_return as f32),
                     outcome,
                 });
             }
@@ -194,9 +195,10 @@ fn complete(record: &mut TransitionRecord, action: [f32; ACTION], report: &StepR
 }
 
 /// Makes a record with an observation the flight's last.
-fn close(record: &mut TransitionRecord, outcome: Outcome, report: &StepReport) {
+fn close(record: &mut TransitionRecord, outcome: Outcome, report: &StepReport, course: &Course) {
     record.kind = RecordKind::Closing.code();
     record.walls_passed = report.walls_passed;
+    record.course_walls = course.levels();
     record.outcome = outcome.code();
 }
 
@@ -219,245 +221,4 @@ fn outcome(ended: simulator::Outcome) -> Outcome {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::sync::Arc;
-
-    use bytemuck::Zeroable;
-    use skein_protocol::IMAGE_PIXELS;
-    use skein_protocol::config::Observation;
-    use skein_protocol::ids::{Attempt, FlightId, RunId};
-    use skein_protocol::snapshot::SnapshotLayout;
-    use skein_protocol::ticket::{CourseChoice, Exploration};
-
-    use super::*;
-    use crate::courses::Courses;
-    use crate::inference::Scratch;
-    use crate::testing::{config, random_snapshot};
-
-    const ACTOR: ActorId = ActorId(3);
-    const LIFE: Incarnation = Incarnation(8);
-
-    /// Keeps what is sent, and where each image lay when it was loaned and when it was sent.
-    #[derive(Default)]
-    struct Tape {
-        sent: Vec<Box<TransitionRecord>>,
-        loaned_at: Vec<usize>,
-        sent_at: Vec<usize>,
-        abandon_after: Option<usize>,
-    }
-
-    impl RecordLink for Tape {
-        type Loan = Box<TransitionRecord>;
-        type Error = std::convert::Infallible;
-
-        fn loan(&mut self) -> Result<Self::Loan, Self::Error> {
-            let mut record = Box::new(TransitionRecord::zeroed());
-            record.depth = [0xA5; IMAGE_PIXELS];
-            self.loaned_at.push(record.depth.as_ptr() as usize);
-            Ok(record)
-        }
-
-        fn send(&mut self, record: Self::Loan) -> Result<(), Self::Error> {
-            self.sent_at.push(record.depth.as_ptr() as usize);
-            self.sent.push(record);
-            Ok(())
-        }
-
-        fn directive(&mut self) -> Result<Directive, Self::Error> {
-            let enough = self.abandon_after.is_some_and(|steps| self.sent.len() >= steps);
-            Ok(if enough {
-                Directive::Abandon
-            } else {
-                Directive::Continue
-            })
-        }
-    }
-
-    fn ticket(exploration: Exploration, seed: u64) -> Ticket {
-        Ticket {
-            run: RunId(1),
-            flight: FlightId(5),
-            attempt: Attempt(2),
-            policy_version: NETWORK,
-            course: CourseChoice::Training,
-            start_level: 2,
-            exploration,
-            seed,
-        }
-    }
-
-    const NETWORK: skein_protocol::ids::PolicyVersion = skein_protocol::ids::PolicyVersion(4);
-
-    fn pilot(simulator: &str) -> Pilot {
-        let courses = Courses::of_run(&config(simulator)).unwrap();
-        Pilot::new(
-            ACTOR,
-            LIFE,
-            Simulators::new(Arc::new(courses)),
-            Agent::new(Observation::LatentVelocityAction),
-        )
-    }
-
-    fn network(change: impl Fn(&mut [f32])) -> Network {
-        let layout = SnapshotLayout::new(Observation::LatentVelocityAction.len(), 16);
-        let mut snapshot = random_snapshot(&layout, NETWORK.0);
-        change(&mut snapshot.values[layout.policy()]);
-        Network::new(&snapshot, &layout)
-    }
-
-    fn flown(pilot: &mut Pilot, ticket: &Ticket) -> (FlightScore, Tape) {
-        let mut tape = Tape::default();
-        let score = pilot.fly(ticket, &network(|_| {}), &mut tape).unwrap();
-        (score, tape)
-    }
-
-    fn bytes(tape: &Tape) -> Vec<&[u8]> {
-        tape.sent.iter().map(|record| bytemuck::bytes_of(&**record)).collect()
-    }
-
-    #[test]
-    fn a_ticket_flown_again_is_the_same_flight_bit_for_bit() {
-        let mut used = pilot("");
-        for exploration in [Exploration::Uniform, Exploration::Sample, Exploration::Mode] {
-            let (score, first) = flown(&mut used, &ticket(exploration, 1));
-            let (_, other) = flown(&mut used, &ticket(exploration, 2));
-            assert_ne!(bytes(&first), bytes(&other));
-            let (score_again, again) = flown(&mut used, &ticket(exploration, 1));
-            let (_, elsewhere) = flown(&mut pilot(""), &ticket(exploration, 1));
-            assert_eq!(score, score_again);
-            assert_eq!(bytes(&first), bytes(&again));
-            assert_eq!(bytes(&first), bytes(&elsewhere));
-        }
-    }
-
-    #[test]
-    fn how_actions_are_chosen_does_not_move_the_start() {
-        let start = |exploration| flown(&mut pilot(""), &ticket(exploration, 1)).1.sent[0].position_m;
-        assert_eq!(start(Exploration::Uniform), start(Exploration::Mode));
-        assert_eq!(start(Exploration::Uniform), start(Exploration::Sample));
-    }
-
-    #[test]
-    fn a_flight_is_its_steps_without_a_gap_and_one_closing_record() {
-        let ticket = ticket(Exploration::Sample, 1);
-        let (score, tape) = flown(&mut pilot(""), &ticket);
-        let (closing, steps) = tape.sent.split_last().unwrap();
-        assert!(steps.len() > 3);
-        for (step, record) in (0u32..).zip(&tape.sent) {
-            let kind = if step as usize == steps.len() {
-                RecordKind::Closing
-            } else {
-                RecordKind::Step
-            };
-            assert_eq!(record.check(&ticket, ACTOR, LIFE, step), Ok(kind));
-        }
-        assert_eq!(Outcome::from_code(closing.outcome), Some(score.outcome));
-        assert_eq!(u32::from(closing.walls_passed), score.walls_passed);
-        let ends = |record: &&TransitionRecord| record.terminated + record.truncated > 0;
-        assert!(steps.iter().rev().skip(1).all(|record| !ends(&&**record)) && ends(&&**steps.last().unwrap()));
-        let sum: f64 = steps.iter().map(|record| f64::from(record.reward)).sum();
-        assert_eq!(sum, score.flight_return);
-    }
-
-    #[test]
-    fn each_record_holds_what_was_seen_and_the_reward_for_what_came_next() {
-        let (_, tape) = flown(&mut pilot(""), &ticket(Exploration::Sample, 1));
-        let (network, mut scratch) = (network(|_| {}), Scratch::default());
-        for pair in tape.sent.windows(2) {
-            assert_eq!(pair[0].latent, network.encode(&pair[0].depth, &mut scratch));
-            let report = StepReport {
-                walls_passed: 0,
-                level_up: LevelUp::No,
-                outcome: None,
-            };
-            let expected = RewardTerms::of(&RewardSettings::default(), &report, &pair[1].depth);
-            assert_eq!(pair[0].reward_terms[3], expected.action);
-            assert_eq!(pair[0].reward, pair[0].reward_terms.iter().sum::<f32>());
-        }
-    }
-
-    #[test]
-    fn images_are_rendered_into_the_loaned_record_and_sent_from_there() {
-        let (_, tape) = flown(&mut pilot(""), &ticket(Exploration::Uniform, 1));
-        assert_eq!(tape.loaned_at, tape.sent_at);
-        assert!(
-            tape.sent
-                .iter()
-                .all(|record| record.depth.iter().any(|pixel| *pixel != 0xA5))
-        );
-    }
-
-    #[test]
-    fn a_flight_cut_off_by_the_step_limit_is_truncated_and_not_terminated() {
-        let (score, tape) = flown(&mut pilot("max_steps = 3"), &ticket(Exploration::Mode, 1));
-        assert_eq!((score.outcome, tape.sent.len()), (Outcome::TimedOut, 4));
-        assert_eq!((tape.sent[2].truncated, tape.sent[2].terminated), (1, 0));
-    }
-
-    #[test]
-    fn an_abandoned_flight_has_no_closing_record() {
-        let mut tape = Tape {
-            abandon_after: Some(2),
-            ..Tape::default()
-        };
-        let end = pilot("").fly(&ticket(Exploration::Mode, 1), &network(|_| {}), &mut tape);
-        assert!(matches!(end, Err(FlightError::Abandoned)));
-        assert_eq!(tape.sent.len(), 2);
-        assert!(tape.sent.iter().all(|record| record.kind == RecordKind::Step.code()));
-    }
-
-    #[test]
-    fn a_fault_ends_the_flight_with_a_record_that_says_so() {
-        let mut tape = Tape::default();
-        // Finite parameters whose products are not: infinity minus infinity in the second layer.
-        let network = network(|policy| {
-            policy
-                .iter_mut()
-                .enumerate()
-                .for_each(|(index, value)| *value = if index % 2 == 0 { 1e38 } else { -9e37 });
-        });
-        let ticket = ticket(Exploration::Mode, 1);
-        let end = pilot("").fly(&ticket, &network, &mut tape);
-        assert!(
-            matches!(end, Err(FlightError::Fault(FlightFault::Simulation(_)))),
-            "{end:?}"
-        );
-        assert_eq!(
-            tape.sent.last().unwrap().check(&ticket, ACTOR, LIFE, 0),
-            Ok(RecordKind::Failed)
-        );
-    }
-
-    #[test]
-    fn a_ticket_for_what_is_not_there_is_a_fault_and_not_a_crash() {
-        for ticket in [
-            Ticket {
-                start_level: 99,
-                ..ticket(Exploration::Mode, 1)
-            },
-            Ticket {
-                course: CourseChoice::Evaluation(99),
-                ..ticket(Exploration::Mode, 1)
-            },
-        ] {
-            let mut tape = Tape::default();
-            let end = pilot("").fly(&ticket, &network(|_| {}), &mut tape);
-            assert!(matches!(end, Err(FlightError::Fault(_))));
-            assert_eq!(tape.sent[0].kind, RecordKind::Failed.code());
-        }
-    }
-
-    #[test]
-    fn a_generated_course_is_the_tickets_own() {
-        let generated = |seed| Ticket {
-            course: CourseChoice::Generated(seed),
-            ..ticket(Exploration::Mode, 1)
-        };
-        let mut used = pilot("");
-        let (_, first) = flown(&mut used, &generated(1));
-        let (_, other) = flown(&mut used, &generated(2));
-        let (_, again) = flown(&mut used, &generated(1));
-        assert_eq!(bytes(&first), bytes(&again));
-        assert_ne!(bytes(&first), bytes(&other));
-    }
-}
+mod tests;

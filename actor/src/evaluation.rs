@@ -18,7 +18,7 @@ use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::TransitionRecord;
 
 use crate::agent::Agent;
-use crate::courses::{Courses, Simulators};
+use crate::courses::{Courses, EvaluationCourse, Simulators};
 use crate::environment_loop::{Directive, FlightError, FlightFault, Pilot, RecordLink};
 use crate::inference::Network;
 
@@ -101,10 +101,10 @@ impl Evaluation<'_> {
         let mut flights = flown.into_iter().map(|(_, flight)| flight);
         let mut courses = Vec::new();
         let mut by_course = Vec::new();
-        for course in self.courses.evaluation() {
+        for EvaluationCourse { name, course } in self.courses.evaluation() {
             let flights: Vec<_> = flights.by_ref().take(self.flights as usize).collect::<Result<_, _>>()?;
             let scores: Vec<_> = flights.iter().map(|flight: &EvaluatedFlight| flight.score).collect();
-            courses.push(CourseEvaluation::of(course.name(), course.walls().len(), &scores));
+            courses.push(CourseEvaluation::of(name, course.walls().len(), &scores));
             by_course.push(flights);
         }
         let report = EvaluationReport {
@@ -169,7 +169,7 @@ impl Evaluation<'_> {
                 records: memory.sent,
             }),
             Err(FlightError::Fault(fault)) => {
-                let course = self.courses.evaluation()[course as usize].name().to_owned();
+                let course = self.courses.evaluation()[course as usize].name.clone();
                 Err(EvaluationError { course, flight, fault })
             }
             Err(FlightError::Link(never)) => match never {},

@@ -271,3 +271,6 @@ impl RecordLink for LearnerLine<'_> {
         })
     }
 }
+
+#[cfg(test)]
+mod tests;

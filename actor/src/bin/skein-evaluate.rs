@@ -109,7 +109,11 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
         fs::write(file, json + "\n").with_context(|| format!("cannot write {}", file.display()))?;
     }
     if let Some(file) = &arguments.record {
-        let names: Vec<_> = courses.evaluation().iter().map(|course| course.name()).collect();
+        let names: Vec<_> = courses
+            .evaluation()
+            .iter()
+            .map(|evaluated| evaluated.name.as_str())
+            .collect();
         write_recording(file, &names, &evaluated.flights)?;
     }
     Ok(())

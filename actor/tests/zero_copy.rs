@@ -1,0 +1,124 @@
+//! The depth image's bytes are written once: where the camera rendered them, the learner reads them.
+
+use std::sync::Arc;
+
+use skein_actor::agent::Agent;
+use skein_actor::courses::{Courses, Simulators};
+use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
+use skein_actor::inference::Network;
+use skein_protocol::config::Config;
+use skein_protocol::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion};
+use skein_protocol::run::RunDirectory;
+use skein_protocol::services::{ActorPorts, LearnerPorts, LoanedTransition, ServiceError};
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+
+/// A byte of memory, whatever address it is mapped to: a file and an offset in it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Place {
+    inode: String,
+    offset: usize,
+}
+
+impl Place {
+    fn of(address: *const u8) -> Self {
+        let address = address as usize;
+        let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
+        let number = |text: &str| usize::from_str_radix(text, 16).unwrap();
+        // "start-end permissions offset device inode path"
+        let place = maps.lines().find_map(|line| {
+            let fields: Vec<_> = line.split_whitespace().collect();
+            let (start, end) = fields[0].split_once('-')?;
+            (number(start) <= address && address < number(end)).then(|| Self {
+                inode: fields[4].to_owned(),
+                offset: address - number(start) + number(fields[2]),
+            })
+        });
+        let place = place.expect("every address of ours is mapped");
+        assert_ne!(place.inode, "0", "memory of one process alone is shared with nobody");
+        place
+    }
+}
+
+/// Notes where each image lies, when it is about to be rendered and when it is sent.
+struct Watched<'a> {
+    ports: &'a ActorPorts,
+    loaned: Vec<Place>,
+    sent: Vec<Place>,
+}
+
+impl RecordLink for Watched<'_> {
+    type Loan = LoanedTransition;
+    type Error = ServiceError;
+
+    fn loan(&mut self) -> Result<LoanedTransition, ServiceError> {
+        let record = self.ports.loan_transition()?;
+        self.loaned.push(Place::of(record.depth.as_ptr()));
+        Ok(record)
+    }
+
+    fn send(&mut self, record: LoanedTransition) -> Result<(), ServiceError> {
+        self.sent.push(Place::of(record.depth.as_ptr()));
+        self.ports.send_transition(record)
+    }
+
+    fn directive(&mut self) -> Result<Directive, ServiceError> {
+        Ok(Directive::Continue)
+    }
+}
+
+#[test]
+fn the_learner_reads_images_where_the_camera_wrote_them() {
+    let directory = tempfile::tempdir().unwrap();
+    let run = RunDirectory::new(directory.path());
+    let mut config = Config::default();
+    config.sac.hidden_width = 8;
+    config.transport.max_actors = 1;
+    let configs = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/courses/training.toml");
+    config.courses.training = configs.into();
+    config.courses.evaluation = vec![configs.into()];
+    run.create(&config).unwrap();
+    let (identity, config) = run.open().unwrap();
+    let learner = LearnerPorts::open(&identity, &config).unwrap();
+    let actor = ActorPorts::open(&identity, &config).unwrap();
+    learner.maintain().unwrap();
+
+    let layout = SnapshotLayout::of(&config);
+    let snapshot = Snapshot {
+        version: PolicyVersion(0),
+        values: vec![0.01; layout.values()],
+    };
+    let ticket = Ticket {
+        run: identity.run,
+        flight: FlightId(0),
+        attempt: Attempt(0),
+        policy_version: PolicyVersion(0),
+        course: CourseChoice::Training,
+        start_level: 1,
+        exploration: Exploration::Uniform,
+        seed: 5,
+    };
+    let simulators = Simulators::new(Arc::new(Courses::of_run(&config).unwrap()));
+    let mut pilot = Pilot::new(
+        ActorId(0),
+        Incarnation(0),
+        simulators,
+        Agent::new(config.learning.observation),
+    );
+    let mut watched = Watched {
+        ports: &actor,
+        loaned: Vec::new(),
+        sent: Vec::new(),
+    };
+    let flown = pilot.fly(&ticket, &Network::new(&snapshot, &layout), &mut watched);
+
+    let mut received = Vec::new();
+    while let Some(record) = learner.receive_transition().unwrap() {
+        received.push(Place::of(record.depth.as_ptr()));
+    }
+    identity.remove_transport();
+    flown.unwrap();
+    assert!(received.len() > 3);
+    assert_eq!(watched.loaned, watched.sent);
+    assert_eq!(watched.sent, received);
+}
