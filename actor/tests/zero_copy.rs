@@ -1,5 +1,7 @@
 //! The depth image's bytes are written once: where the camera rendered them, the learner reads them.
 
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
 use std::sync::Arc;
 
 use skein_actor::agent::Agent;
