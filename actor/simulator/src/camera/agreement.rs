@@ -2,6 +2,8 @@
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 use proptest::prelude::*;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
 
 use super::{CameraSettings, DepthCamera, IMAGE_PIXELS, IMAGE_WIDTH, ReferenceCamera};
 use crate::course::{Course, GeneratorRanges, test_course};
@@ -59,42 +61,47 @@ fn compare(course: &Course, settings: &CameraSettings, world_from_body: &Isometr
     comparison
 }
 
-/// Where in the free space a lens is put.
+/// Where in the corridor a lens is put.
 #[derive(Debug, Clone, Copy)]
 enum Spot {
+    /// Before a wall, behind the one before.
     BetweenWalls,
-    WithinOpening,
+    /// In an opening, or just before or behind it.
+    Opening,
+    /// In a wall itself, where a body that has hit it may be: the backs of its faces are not seen.
+    InsideWall,
 }
 
-/// A lens in free space.
-fn free_point(course: &Course, share: [f32; 3], spot: Spot) -> [f32; 3] {
+/// A lens at a spot of the wall with this number. `share`: where in the spot, each from 0 to 1.
+fn lens(course: &Course, number: usize, spot: Spot, share: [f32; 3]) -> [f32; 3] {
     const MARGIN_M: f32 = 0.05;
-    let corridor = course.corridor();
     let between = |least: f32, most: f32, share: f32| least + (most - least) * share;
-    let walls = course.walls();
-    let choice = share[0] * (walls.len() + 1) as f32;
-    let (number, along) = (choice as usize, choice.fract());
-    if matches!(spot, Spot::WithinOpening) && number < walls.len() {
-        let wall = &walls[number];
-        let radius = (wall.clearance_m() - MARGIN_M) * share[1].sqrt();
-        let (sin, cos) = (share[2] * std::f32::consts::TAU).sin_cos();
-        let [y, z] = wall.safe_point();
-        let x = between(wall.x_m(), wall.x_m() + course.wall_thickness_m(), along);
-        return [x, y + radius * cos, z + radius * sin];
-    }
-    let number = number.min(walls.len());
-    let begin = if number == 0 {
-        0.0
-    } else {
-        walls[number - 1].x_m() + course.wall_thickness_m()
-    };
-    let end = walls.get(number).map_or(corridor.length_m, |wall| wall.x_m());
+    let corridor = course.corridor();
     let half = corridor.width_m / 2.0;
-    [
-        between(begin + MARGIN_M, end - MARGIN_M, along),
-        between(MARGIN_M - half, half - MARGIN_M, share[1]),
-        between(MARGIN_M, corridor.height_m - MARGIN_M, share[2]),
-    ]
+    let wall = &course.walls()[number];
+    let back_m = wall.x_m() + course.wall_thickness_m();
+    let begin_m = match number {
+        0 => 0.0,
+        _ => course.walls()[number - 1].x_m() + course.wall_thickness_m(),
+    };
+    let x = match spot {
+        Spot::BetweenWalls => between(begin_m + MARGIN_M, wall.x_m() - MARGIN_M, share[0]),
+        Spot::Opening => between(wall.x_m() - 0.5, back_m + 0.5, share[0]),
+        Spot::InsideWall => between(wall.x_m() + MARGIN_M, back_m - MARGIN_M, share[0]),
+    };
+    match spot {
+        Spot::BetweenWalls | Spot::InsideWall => [
+            x,
+            between(MARGIN_M - half, half - MARGIN_M, share[1]),
+            between(MARGIN_M, corridor.height_m - MARGIN_M, share[2]),
+        ],
+        Spot::Opening => {
+            let radius = (wall.clearance_m() - MARGIN_M) * share[1].sqrt();
+            let (sin, cos) = (share[2] * std::f32::consts::TAU).sin_cos();
+            let [y, z] = wall.safe_point();
+            [x, y + radius * cos, z + radius * sin]
+        }
+    }
 }
 
 /// Settings whose lens sits at the body's origin, so that the pose decides where it is.
@@ -117,8 +124,9 @@ proptest! {
     #[test]
     fn drawn_image_equals_the_traced_one(
         seed in any::<u64>(),
+        wall in 0usize..5,
         share in prop::array::uniform3(0.0f32..1.0),
-        spot in prop_oneof![Just(Spot::BetweenWalls), Just(Spot::WithinOpening)],
+        spot in prop_oneof![Just(Spot::BetweenWalls), Just(Spot::Opening), Just(Spot::InsideWall)],
         quaternion in prop::array::uniform4(-1.0f32..1.0)
             .prop_filter("too short to turn by", |q| q.iter().map(|c| c * c).sum::<f32>() > 0.1),
         horizontal_fov_deg in 40.0f32..120.0,
@@ -126,7 +134,7 @@ proptest! {
     ) {
         let course = Course::generate(seed, &GeneratorRanges::default()).unwrap();
         let settings = CameraSettings { horizontal_fov_deg, mount_pitch_deg, ..lens_in_the_middle() };
-        let world_from_body = pose(free_point(&course, share, spot), quaternion);
+        let world_from_body = pose(lens(&course, wall, spot, share), quaternion);
         let comparison = compare(&course, &settings, &world_from_body);
         prop_assert!(comparison.wrong.is_empty(), "{:?}", comparison.wrong);
         prop_assert!(comparison.excused <= MOST_EXCUSED, "{} excused", comparison.excused);
@@ -208,6 +216,49 @@ fn roll_turns_the_image_and_pitch_lifts_it() {
     let nose_down = render(UnitQuaternion::from_euler_angles(0.0, 0.5, 0.0));
     let middle = 36 * IMAGE_WIDTH + 64;
     assert!(nose_down[middle] < level[middle]);
+}
+
+#[test]
+fn nothing_is_near_in_the_middle_of_an_opening() {
+    // With the lens in the plane of a face, the near plane cuts the face all along its hole. Turned in many ways, no pixel of
+    // the line of that cut may show.
+    let course = test_course();
+    let mut camera = DepthCamera::new(&lens_in_the_middle(), &course).unwrap();
+    let mut image = [0; IMAGE_PIXELS];
+    let mut rng = Pcg64Mcg::seed_from_u64(1);
+    for number in 0..4000 {
+        let wall = &course.walls()[number % course.walls().len()];
+        let [y, z] = wall.safe_point();
+        let x = wall.x_m() + rng.random_range(-0.03..0.03);
+        let quaternion = std::array::from_fn(|_| rng.random_range(-1.0..1.0));
+        camera.render(&pose([x, y, z], quaternion), &mut image);
+        // The nearest surface is `clearance_m` away, at most 49 degrees off the optical axis.
+        let least = (255.0 * 0.65 * wall.clearance_m() / 20.0) as u8;
+        let nearest = image.iter().copied().min().unwrap();
+        assert!(
+            nearest >= least,
+            "wall {}, x = {x}, {quaternion:?}: {nearest}",
+            wall.label()
+        );
+    }
+}
+
+#[test]
+fn wider_registers_change_no_bit_of_the_image() {
+    let course = test_course();
+    let settings = lens_in_the_middle();
+    let mut camera = DepthCamera::new(&settings, &course).unwrap();
+    let [mut portable, mut chosen] = [[0; IMAGE_PIXELS]; 2];
+    let mut rng = Pcg64Mcg::seed_from_u64(2);
+    for number in 0..500 {
+        let share = std::array::from_fn(|_| rng.random_range(0.0..1.0));
+        let quaternion = std::array::from_fn(|_| rng.random_range(-1.0..1.0));
+        let spot = [Spot::BetweenWalls, Spot::Opening][number % 2];
+        let view = settings.view(&pose(lens(&course, number % 5, spot, share), quaternion));
+        super::draw(&mut camera, &view, &mut portable);
+        (super::fastest_draw())(&mut camera, &view, &mut chosen);
+        assert_eq!(portable, chosen, "{view:?}");
+    }
 }
 
 #[test]

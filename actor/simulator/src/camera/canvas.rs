@@ -23,9 +23,6 @@ pub(super) struct Nearness {
     pub in_middle: f32,
 }
 
-/// Pixels that are filled at a time: a bit each of a `u16`, and one AVX-512 register.
-const BLOCK: usize = 16;
-
 /// Pixels from a column to the right border, as bits; none from behind it.
 const FROM_COLUMN: [u128; IMAGE_WIDTH + 1] = {
     let mut masks = [0; IMAGE_WIDTH + 1];
@@ -35,6 +32,17 @@ const FROM_COLUMN: [u128; IMAGE_WIDTH + 1] = {
         column += 1;
     }
     masks
+};
+
+/// Columns from the image's middle to the middle of each pixel.
+const FROM_MIDDLE: [f32; IMAGE_WIDTH] = {
+    let mut columns = [0.0; IMAGE_WIDTH];
+    let mut column = 0;
+    while column < IMAGE_WIDTH {
+        columns[column] = column as f32 + 0.5 - MIDDLE_PX[0];
+        column += 1;
+    }
+    columns
 };
 
 const _: () = assert!(IMAGE_WIDTH == u128::BITS as usize, "a row is the bits of a u128");
@@ -88,18 +96,14 @@ impl Canvas {
     #[inline(always)]
     pub(super) fn fill(&mut self, plane: Nearness) {
         for row in self.first_row..self.end_row {
-            let inside = std::mem::take(&mut self.inside[row]);
-            if inside == 0 {
-                continue;
-            }
+            let mut left = std::mem::take(&mut self.inside[row]);
             let at_row = plane.in_middle + (row as f32 + 0.5 - MIDDLE_PX[1]) * plane.per_row;
-            let blocks = self.nearness[row].as_chunks_mut::<BLOCK>().0;
-            for (number, block) in blocks.iter_mut().enumerate() {
-                let bits = (inside >> (number * BLOCK)) as u16;
-                if bits != 0 {
-                    let first_column = (number * BLOCK) as f32 + 0.5 - MIDDLE_PX[0];
-                    fill_block(block, bits, at_row + first_column * plane.per_column, plane.per_column);
-                }
+            while left != 0 {
+                let start = left.trailing_zeros() as usize;
+                let end = start + (!(left >> start)).trailing_zeros() as usize;
+                left &= FROM_COLUMN[end];
+                let pixels = &mut self.nearness[row][start..end];
+                raise(pixels, &FROM_MIDDLE[start..end], at_row, plane.per_column);
             }
         }
         self.first_row = IMAGE_HEIGHT;
@@ -117,13 +121,12 @@ impl Canvas {
     }
 }
 
-/// Raises the pixels whose bit is set to the plane.
+/// Raises a run of pixels to the plane.
 #[inline(always)]
-fn fill_block(block: &mut [f32; BLOCK], bits: u16, first: f32, per_column: f32) {
-    for (lane, pixel) in block.iter_mut().enumerate() {
-        let plane = first + lane as f32 * per_column;
-        let raised = if plane > *pixel { plane } else { *pixel };
-        *pixel = if bits >> lane & 1 == 1 { raised } else { *pixel };
+fn raise(pixels: &mut [f32], columns: &[f32], at_row: f32, per_column: f32) {
+    for (pixel, column) in pixels.iter_mut().zip(columns) {
+        let plane = at_row + column * per_column;
+        *pixel = if plane > *pixel { plane } else { *pixel };
     }
 }
 

@@ -15,6 +15,8 @@ const EDGE_ON_M: f32 = 1e-6;
 /// The surfaces of a mesh in parts, each skipped as a whole when it is out of sight.
 pub(super) struct Scene {
     parts: Vec<Part>,
+    /// Where the edges of a face meet the near plane; scratch memory.
+    cuts: Vec<ImagePoint>,
 }
 
 /// The corridor's inside, or a wall.
@@ -63,8 +65,12 @@ impl Scene {
             SurfaceKind::Corridor | SurfaceKind::EndWall => None,
         };
         let parts = mesh.surfaces.chunk_by(|a, b| wall(a) == wall(b));
+        let parts: Vec<_> = parts.map(|surfaces| Part::new(mesh, surfaces)).collect();
+        let faces = parts.iter().flat_map(|part| &part.faces);
+        let most_corners = faces.map(|face| face.corners.len()).max().unwrap_or(0);
         Self {
-            parts: parts.map(|surfaces| Part::new(mesh, surfaces)).collect(),
+            parts,
+            cuts: Vec::with_capacity(most_corners),
         }
     }
 
@@ -81,7 +87,7 @@ impl Scene {
         for part in &mut self.parts {
             if part.reaches_into_range(&eye) {
                 part.look(&eye);
-                part.draw(&eye, canvas);
+                part.draw(&eye, &mut self.cuts, canvas);
             }
         }
     }
@@ -132,12 +138,12 @@ impl Part {
     }
 
     #[inline(always)]
-    fn draw(&self, eye: &Eye, canvas: &mut Canvas) {
+    fn draw(&self, eye: &Eye, cuts: &mut Vec<ImagePoint>, canvas: &mut Canvas) {
         for face in &self.faces {
             let above_m = face.normal.dot(&eye.at.coords) - face.offset_m;
             // Written so that a pose that is not a number sees nothing.
             if above_m > EDGE_ON_M {
-                face.outline(&self.seen, eye, canvas);
+                face.outline(&self.seen, eye, cuts, canvas);
                 canvas.fill(eye.nearness(face.normal, above_m));
             }
         }
@@ -163,39 +169,57 @@ impl Face {
     }
 
     /// Adds to the canvas what of the face's edges lies beyond the near distance, and what closes them there.
+    ///
+    /// `cuts`: scratch memory.
     #[inline(always)]
-    fn outline(&self, seen: &[Seen], eye: &Eye, canvas: &mut Canvas) {
+    fn outline(&self, seen: &[Seen], eye: &Eye, cuts: &mut Vec<ImagePoint>, canvas: &mut Canvas) {
+        cuts.clear();
         for range in &self.loops {
             let ring = &self.corners[range.clone()];
             let Some(&last) = ring.last() else { continue };
             let mut from = seen[last as usize];
-            // Where the loop last went out through the near plane, and where it first came in with no way out known yet.
-            let (mut went_out, mut first_in) = (None, None);
             for &corner in ring {
                 let to = seen[corner as usize];
                 match (from.at_m.z >= eye.near_m, to.at_m.z >= eye.near_m) {
                     (true, true) => canvas.add_edge(from.image, to.image),
                     (true, false) => {
-                        let out = eye.cross_near_plane(from.at_m, to.at_m);
-                        canvas.add_edge(from.image, out);
-                        went_out = Some(out);
+                        let cut = eye.cross_near_plane(from.at_m, to.at_m);
+                        canvas.add_edge(from.image, cut);
+                        cuts.push(cut);
                     }
                     (false, true) => {
-                        let into = eye.cross_near_plane(to.at_m, from.at_m);
-                        canvas.add_edge(into, to.image);
-                        match went_out.take() {
-                            Some(out) => canvas.add_edge(out, into),
-                            None => first_in = Some(into),
-                        }
+                        let cut = eye.cross_near_plane(to.at_m, from.at_m);
+                        canvas.add_edge(cut, to.image);
+                        cuts.push(cut);
                     }
                     (false, false) => {}
                 }
                 from = to;
             }
-            if let (Some(out), Some(into)) = (went_out, first_in) {
-                canvas.add_edge(out, into);
-            }
         }
+        if !cuts.is_empty() {
+            close_along_cuts(cuts, canvas);
+        }
+    }
+}
+
+/// Closes an outline along the near plane.
+///
+/// The cuts lie on one line, and the face between every other two of them. Closing each loop by itself would lay edges of the rim
+/// and of the hole over each other, which cancel only as far as their arithmetic agrees: a slit of near pixels remained.
+fn close_along_cuts(cuts: &mut [ImagePoint], canvas: &mut Canvas) {
+    let extent = |along: fn(&ImagePoint) -> f32| {
+        let (least, most) = cuts
+            .iter()
+            .map(along)
+            .fold((f32::INFINITY, f32::NEG_INFINITY), |(l, m), at| (l.min(at), m.max(at)));
+        most - least
+    };
+    let steep = extent(|cut| cut.row) > extent(|cut| cut.column);
+    let along = |cut: &ImagePoint| if steep { cut.row } else { cut.column };
+    cuts.sort_unstable_by(|a, b| along(a).total_cmp(&along(b)));
+    for &[a, b] in cuts.as_chunks::<2>().0 {
+        canvas.add_edge(a, b);
     }
 }
 
