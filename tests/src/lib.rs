@@ -1,1 +1,1 @@
-//! Placeholder, replaced in the first build-up.
+//! Whole-system tests: what only holds, or fails, between the packages. They lie in `tests/`, one file a subject.

@@ -1,0 +1,148 @@
+//! The actor's native networks are the learner's: the same parameters give the same numbers, to 1e-5.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use skein_actor::inference::{Network, Scratch};
+use skein_learner::networks::{Layout, Parameters, Policy};
+use skein_learner::sac::Sac;
+use skein_learner::vae::{Vae, images_from_bytes};
+use skein_protocol::config::{Config, Observation};
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
+use tch::{Device, Tensor};
+
+const TOLERANCE: f32 = 1e-5;
+const SEEDS: std::ops::Range<u64> = 0..3;
+const OBSERVATIONS: [Observation; 3] = [
+    Observation::Latent,
+    Observation::LatentVelocity,
+    Observation::LatentVelocityAction,
+];
+
+fn config(observation: Observation) -> Config {
+    let mut config = Config::default();
+    config.learning.observation = observation;
+    config
+}
+
+/// What the learner would publish, with the policy's parameters written by `policy`.
+fn network(config: &Config, vae: &Vae, policy: impl Fn(&mut [f32])) -> Network {
+    let layout = SnapshotLayout::of(config);
+    let mut values = vec![0.0; layout.values()];
+    vae.publish(&mut values[layout.encoder()]);
+    policy(&mut values[layout.policy()]);
+    Network::new(
+        &Snapshot {
+            version: PolicyVersion(0),
+            values,
+        },
+        &layout,
+    )
+}
+
+fn vae(config: &Config, seed: u64) -> Vae {
+    Vae::new(&config.vae, seed, Device::Cpu)
+}
+
+fn rows(tensor: &Tensor) -> Vec<Vec<f32>> {
+    tensor.try_into().unwrap()
+}
+
+fn assert_close(what: &str, native: &[f32], learner: &[f32]) {
+    assert_eq!(native.len(), learner.len());
+    for (index, (native, learner)) in native.iter().zip(learner).enumerate() {
+        assert!(
+            (native - learner).abs() <= TOLERANCE,
+            "{what}[{index}]: native {native}, learner {learner}"
+        );
+    }
+}
+
+fn assert_alive(what: &str, values: &[f32]) {
+    assert!(
+        values.iter().any(|value| value.abs() > 1e-3),
+        "{what} is all noughts: nothing was compared"
+    );
+}
+
+#[test]
+fn the_native_encoder_is_the_learners() {
+    let config = config(Observation::Latent);
+    for seed in SEEDS {
+        let vae = vae(&config, seed);
+        let network = network(&config, &vae, |_| {});
+        let mut rng = Pcg64Mcg::seed_from_u64(seed);
+        let mut images = vec![[0u8; IMAGE_PIXELS], [255; IMAGE_PIXELS]];
+        images.extend((0..4).map(|_| std::array::from_fn(|_| rng.random())));
+        let learner = rows(&vae.encode(&images_from_bytes(&images.concat())));
+        let mut scratch = Scratch::default();
+        for (image, learner) in images.iter().zip(&learner) {
+            let native: [f32; LATENT] = network.encode(image, &mut scratch);
+            assert_alive("latent", &native);
+            assert_close("latent", &native, learner);
+        }
+    }
+}
+
+#[test]
+fn the_native_policy_is_the_learners() {
+    for (seed, observation) in SEEDS.zip(OBSERVATIONS) {
+        let config = config(observation);
+        let mut layout = Layout::default();
+        let policy = Policy::describe(&mut layout, observation.len() as i64, config.sac.hidden_width as i64);
+        let parameters = Parameters::initialise(layout, seed, Device::Cpu);
+        let network = network(&config, &vae(&config, seed), |into| {
+            parameters.copy_range(0..into.len(), into)
+        });
+        let mut rng = Pcg64Mcg::seed_from_u64(seed);
+        let observed: Vec<f32> = (0..observation.len()).map(|_| rng.random_range(-3.0..3.0)).collect();
+        let (mean, log_std) = policy.distribution(&parameters, &Tensor::from_slice(&observed).unsqueeze(0));
+        let native = network.distribution(&observed, &mut Scratch::default());
+        assert_alive("mean", &native.mean);
+        assert_alive("log_std", &native.log_std);
+        assert_close("mean", &native.mean, &rows(&mean)[0]);
+        assert_close("log_std", &native.log_std, &rows(&log_std)[0]);
+    }
+}
+
+#[test]
+fn both_bound_an_extreme_spread_alike() {
+    let config = config(Observation::Latent);
+    let mut layout = Layout::default();
+    let policy = Policy::describe(&mut layout, LATENT as i64, config.sac.hidden_width as i64);
+    let mut parameters = Parameters::initialise(layout, 0, Device::Cpu);
+    // The last two values are the biases of the logarithms of the standard deviations.
+    let count = parameters.layout().len();
+    {
+        let _guard = tch::no_grad_guard();
+        let extremes = Tensor::from_slice(&[500.0f32, -500.0]);
+        parameters
+            .flat_mut()
+            .narrow(0, (count - ACTION) as i64, ACTION as i64)
+            .copy_(&extremes);
+    }
+    let network = network(&config, &vae(&config, 0), |into| {
+        parameters.copy_range(0..into.len(), into)
+    });
+    let observed = [0.5; LATENT];
+    let (_, log_std) = policy.distribution(&parameters, &Tensor::from_slice(&observed).unsqueeze(0));
+    let native = network.distribution(&observed, &mut Scratch::default());
+    assert_eq!(native.log_std.to_vec(), rows(&log_std)[0]);
+}
+
+#[test]
+fn what_the_learner_publishes_flies_as_the_learner_says() {
+    for observation in OBSERVATIONS {
+        let config = config(observation);
+        let sac = Sac::new(&config.sac, observation, 9, Device::Cpu);
+        let network = network(&config, &vae(&config, 9), |into| sac.publish(into));
+        let observed = vec![0.3; observation.len()];
+        let learner = rows(&sac.mode(&Tensor::from_slice(&observed).unsqueeze(0)));
+        let native = network.distribution(&observed, &mut Scratch::default()).mode();
+        assert_alive("action", &native);
+        assert_close("action", &native, &learner[0]);
+    }
+}
