@@ -45,7 +45,8 @@ impl CheckpointStore {
     /// [`CheckpointError`]; what was there before still is.
     pub fn save(&self, state: &CheckpointState) -> Result<PathBuf, CheckpointError> {
         let flights = state.progress.flights;
-        let aside = self.directory.join(format!(".writing-flight-{flights}"));
+        // One name for all: whatever an interrupted write left, of this flight or another, makes room for the next.
+        let aside = self.directory.join(".writing");
         remove(&aside)?;
         fs::create_dir_all(&aside).map_err(CheckpointError::io("create", &aside))?;
         files::write(&aside, state)?;

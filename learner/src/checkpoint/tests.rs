@@ -87,8 +87,8 @@ fn store(keep: usize) -> (tempfile::TempDir, CheckpointStore) {
     (directory, store)
 }
 
-fn names(store: &CheckpointStore) -> Vec<String> {
-    let entries = fs::read_dir(store.directory()).unwrap();
+fn names(directory: &std::path::Path) -> Vec<String> {
+    let entries = fs::read_dir(directory).unwrap();
     let mut names: Vec<_> = entries
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
         .collect();
@@ -201,7 +201,7 @@ fn only_the_newest_few_are_kept_and_nothing_else_remains() {
     for flights in [500, 1000, 1500] {
         store.save(&state(flights)).unwrap();
     }
-    assert_eq!(names(&store), ["flight-1000", "flight-1500"]);
+    assert_eq!(names(store.directory()), ["flight-1000", "flight-1500"]);
     assert_eq!(store.list().unwrap(), [1500, 1000]);
 }
 
@@ -221,17 +221,27 @@ fn checkpoints_of_an_abandoned_future_do_not_push_out_the_present() {
     let (_directory, store) = store(1);
     store.save(&state(1000)).unwrap();
     store.save(&state(600)).unwrap();
-    assert_eq!(names(&store), ["flight-600"]);
+    assert_eq!(names(store.directory()), ["flight-600"]);
 }
 
 #[test]
 fn what_an_interrupted_write_left_is_never_read_and_then_cleared() {
     let (_directory, store) = store(2);
-    let place = store.save(&state(500)).unwrap();
-    fs::rename(place, store.directory().join(".writing-flight-500")).unwrap();
+    let interrupted = store.save(&state(437)).unwrap();
+    fs::write(interrupted.join("tensors.safetensors.part"), "half").unwrap();
+    fs::rename(interrupted, store.directory().join(".writing")).unwrap();
     assert!(store.load_newest().unwrap().is_none());
-    store.save(&state(500)).unwrap();
-    assert_eq!(names(&store), ["flight-500"]);
+    let place = store.save(&state(500)).unwrap();
+    assert_eq!(names(store.directory()), ["flight-500"]);
+    assert_eq!(
+        names(&place),
+        [
+            "manifest.json",
+            "progress.bin",
+            "replay.safetensors",
+            "tensors.safetensors"
+        ]
+    );
 }
 
 #[test]

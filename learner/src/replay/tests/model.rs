@@ -1,0 +1,162 @@
+//! The buffer against a naive model of it: overwriting, sorting, freezing, storing and restoring at any point.
+
+use std::collections::VecDeque;
+
+use proptest::prelude::*;
+use skein_protocol::config::SuccessRule;
+use skein_protocol::transition::Outcome;
+
+use super::super::*;
+use super::{config, encode, final_code};
+use crate::flight::samples::{flight, with_images};
+
+/// A transition, owned.
+#[derive(Debug, Clone, PartialEq)]
+struct Transition {
+    observation: Vec<f32>,
+    next_observation: Vec<f32>,
+    action: [f32; ACTION],
+    reward: f32,
+    terminated: f32,
+}
+
+/// The model: both parts as queues of owned transitions, the oldest in front.
+struct Model {
+    parts: [(VecDeque<Transition>, usize); 2],
+    observation: Observation,
+    section: ReplaySection,
+}
+
+impl Model {
+    fn new(config: &Config) -> Self {
+        let (success, regular) = capacities(&config.replay);
+        let parts = [(VecDeque::new(), success), (VecDeque::new(), regular)];
+        Self {
+            parts,
+            observation: config.learning.observation,
+            section: config.replay.clone(),
+        }
+    }
+
+    fn insert(&mut self, flight: &CommittedFlight) {
+        for step in 0..flight.steps() {
+            let observed = |step: usize| {
+                let mut vector = flight.observations[step].latent.to_vec();
+                if self.observation != Observation::Latent {
+                    vector.extend(&flight.observations[step].velocity_mps[1..]);
+                }
+                if self.observation == Observation::LatentVelocityAction {
+                    vector.extend(if step == 0 { [0.0; 2] } else { flight.actions[step - 1] });
+                }
+                vector
+            };
+            let ends = step + 1 == flight.steps() && flight.outcome != Outcome::TimedOut;
+            let transition = Transition {
+                observation: observed(step),
+                next_observation: observed(step + 1),
+                action: flight.actions[step],
+                reward: flight.rewards[step],
+                terminated: if ends { 1.0 } else { 0.0 },
+            };
+            let ahead = match self.section.success {
+                SuccessRule::LevelUp => 0,
+                SuccessRule::Approach => self.section.approach_steps,
+            };
+            let success = flight.level_up[step..].iter().take(ahead + 1).any(|&level_up| level_up);
+            let (part, capacity) = &mut self.parts[usize::from(!success)];
+            part.push_back(transition);
+            if part.len() > *capacity {
+                part.pop_front();
+            }
+        }
+    }
+
+    fn set_latents(&mut self, latent: impl Fn(&[f32]) -> [f32; LATENT]) {
+        for transition in self.parts.iter_mut().flat_map(|(part, _)| part) {
+            for vector in [&mut transition.observation, &mut transition.next_observation] {
+                let made = latent(vector);
+                vector[..LATENT].copy_from_slice(&made);
+            }
+        }
+    }
+}
+
+/// A ring's transitions, the oldest first.
+fn transitions(ring: &Ring) -> Vec<Transition> {
+    let state = ring.state();
+    let oldest = if state.inserted as usize > ring.len() {
+        state.inserted as usize % ring.len()
+    } else {
+        0
+    };
+    (0..ring.len())
+        .map(|index| ring.row((oldest + index) % ring.len()))
+        .map(|row| Transition {
+            observation: row.observation.to_vec(),
+            next_observation: row.next_observation.to_vec(),
+            action: row.action.try_into().unwrap(),
+            reward: row.reward,
+            terminated: row.terminated,
+        })
+        .collect()
+}
+
+fn assert_same(replay: &Replay, model: &Model) {
+    assert_eq!(transitions(&replay.success), Vec::from(model.parts[0].0.clone()));
+    assert_eq!(transitions(&replay.regular), Vec::from(model.parts[1].0.clone()));
+}
+
+prop_compose! {
+    /// Flights of 1 to 12 steps with crossings anywhere and every outcome.
+    fn flights()(
+        shapes in prop::collection::vec((prop::collection::vec(prop::bool::weighted(0.2), 1..12), 0..3_usize), 1..20)
+    ) -> Vec<CommittedFlight> {
+        shapes
+            .into_iter()
+            .enumerate()
+            .map(|(number, (level_up, outcome))| {
+                let outcome = [Outcome::Collided, Outcome::ReachedEnd, Outcome::TimedOut][outcome];
+                let mut flight = flight(number as u64, level_up.len(), outcome);
+                flight.level_up = level_up;
+                flight
+            })
+            .collect()
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    /// Overwriting, classification, freezing at any point, saving and restoring at any point: always what the model holds.
+    #[test]
+    fn holds_what_a_naive_model_holds(
+        flights in flights(),
+        capacity in 4..80_usize,
+        freeze_after in 0..20_usize,
+        observation in prop::sample::select(vec![
+            Observation::Latent, Observation::LatentVelocity, Observation::LatentVelocityAction,
+        ]),
+        rule in prop::sample::select(vec![SuccessRule::LevelUp, SuccessRule::Approach]),
+        chunk in 1..9_usize,
+    ) {
+        let mut config = config(capacity, observation);
+        config.replay.success = rule;
+        config.replay.approach_steps = 3;
+        let (mut replay, mut model) = (Replay::new(&config), Model::new(&config));
+        for (number, flight) in flights.iter().enumerate() {
+            if number == freeze_after {
+                replay.freeze_latents(chunk, encode).unwrap();
+                model.set_latents(|vector| final_code(vector[0] as u8));
+            }
+            let images_live = replay.image_count().is_some();
+            replay.insert(if images_live { with_images(flight.clone()) } else { flight.clone() }).unwrap();
+            model.insert(flight);
+            assert_same(&replay, &model);
+            let restored = Replay::restore(&config, replay.state()).unwrap();
+            prop_assert_eq!(restored.state(), replay.state());
+            replay = restored;
+        }
+        prop_assert!(replay.len() <= capacity);
+        prop_assert_eq!(replay.success_len(), model.parts[0].0.len());
+    }
+}
