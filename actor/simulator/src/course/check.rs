@@ -3,7 +3,7 @@
 //! Every rule exists because the flight would otherwise be impossible or the numbers meaningless; each names what to change.
 
 use super::{
-    BODY_CLEARANCE_M, CourseFault, CourseLayout, DRONE_WIDTH_M, FRAME_M, MAX_CORNERS, MAX_WALLS, Place, Shape, Wall,
+    BODY_CLEARANCE_M, Course, CourseFault, DRONE_WIDTH_M, FRAME_M, MAX_CORNERS, MAX_WALLS, Place, Shape, Wall,
     WallLabel, WallLayout, polygon,
 };
 
@@ -13,63 +13,62 @@ const SETTLING_M: f32 = 3.2;
 /// Largest length that any key may hold, metres.
 const LARGEST_M: f32 = 1000.0;
 
-pub(super) fn corridor_and_start(layout: &CourseLayout) -> Result<(), CourseFault> {
-    let corridor = layout.corridor;
-    let course = |key, value, least, most| in_range(Place::Course, key, value, least, most);
-    course("corridor.length_m", corridor.length_m, 5.0, LARGEST_M)?;
-    course("corridor.width_m", corridor.width_m, 2.0, 100.0)?;
-    course("corridor.height_m", corridor.height_m, 2.0, 100.0)?;
-    course("wall_thickness_m", layout.wall_thickness_m, 0.01, 2.0)?;
+pub(super) fn corridor_and_start(course: &Course) -> Result<(), CourseFault> {
+    let corridor = course.corridor;
+    let thickness_m = course.wall_thickness_m;
+    let check = |key, value, least, most| in_range(Place::Course, key, value, least, most);
+    check("corridor.length_m", corridor.length_m, 5.0, LARGEST_M)?;
+    check("corridor.width_m", corridor.width_m, 2.0, 100.0)?;
+    check("corridor.height_m", corridor.height_m, 2.0, 100.0)?;
+    check("wall_thickness_m", thickness_m, 0.01, 2.0)?;
 
-    let start = layout.start;
-    let behind_m = layout.wall_thickness_m + BODY_CLEARANCE_M;
-    course(
+    let start = course.start;
+    let behind_m = thickness_m + BODY_CLEARANCE_M;
+    check(
         "start.offset_m",
         start.offset_m,
         behind_m,
         corridor.length_m - BODY_CLEARANCE_M,
     )?;
-    course(
+    check(
         "start.jitter_y_m",
         start.jitter_y_m,
         0.0,
         corridor.width_m / 2.0 - BODY_CLEARANCE_M,
     )?;
-    course(
+    check(
         "start.jitter_z_m",
         start.jitter_z_m,
         0.0,
         corridor.height_m / 2.0 - BODY_CLEARANCE_M,
-    )?;
-
-    let count = layout.walls.len();
-    if !(1..=MAX_WALLS).contains(&count) {
-        return Err(CourseFault::WallCount { count });
-    }
-    Ok(())
+    )
 }
 
-/// Checks the walls one by one and against the one before.
-pub(super) fn walls(layout: &CourseLayout) -> Result<Vec<Wall>, CourseFault> {
-    let mut walls: Vec<Wall> = Vec::with_capacity(layout.walls.len());
-    for candidate in &layout.walls {
-        if walls.iter().any(|wall| wall.label == candidate.label) {
-            return Err(CourseFault::RepeatedWall {
-                wall: candidate.label,
-                key: "order",
-            });
-        }
-        let wall = wall(layout, candidate)?;
-        reachable(layout, walls.last(), &wall)?;
-        walls.push(wall);
+/// The wall, if it can be flown through by itself and after the walls already in the course.
+pub(super) fn next_wall(course: &Course, candidate: WallLayout) -> Result<Wall, CourseFault> {
+    if course.walls.iter().any(|wall| wall.label == candidate.label) {
+        return Err(CourseFault::RepeatedWall {
+            wall: candidate.label,
+            key: "order",
+        });
     }
-    Ok(walls)
+    let wall = wall(course, candidate)?;
+    reachable(course, &wall)?;
+    Ok(wall)
 }
 
-fn wall(layout: &CourseLayout, candidate: &WallLayout) -> Result<Wall, CourseFault> {
+/// A course has walls, and not more than its levels can be counted.
+pub(super) fn wall_count(count: usize) -> Result<(), CourseFault> {
+    match count {
+        1..=MAX_WALLS => Ok(()),
+        _ => Err(CourseFault::WallCount { count }),
+    }
+}
+
+fn wall(course: &Course, candidate: WallLayout) -> Result<Wall, CourseFault> {
     let label = candidate.label;
-    let least_m = layout.start.offset_m + BODY_CLEARANCE_M;
-    let most_m = layout.corridor.length_m - layout.wall_thickness_m - DRONE_WIDTH_M;
+    let least_m = course.start.offset_m + BODY_CLEARANCE_M;
+    let most_m = course.corridor.length_m - course.wall_thickness_m - DRONE_WIDTH_M;
     // Written so that a NaN is refused as well.
     if !(least_m..=most_m).contains(&candidate.x_m) {
         return Err(CourseFault::OutsideCorridor {
@@ -79,8 +78,8 @@ fn wall(layout: &CourseLayout, candidate: &WallLayout) -> Result<Wall, CourseFau
             most_m,
         });
     }
-    sizes(label, candidate)?;
-    let outline = outline(layout, candidate)?;
+    sizes(label, &candidate)?;
+    let outline = outline(course, &candidate)?;
     let (safe_point, clearance_m) = polygon::widest_circle(&outline);
     if clearance_m < BODY_CLEARANCE_M {
         let shape = candidate.opening.shape.name();
@@ -93,7 +92,7 @@ fn wall(layout: &CourseLayout, candidate: &WallLayout) -> Result<Wall, CourseFau
     Ok(Wall {
         label,
         x_m: candidate.x_m,
-        opening: candidate.opening.clone(),
+        opening: candidate.opening,
         outline,
         safe_point,
         clearance_m,
@@ -145,14 +144,14 @@ fn sizes(wall: WallLabel, candidate: &WallLayout) -> Result<(), CourseFault> {
 }
 
 /// The outline, if it is a simple polygon within the wall's frame.
-fn outline(layout: &CourseLayout, candidate: &WallLayout) -> Result<Vec<[f32; 2]>, CourseFault> {
+fn outline(course: &Course, candidate: &WallLayout) -> Result<Vec<[f32; 2]>, CourseFault> {
     let wall = candidate.label;
     let outline = candidate.opening.outline();
     if let Some(edges) = polygon::self_intersection(&outline) {
         return Err(CourseFault::SelfIntersecting { wall, edges });
     }
-    let limit_y_m = layout.corridor.width_m / 2.0 - FRAME_M;
-    let limit_z_m = layout.corridor.height_m - FRAME_M;
+    let limit_y_m = course.corridor.width_m / 2.0 - FRAME_M;
+    let limit_z_m = course.corridor.height_m - FRAME_M;
     match outline
         .iter()
         .find(|[y, z]| y.abs() > limit_y_m || !(FRAME_M..=limit_z_m).contains(z))
@@ -169,17 +168,18 @@ fn outline(layout: &CourseLayout, candidate: &WallLayout) -> Result<Vec<[f32; 2]
 }
 
 /// There is way enough to sidestep from the opening before, and from the start area, to this opening.
-fn reachable(layout: &CourseLayout, before: Option<&Wall>, wall: &Wall) -> Result<(), CourseFault> {
-    let start = layout.start;
+fn reachable(course: &Course, wall: &Wall) -> Result<(), CourseFault> {
+    let before = course.walls.last();
+    let start = course.start;
     let behind_m = before.map_or(0.0, |before| before.x_m);
     let from_start = (
         wall.x_m - behind_m - start.offset_m,
         wall.safe_point[0].abs() + start.jitter_y_m,
-        (wall.safe_point[1] - layout.corridor.height_m / 2.0).abs() + start.jitter_z_m,
+        (wall.safe_point[1] - course.corridor.height_m / 2.0).abs() + start.jitter_z_m,
     );
     let from_wall = before.map(|before| {
         (
-            wall.x_m - before.x_m - layout.wall_thickness_m,
+            wall.x_m - before.x_m - course.wall_thickness_m,
             (wall.safe_point[0] - before.safe_point[0]).abs(),
             (wall.safe_point[1] - before.safe_point[1]).abs(),
         )

@@ -10,8 +10,7 @@ use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    BODY_CLEARANCE_M, Corridor, Course, CourseFault, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout,
-    polygon,
+    BODY_CLEARANCE_M, Corridor, Course, CourseFault, Opening, Shape, StartArea, WallLabel, WallLayout, check, polygon,
 };
 
 /// What random courses are drawn from. Pairs are the least and the largest value, drawn uniformly.
@@ -72,11 +71,14 @@ pub enum RangesError {
     /// No shapes to choose from.
     #[error("generator: shapes is empty: name at least one")]
     NoShapes,
+    /// The corridor, the start area or the number of walls.
+    #[error("generator: {0}")]
+    Corridor(#[from] CourseFault),
     /// Nothing drawn from the ranges could be flown.
     #[error("generator: nothing drawn for wall {wall} could be flown, for instance: {last}")]
     NothingFits {
-        /// Place of the wall, from 1.
-        wall: usize,
+        /// The wall.
+        wall: WallLabel,
         /// Why the last try was refused.
         last: CourseFault,
     },
@@ -106,57 +108,41 @@ impl Course {
     pub fn generate(seed: u64, ranges: &GeneratorRanges) -> Result<Self, RangesError> {
         ranges.check()?;
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
-        let mut layout = CourseLayout {
-            name: format!("generated {seed}"),
-            corridor: ranges.corridor,
-            start: ranges.start,
-            wall_thickness_m: ranges.wall_thickness_m,
-            walls: Vec::new(),
-        };
-        let mut course = None;
-        for (place, &x_m) in ranges.wall_x_m.iter().enumerate() {
-            let label = WallLabel(place as u32 + 1);
-            course = Some(add_wall(&mut layout, label, x_m, ranges, &mut rng)?);
+        let mut course = Self::without_walls(
+            format!("generated {seed}"),
+            ranges.corridor,
+            ranges.start,
+            ranges.wall_thickness_m,
+        )?;
+        for &x_m in &ranges.wall_x_m {
+            course.add_random_wall(x_m, ranges, &mut rng)?;
         }
-        course.ok_or(RangesError::NothingFits {
-            wall: 1,
-            last: CourseFault::WallCount { count: 0 },
-        })
+        Ok(course)
     }
-}
 
-/// Draws walls until one can be flown after those already there.
-fn add_wall(
-    layout: &mut CourseLayout,
-    label: WallLabel,
-    x_m: f32,
-    ranges: &GeneratorRanges,
-    rng: &mut impl Rng,
-) -> Result<Course, RangesError> {
-    /// With the default ranges about every second try fits.
-    const TRIES: u32 = 1000;
+    /// Draws walls until one can be flown after those already there.
+    fn add_random_wall(&mut self, x_m: f32, ranges: &GeneratorRanges, rng: &mut impl Rng) -> Result<(), RangesError> {
+        /// With the default ranges about every third try fits.
+        const TRIES: u32 = 1000;
 
-    let mut last = CourseFault::WallCount { count: 0 };
-    for _ in 0..TRIES {
-        layout.walls.push(WallLayout {
-            label,
-            x_m,
-            opening: ranges.draw_opening(rng),
-        });
-        match Course::new(layout.clone()) {
-            Ok(course) => return Ok(course),
-            Err(fault) => last = fault,
+        let label = WallLabel(self.walls.len() as u32 + 1);
+        let mut tries = 0;
+        loop {
+            let opening = ranges.draw_opening(rng);
+            match self.add_wall(WallLayout { label, x_m, opening }) {
+                Ok(()) => return Ok(()),
+                Err(last) if tries == TRIES => {
+                    return Err(RangesError::NothingFits { wall: label, last });
+                }
+                Err(_) => tries += 1,
+            }
         }
-        layout.walls.pop();
     }
-    Err(RangesError::NothingFits {
-        wall: label.0 as usize,
-        last,
-    })
 }
 
 impl GeneratorRanges {
     fn check(&self) -> Result<(), RangesError> {
+        check::wall_count(self.wall_x_m.len())?;
         if self.shapes.is_empty() {
             return Err(RangesError::NoShapes);
         }
@@ -278,6 +264,16 @@ mod tests {
         };
         let error = Course::generate(0, &upside_down).unwrap_err().to_string();
         assert!(error.contains("clearance_m = [1.2, 1]"), "{error}");
+
+        let no_corridor = GeneratorRanges {
+            corridor: Corridor {
+                width_m: f32::NAN,
+                ..Corridor::default()
+            },
+            ..Default::default()
+        };
+        let error = Course::generate(0, &no_corridor).unwrap_err().to_string();
+        assert!(error.contains("corridor.width_m = NaN"), "{error}");
 
         let too_wide = GeneratorRanges {
             clearance_m: [3.5, 3.5],

@@ -152,15 +152,37 @@ impl Course {
     /// # Errors
     /// The first [`CourseFault`] found, from the corridor to the walls in flight order.
     pub fn new(layout: CourseLayout) -> Result<Self, CourseFault> {
-        check::corridor_and_start(&layout)?;
-        let walls = check::walls(&layout)?;
-        Ok(Self {
-            name: layout.name,
-            corridor: layout.corridor,
-            start: layout.start,
-            wall_thickness_m: layout.wall_thickness_m,
-            walls,
-        })
+        let mut course = Self::without_walls(layout.name, layout.corridor, layout.start, layout.wall_thickness_m)?;
+        check::wall_count(layout.walls.len())?;
+        for wall in layout.walls {
+            course.add_wall(wall)?;
+        }
+        Ok(course)
+    }
+
+    /// A course under construction.
+    fn without_walls(
+        name: String,
+        corridor: Corridor,
+        start: StartArea,
+        wall_thickness_m: f32,
+    ) -> Result<Self, CourseFault> {
+        let course = Self {
+            name,
+            corridor,
+            start,
+            wall_thickness_m,
+            walls: Vec::new(),
+        };
+        check::corridor_and_start(&course)?;
+        Ok(course)
+    }
+
+    /// Adds the next wall in flight order, unless it cannot be flown.
+    fn add_wall(&mut self, layout: WallLayout) -> Result<(), CourseFault> {
+        let wall = check::next_wall(self, layout)?;
+        self.walls.push(wall);
+        Ok(())
     }
 
     /// Name in reports.

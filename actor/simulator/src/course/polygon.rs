@@ -55,15 +55,16 @@ pub(crate) fn signed_distance(points: &[[f32; 2]], point: [f32; 2]) -> f32 {
     if inside { nearest } else { -nearest }
 }
 
-/// Centre of the widest circle that fits inside, and its radius in metres.
+/// Centre of the widest circle that fits inside, and its radius in metres, to a millimetre.
 ///
 /// Where several circles are equally wide (a long rectangle), the one nearest the centroid wins: an opening is flown
-/// through its middle. A grid is refined around its best cell until a cell is below a millimetre.
+/// through its middle. Squares are quartered as long as a better centre can lie in them.
 pub(crate) fn widest_circle(points: &[[f32; 2]]) -> ([f32; 2], f32) {
     /// Metres of clearance given up for each metre nearer to the centroid.
     const PULL_TO_CENTROID: f32 = 0.02;
-    const CELLS: i32 = 12;
-    const SMALLEST_CELL_M: f32 = 0.001;
+    const PRECISION_M: f32 = 0.001;
+    /// How much the score can change over a metre.
+    const STEEPEST: f32 = 1.0 + PULL_TO_CENTROID;
 
     let middle = centroid(points);
     let score = |at: [f32; 2]| {
@@ -71,29 +72,28 @@ pub(crate) fn widest_circle(points: &[[f32; 2]]) -> ([f32; 2], f32) {
         signed_distance(points, at) - PULL_TO_CENTROID * off_centre
     };
 
-    let reach = points
+    let mut half_side = points
         .iter()
         .map(|p| (p[0] - middle[0]).abs().max((p[1] - middle[1]).abs()))
         .fold(0.0, f32::max);
-    let mut cell = reach / CELLS as f32;
-    let mut best = middle;
-    let mut best_score = score(middle);
-    loop {
-        let around = best;
-        for i in -CELLS..=CELLS {
-            for j in -CELLS..=CELLS {
-                let at = [around[0] + i as f32 * cell, around[1] + j as f32 * cell];
-                let here = score(at);
-                if here > best_score {
-                    (best, best_score) = (at, here);
-                }
-            }
-        }
-        if cell < SMALLEST_CELL_M {
-            return (best, signed_distance(points, best));
-        }
-        cell *= 0.25;
+    let mut best = (middle, score(middle));
+    let mut squares = vec![middle];
+    while !squares.is_empty() {
+        let scored: Vec<_> = squares.into_iter().map(|at| (at, score(at))).collect();
+        best = scored.iter().copied().fold(best, |a, b| if b.1 > a.1 { b } else { a });
+        let corner_gains = half_side * std::f32::consts::SQRT_2 * STEEPEST;
+        half_side /= 2.0;
+        squares = scored
+            .into_iter()
+            .filter(|(_, here)| here + corner_gains > best.1 + PRECISION_M)
+            .flat_map(|([y, z], _)| {
+                let (left, right) = (y - half_side, y + half_side);
+                let (low, high) = (z - half_side, z + half_side);
+                [[left, low], [right, low], [left, high], [right, high]]
+            })
+            .collect();
     }
+    (best.0, signed_distance(points, best.0))
 }
 
 /// Edges in order, the last one closing the loop.
