@@ -1,0 +1,145 @@
+//! `skein-evaluate` as its user meets it.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use skein_protocol::config::Config;
+use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+
+fn shipped(course: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../configs/courses")
+        .join(course)
+}
+
+/// A run's folder with a snapshot of an untrained policy; its evaluation courses lie beside it, as in a run that was moved.
+fn run_folder() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["snapshots", "courses"] {
+        std::fs::create_dir(folder.path().join(name)).unwrap();
+    }
+    let mut config = Config::default();
+    config.sac.hidden_width = 8;
+    config.courses.evaluation = ["training.toml", "non_rectangular.toml"]
+        .map(|name| Path::new("/elsewhere").join(name))
+        .to_vec();
+    for course in &config.courses.evaluation {
+        let name = course.file_name().unwrap();
+        std::fs::copy(
+            shipped(name.to_str().unwrap()),
+            folder.path().join("courses").join(name),
+        )
+        .unwrap();
+    }
+    let layout = SnapshotLayout::of(&config);
+    let values = (0..layout.values())
+        .map(|index| (index as f32 * 0.7).sin() * 0.02)
+        .collect();
+    let snapshot = Snapshot {
+        version: PolicyVersion(17),
+        values,
+    };
+    snapshot
+        .save(&folder.path().join("snapshots/latest.safetensors"), &layout, &config)
+        .unwrap();
+    folder
+}
+
+fn evaluate(folder: &Path, arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_skein-evaluate"))
+        .current_dir(folder)
+        .args(arguments)
+        .output()
+        .unwrap()
+}
+
+fn error_of(folder: &Path, arguments: &[&str]) -> String {
+    let output = evaluate(folder, arguments);
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    String::from_utf8(output.stderr).unwrap()
+}
+
+#[test]
+fn a_run_is_evaluated_on_its_own_courses_alike_on_any_number_of_threads() {
+    let folder = run_folder();
+    for threads in ["1", "3"] {
+        let json = format!("{threads}.json");
+        let output = evaluate(
+            folder.path(),
+            &["--run", ".", "--flights", "4", "--threads", threads, "--json", &json],
+        );
+        assert!(output.status.success(), "{output:?}");
+        let table = String::from_utf8(output.stdout).unwrap();
+        assert!(
+            table.contains("training") && table.contains("non_rectangular"),
+            "{table}"
+        );
+    }
+    let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
+    assert_eq!(read("1.json"), read("3.json"));
+    let report: EvaluationReport = serde_json::from_str(&read("1.json")).unwrap();
+    assert_eq!(report.policy_version, PolicyVersion(17));
+    assert_eq!(
+        report.courses.iter().map(|course| course.flights).collect::<Vec<_>>(),
+        [4, 4]
+    );
+}
+
+#[test]
+fn a_snapshot_file_alone_is_flown_and_recorded() {
+    let folder = run_folder();
+    let course = shipped("rearranged_34125.toml");
+    let arguments = [
+        "--snapshot",
+        "snapshots/latest.safetensors",
+        "--flights",
+        "2",
+        "--record",
+        "flights.npz",
+        "--course",
+    ];
+    let output = evaluate(
+        folder.path(),
+        &[arguments.as_slice(), &[course.to_str().unwrap()]].concat(),
+    );
+    assert!(output.status.success(), "{output:?}");
+    let recording = std::fs::File::open(folder.path().join("flights.npz")).unwrap();
+    let mut arrays = zip::ZipArchive::new(recording).unwrap();
+    assert!(arrays.by_name("depth.npy").is_ok());
+}
+
+#[test]
+fn errors_name_the_file_and_the_remedy() {
+    let folder = run_folder();
+    let at = folder.path();
+    let snapshot = ["--snapshot", "snapshots/latest.safetensors"];
+    let with = |more: &[&str]| error_of(at, &[snapshot.as_slice(), more].concat());
+
+    assert!(error_of(at, &["--run", "courses"]).contains("courses holds neither"));
+    assert!(error_of(at, &["--snapshot", "none.safetensors"]).contains("none.safetensors"));
+    assert!(with(&["--course", "none.toml"]).contains("none.toml"));
+    assert!(with(&["--json", "none/report.json"]).contains("none/report.json"));
+    std::fs::write(at.join("bent.toml"), "wals = 3").unwrap();
+    let bent = with(&["--course", "bent.toml"]);
+    assert!(bent.contains("bent.toml") && bent.contains("wals"), "{bent}");
+    std::fs::remove_dir_all(at.join("courses")).unwrap();
+    let gone = with(&[]);
+    assert!(
+        gone.contains("/elsewhere/training.toml") && gone.contains("--course"),
+        "{gone}"
+    );
+    std::fs::write(at.join("snapshots/latest.safetensors"), b"nothing of the kind").unwrap();
+    assert!(with(&[]).contains("snapshots/latest.safetensors"));
+}
+
+#[test]
+fn help_documents_the_recording() {
+    let help = String::from_utf8(evaluate(Path::new("."), &["--help"]).stdout).unwrap();
+    for word in ["reward_terms", "course_names", "[n, 72, 128]"] {
+        assert!(help.contains(word), "{help}");
+    }
+}
