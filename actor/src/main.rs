@@ -14,6 +14,7 @@ use skein_actor::courses::{Courses, Simulators};
 use skein_actor::environment_loop::Pilot;
 use skein_actor::service::{Ending, LearnerLine, serve};
 use skein_actor::weights::Weights;
+use skein_protocol::failure::with_causes;
 use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::logging::{LogFormat, log_to_file};
 use skein_protocol::run::RunDirectory;
@@ -48,8 +49,9 @@ fn main() -> ExitCode {
             ExitCode::from(EXIT_LEARNER_SILENT)
         }
         Err(error) => {
-            error!("{error:#}");
-            eprintln!("skein-actor: {error:#}");
+            let error = with_causes(error.as_ref());
+            error!(error, "actor failed");
+            eprintln!("skein-actor: {error}");
             ExitCode::FAILURE
         }
     }

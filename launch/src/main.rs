@@ -12,6 +12,7 @@ use skein_launch::prepare::{Prepared, load_courses, prepare};
 use skein_launch::reports;
 use skein_launch::supervisor::{self, Ended, Plan, Programs};
 use skein_protocol::config::Config;
+use skein_protocol::failure::with_causes;
 use skein_protocol::ids::ActorId;
 use skein_protocol::run::{RunDirectory, RunError};
 use tokio::runtime::Runtime;
@@ -82,22 +83,10 @@ fn main() -> ExitCode {
         Ok(Ended::Finished) => ExitCode::SUCCESS,
         Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
         Err(error) => {
-            eprintln!("skein: {}", with_causes(&error));
+            eprintln!("skein: {}", with_causes(error.as_ref()));
             ExitCode::FAILURE
         }
     }
-}
-
-/// The error and those of its causes that it does not quote itself.
-fn with_causes(error: &anyhow::Error) -> String {
-    error
-        .chain()
-        .map(ToString::to_string)
-        .fold(String::new(), |text, cause| match text.as_str() {
-            "" => cause,
-            said if said.contains(&cause) => text,
-            said => format!("{said}: {cause}"),
-        })
 }
 
 fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {

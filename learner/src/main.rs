@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, Result};
 use clap::Parser;
 use skein_learner::training;
+use skein_protocol::failure::with_causes;
 use skein_protocol::logging::{LogFormat, log_to_file};
 use skein_protocol::run::RunDirectory;
 use tokio::signal::unix::{SignalKind, signal};
@@ -27,8 +28,9 @@ fn main() -> ExitCode {
     match run(&Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            tracing::error!(error = format!("{error:#}"), "learner failed");
-            eprintln!("skein-learner: {error:#}");
+            let error = with_causes(error.as_ref());
+            tracing::error!(error, "learner failed");
+            eprintln!("skein-learner: {error}");
             ExitCode::FAILURE
         }
     }

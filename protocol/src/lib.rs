@@ -7,6 +7,7 @@
 
 pub mod config;
 pub mod evaluation;
+pub mod failure;
 pub mod ids;
 pub mod logging;
 pub mod progress;

@@ -275,6 +275,17 @@ mod tests {
     }
 
     #[test]
+    fn a_run_can_be_moved() {
+        let directory = tempfile::tempdir().unwrap();
+        let (before, after) = (directory.path().join("before"), directory.path().join("after"));
+        let run = RunDirectory::new(&before);
+        run.create(&Config::default()).unwrap();
+        fs::rename(&before, &after).unwrap();
+        let (_, moved) = RunDirectory::new(&after).open().unwrap();
+        assert_eq!(moved.courses.training, after.join("courses/training.toml"));
+    }
+
+    #[test]
     fn no_two_actors_get_the_same_id() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());

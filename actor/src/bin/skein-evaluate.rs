@@ -12,6 +12,7 @@ use skein_actor::courses::Courses;
 use skein_actor::evaluation::{Evaluation, Keep};
 use skein_actor::recording::{COLUMNS, write_recording};
 use skein_protocol::config::Config;
+use skein_protocol::failure::with_causes;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::snapshot::Snapshot;
 
@@ -59,7 +60,7 @@ fn main() -> ExitCode {
     match run(&Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("skein-evaluate: {error:#}");
+            eprintln!("skein-evaluate: {}", with_causes(error.as_ref()));
             ExitCode::FAILURE
         }
     }

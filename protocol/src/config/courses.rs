@@ -37,6 +37,11 @@ impl Default for CoursesSection {
 }
 
 impl CoursesSection {
+    /// All course files.
+    pub fn paths_mut(&mut self) -> impl Iterator<Item = &mut PathBuf> {
+        self.evaluation.iter_mut().chain([&mut self.training])
+    }
+
     pub(super) fn validate(&self) -> Result<(), Invalid> {
         require(
             (0.0..=1.0).contains(&self.generated_share),

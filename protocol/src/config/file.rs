@@ -82,8 +82,7 @@ impl Config {
             source,
         })?;
         let directory = path.parent().unwrap_or(Path::new(""));
-        let courses = &mut config.courses;
-        for course in courses.evaluation.iter_mut().chain([&mut courses.training]) {
+        for course in config.courses.paths_mut() {
             *course = directory.join(&*course);
         }
         Ok(config)

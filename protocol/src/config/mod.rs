@@ -13,6 +13,8 @@ mod sac;
 mod transport;
 mod vae;
 
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -87,9 +89,13 @@ impl Config {
         )
     }
 
-    /// Fingerprint of everything in the configuration; processes of one run compare it.
+    /// Fingerprint of the configuration; processes of one run compare it. Of course files it sees the names only, so that a run's directory can be moved.
     pub fn digest(&self) -> u64 {
-        xxh3_64(self.to_toml().as_bytes())
+        let mut portable = self.clone();
+        for course in portable.courses.paths_mut() {
+            *course = course.file_name().map(PathBuf::from).unwrap_or_default();
+        }
+        xxh3_64(portable.to_toml().as_bytes())
     }
 }
 

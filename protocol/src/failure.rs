@@ -1,0 +1,41 @@
+//! How a process tells its user why it failed.
+
+use std::error::Error;
+use std::iter::successors;
+
+/// The error and those of its causes that it does not quote itself, on one line.
+pub fn with_causes(error: &(dyn Error + 'static)) -> String {
+    successors(Some(error), |&error| error.source())
+        .map(ToString::to_string)
+        .fold(String::new(), |text, cause| match text.as_str() {
+            "" => cause,
+            said if said.contains(&cause) => text,
+            said => format!("{said}: {cause}"),
+        })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, thiserror::Error)]
+    #[error("{text}")]
+    struct Outer {
+        text: &'static str,
+        #[source]
+        cause: std::fmt::Error,
+    }
+
+    #[test]
+    fn each_cause_is_told_once() {
+        let cause = std::fmt::Error;
+        let told = cause.to_string();
+        let silent = Outer {
+            text: "cannot write",
+            cause,
+        };
+        assert_eq!(with_causes(&silent), format!("cannot write: {told}"));
+        let text: &'static str = format!("cannot write: {told}").leak();
+        assert_eq!(with_causes(&Outer { text, cause }), text);
+    }
+}
