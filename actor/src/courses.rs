@@ -168,3 +168,54 @@ pub enum NoCourse {
     #[error(transparent)]
     Simulator(#[from] SimulatorError),
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::config;
+
+    fn refused(config: &Config) -> String {
+        Courses::of_run(config).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        let unknown = refused(&config("max_stepps = 3"));
+        assert!(
+            unknown.contains("[simulator]") && unknown.contains("max_stepps"),
+            "{unknown}"
+        );
+        let mut missing = config("");
+        missing.courses.evaluation.push("nowhere.toml".into());
+        assert!(refused(&missing).contains("nowhere.toml"));
+    }
+
+    #[test]
+    fn evaluation_courses_go_by_their_files_names_in_order() {
+        let courses = Courses::of_run(&config("")).unwrap();
+        let names: Vec<_> = courses
+            .evaluation()
+            .iter()
+            .map(|evaluated| evaluated.name.as_str())
+            .collect();
+        assert_eq!(
+            names,
+            ["training", "rearranged_34125", "rearranged_53412", "non_rectangular"]
+        );
+    }
+
+    #[test]
+    fn a_simulator_is_built_once_and_only_the_last_generated_one_is_kept() {
+        let mut simulators = Simulators::new(Arc::new(Courses::of_run(&config("")).unwrap()));
+        let address = |simulator: &mut Simulator| std::ptr::from_ref(simulator.course()) as usize;
+        let training = address(simulators.of(CourseChoice::Training).unwrap());
+        for seed in 0..3 {
+            simulators.of(CourseChoice::Generated(seed)).unwrap();
+        }
+        assert_eq!(address(simulators.of(CourseChoice::Training).unwrap()), training);
+        assert_eq!(
+            (simulators.fixed.len(), simulators.generated.as_ref().unwrap().0),
+            (1, 2)
+        );
+    }
+}

@@ -107,7 +107,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
     println!("{}", evaluated.report);
     if let Some(file) = &arguments.json {
         let json = serde_json::to_string_pretty(&evaluated.report).context("the result is no JSON")?;
-        fs::write(file, json + "\n").with_context(|| format!("cannot write {}", file.display()))?;
+        fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))?;
     }
     if let Some(file) = &arguments.record {
         let names: Vec<_> = courses
