@@ -110,7 +110,7 @@ mod tests {
             policy_sha256: "0123456789abcdef0000".to_owned(),
             final_version: PolicyVersion(50),
             best_version: None,
-            best_confirmed_r: None,
+            best_confirmed_walls_passed: None,
             flights: 100,
             steps: 2000,
             updates: 300,

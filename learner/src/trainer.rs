@@ -3,8 +3,6 @@
 //! How many VAE steps and SAC updates an epoch brings follows from the steps flown so far alone, and every random draw is seeded by the epoch: a
 //! trainer restored from a checkpoint goes on bit for bit.
 
-use std::ops::ControlFlow;
-
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::config::Config;
@@ -159,14 +157,14 @@ impl Trainer {
     }
 
     /// Does the SAC updates that the steps flown since the warm-up ask for; returns the means of their metrics. `after_each` may do something
-    /// between updates, or end them early, which is then made up for in the next epoch.
+    /// between updates.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite.
     pub fn train_policy(
         &mut self,
         epoch: Epoch,
-        mut after_each: impl FnMut(&SacMetrics) -> ControlFlow<()>,
+        mut after_each: impl FnMut(&SacMetrics),
     ) -> Result<Option<SacMetrics>, UpdateError> {
         let learning = &self.config.learning;
         let counted = self.steps.saturating_sub(learning.warmup_steps as u64);
@@ -181,9 +179,7 @@ impl Trainer {
                 .sac
                 .update(&Batch::new(columns(&minibatch), self.device), &mut noise)?;
             means.add(&metrics);
-            if after_each(&metrics).is_break() {
-                break;
-            }
+            after_each(&metrics);
         }
         Ok(means.finish())
     }

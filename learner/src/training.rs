@@ -4,7 +4,6 @@
 //! order, updates the networks and publishes the next snapshot. Everything it does follows from configuration, seed and committed flights.
 
 use std::collections::VecDeque;
-use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
@@ -67,6 +66,7 @@ struct Training<'a> {
     metrics: Metrics,
     checkpoints: CheckpointWriter,
     phases: Phases,
+    epoch_started: Instant,
     version: PolicyVersion,
     epochs_done: u64,
     flights: u64,
@@ -126,6 +126,7 @@ impl<'a> Training<'a> {
             metrics: Metrics::create(directory, config.evaluation.window_flights as usize)?,
             checkpoints: CheckpointWriter::start(store)?,
             phases: Phases::default(),
+            epoch_started: Instant::now(),
             version: PolicyVersion(0),
             epochs_done: 0,
             flights: 0,
@@ -160,8 +161,8 @@ impl<'a> Training<'a> {
             self.version = PolicyVersion(self.epochs_done);
             self.publish()?;
             self.metrics.flush()?;
-            self.checkpoint_if_due()?;
             self.look_for_best()?;
+            self.checkpoint_if_due()?;
         }
         Ok(())
     }
@@ -204,6 +205,9 @@ impl<'a> Training<'a> {
     /// Takes the epoch's flights into metrics and replay buffer, in flight order.
     fn take_in(&mut self, flights: Vec<CommittedFlight>) -> Result<(), TrainingError> {
         let started = Instant::now();
+        let steps: usize = flights.iter().map(CommittedFlight::steps).sum();
+        let steps_per_sec = steps as f64 / self.epoch_started.elapsed().as_secs_f64();
+        self.epoch_started = started;
         for flight in flights {
             self.metrics.flight(&flight)?;
             self.trainer.take_in(flight)?;
@@ -219,6 +223,7 @@ impl<'a> Training<'a> {
         let sizes = [
             (Scalar::ReplayTransitions, replay.len() as f64),
             (Scalar::ReplaySuccess, replay.success_len() as f64),
+            (Scalar::StepsPerSec, steps_per_sec),
         ];
         self.metrics.scalars(self.last_flight(), &sizes)?;
         self.phases.add("take flights in", started);
@@ -254,13 +259,15 @@ impl<'a> Training<'a> {
     fn train_policy(&mut self, epoch: Epoch) -> Result<(), TrainingError> {
         let started = Instant::now();
         let reporter = &self.reporter;
+        let updates_before = self.trainer.updates();
         let trained = self.trainer.train_policy(epoch, |metrics| {
             reporter.update(|progress| {
                 progress.updates += 1;
                 progress.temperature = Some(metrics.temperature.into());
             });
-            ControlFlow::Continue(())
         })?;
+        let done = self.trainer.updates() - updates_before;
+        let updates_per_sec = done as f64 / started.elapsed().as_secs_f64();
         self.phases.add("SAC updates", started);
         let Some(SacMetrics {
             critic_loss,
@@ -278,6 +285,7 @@ impl<'a> Training<'a> {
             (Scalar::Temperature, temperature.into()),
             (Scalar::Entropy, entropy.into()),
             (Scalar::MeanValue, mean_value.into()),
+            (Scalar::UpdatesPerSec, updates_per_sec),
         ];
         Ok(self.metrics.scalars(self.last_flight(), &curves)?)
     }
@@ -333,8 +341,8 @@ impl<'a> Training<'a> {
             return Ok(());
         }
         let window_walls_passed = walls_passed.mean().unwrap_or_default();
-        self.latest_candidate = Some(self.flights);
         let flown = self.evaluate(self.version, 0..1, section.confirm_flights, Keep::Latents)?;
+        self.latest_candidate = Some(self.flights);
         let passed: f64 = flown.iter().map(|flight| f64::from(flight.walls_passed)).sum();
         let candidate = BestSnapshot {
             policy_version: self.version.0,
@@ -405,10 +413,6 @@ impl<'a> Training<'a> {
         self.checkpoints.finish()?;
         let shared = self.reception.shared();
         self.reception.finish();
-        let walls = self
-            .best
-            .as_ref()
-            .map(|best| best.confirmed_walls_passed / f64::from(self.config.learning.levels));
         Ok(Summary {
             skein_version: env!("CARGO_PKG_VERSION").to_owned(),
             run: self.identity.run,
@@ -417,7 +421,7 @@ impl<'a> Training<'a> {
             policy_sha256: self.trainer.snapshot(self.version).sha256(),
             final_version: self.version,
             best_version: self.best.as_ref().map(|best| PolicyVersion(best.policy_version)),
-            best_confirmed_r: walls,
+            best_confirmed_walls_passed: self.best.as_ref().map(|best| best.confirmed_walls_passed),
             flights: self.flights,
             steps: self.trainer.steps(),
             updates: self.trainer.updates(),

@@ -23,8 +23,8 @@ pub struct Summary {
     pub final_version: PolicyVersion,
     /// The best snapshot, if one was confirmed.
     pub best_version: Option<PolicyVersion>,
-    /// R of the best snapshot's confirmation flights.
-    pub best_confirmed_r: Option<f64>,
+    /// Walls passed in the best snapshot's confirmation flights, on average.
+    pub best_confirmed_walls_passed: Option<f64>,
     /// Training flights committed.
     pub flights: u64,
     /// Environment steps of training flights.
