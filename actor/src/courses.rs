@@ -5,7 +5,7 @@ use std::collections::hash_map::Entry;
 use std::path::Path;
 use std::sync::Arc;
 
-use skein_protocol::config::Config;
+use skein_protocol::config::{Config, CoursesSection};
 use skein_protocol::ticket::CourseChoice;
 use skein_simulator::course::{Course, CourseError, RangesError};
 use skein_simulator::simulator::{Simulator, SimulatorError, SimulatorSettings};
@@ -121,8 +121,7 @@ impl Simulators {
 
 fn evaluation_courses<P: AsRef<Path>>(paths: &[P]) -> Result<Vec<EvaluationCourse>, CoursesError> {
     let load = |path: &P| {
-        let stem = path.as_ref().file_stem().unwrap_or_default();
-        let name = stem.to_string_lossy().into_owned();
+        let name = CoursesSection::name_of(path.as_ref());
         Ok(EvaluationCourse {
             name,
             course: load(path.as_ref())?,

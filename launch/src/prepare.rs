@@ -9,7 +9,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use skein_protocol::config::{Config, ConfigError};
+use skein_protocol::config::{Config, ConfigError, CoursesSection};
 use skein_protocol::run::{RunDirectory, RunError, RunIdentity};
 use skein_simulator::course::{Course, CourseError, RangesError};
 use skein_simulator::simulator::{Simulator, SimulatorError, SimulatorSettings};
@@ -96,7 +96,7 @@ pub struct Prepared {
     /// Its resolved configuration.
     pub config: Config,
     /// The courses of its final evaluation.
-    pub courses: Vec<Course>,
+    pub courses: Vec<NamedCourse>,
 }
 
 /// Checks the configuration in `config_file` with `overrides`, the courses it names and the number of `actors`; then creates `run_directory` with
@@ -126,12 +126,27 @@ pub fn prepare(
     })
 }
 
+/// A course of the final evaluation, under the name it has in the run's reports.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NamedCourse {
+    /// [`CoursesSection::name_of`] its file.
+    pub name: String,
+    /// The course.
+    pub course: Course,
+}
+
 /// The courses of the final evaluation.
 ///
 /// # Errors
 /// [`CourseError`] names the file, the wall and the key.
-pub fn load_courses(config: &Config) -> Result<Vec<Course>, CourseError> {
-    config.courses.evaluation.iter().map(Course::load).collect()
+pub fn load_courses(config: &Config) -> Result<Vec<NamedCourse>, CourseError> {
+    let load = |path: &PathBuf| {
+        Ok(NamedCourse {
+            name: CoursesSection::name_of(path),
+            course: Course::load(path)?,
+        })
+    };
+    config.courses.evaluation.iter().map(load).collect()
 }
 
 fn check(config_file: &Path, config: &Config, actors: usize) -> Result<(), PrepareError> {
@@ -236,7 +251,10 @@ mod tests {
         assert_eq!(prepared.config.run.seed, 7);
         let root = directory.path().join("run").canonicalize().unwrap();
         assert_eq!(prepared.config.courses.training, root.join("courses/training.toml"));
-        assert_eq!(prepared.courses[0], Course::load(shipped("training.toml")).unwrap());
+        assert_eq!(
+            prepared.courses[0].course,
+            Course::load(shipped("training.toml")).unwrap()
+        );
         assert_eq!(prepared.run.open().unwrap().0, prepared.identity);
     }
 

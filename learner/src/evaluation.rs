@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, TensorView};
 use serde::Serialize;
-use skein_protocol::config::Config;
+use skein_protocol::config::{Config, CoursesSection};
 use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::run::RunDirectory;
@@ -70,9 +70,7 @@ pub fn write_report(
         .iter()
         .zip(flown.chunks(config.evaluation.flights as usize))
     {
-        let name = course
-            .file_stem()
-            .map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
+        let name = CoursesSection::name_of(course);
         let scores: Vec<FlightScore> = flights.iter().map(score).collect();
         let walls = flights.first().map_or(0, |flight| flight.course_walls.into());
         courses.push(CourseEvaluation::of(&name, walls, &scores));

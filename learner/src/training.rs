@@ -160,6 +160,7 @@ impl<'a> Training<'a> {
             self.epochs_done = epoch.0 + 1;
             self.version = PolicyVersion(self.epochs_done);
             self.publish()?;
+            tracing::debug!(epoch = epoch.0, flights = self.flights, version = %self.version, "epoch learned from");
             self.metrics.flush()?;
             self.look_for_best()?;
             self.checkpoint_if_due()?;

@@ -92,7 +92,8 @@ impl RunDirectory {
         ] {
             fs::create_dir_all(&folder).map_err(io(folder.clone()))?;
         }
-        fs::write(self.config(), config.to_toml()).map_err(io(self.config()))?;
+        let text = format!("# Resolved by Skein {}.\n\n{}", env!("CARGO_PKG_VERSION"), config.to_toml());
+        fs::write(self.config(), text).map_err(io(self.config()))?;
         let resolved = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
         let identity = RunIdentity::new(&resolved);
         let json = serde_json::to_string_pretty(&identity).expect("an identity is plain data");

@@ -10,6 +10,7 @@ use skein_simulator::course::{Course, Wall};
 
 use super::ReportError;
 use super::canvas::{Area, Canvas, INK, REFERENCE, STRONG, font, px};
+use crate::prepare::NamedCourse;
 
 const WIDTH: u32 = 1280;
 const LEFT: u32 = 70;
@@ -79,18 +80,18 @@ pub(super) fn read_paths(path: &Path) -> Result<PathsByCourse, ReportError> {
 ///
 /// # Errors
 /// [`ReportError`] if the picture cannot be drawn or written.
-pub(super) fn draw(courses: &[Course], paths: &PathsByCourse, path: &Path) -> Result<(), ReportError> {
+pub(super) fn draw(courses: &[NamedCourse], paths: &PathsByCourse, path: &Path) -> Result<(), ReportError> {
     let flown: Vec<_> = courses
         .iter()
-        .filter_map(|course| Some((course, paths.get(course.name())?)))
+        .filter_map(|NamedCourse { name, course }| Some((name, course, paths.get(name)?)))
         .collect();
-    let height = TOP + flown.iter().map(|(course, _)| block_height(course)).sum::<u32>();
+    let height = TOP + flown.iter().map(|(_, course, _)| block_height(course)).sum::<u32>();
     let mut canvas = Canvas::new(WIDTH, height);
     canvas.draw(|area| {
         draw_legend(area)?;
         let mut top = TOP;
-        for (course, flights) in &flown {
-            draw_course(area, course, flights, top)?;
+        for (name, course, flights) in &flown {
+            draw_course(area, name, course, flights, top)?;
             top += block_height(course);
         }
         Ok(())
@@ -241,6 +242,7 @@ impl Panel<'_> {
 
 fn draw_course(
     area: &Area<'_>,
+    name: &str,
     course: &Course,
     flights: &[FlightPath],
     top: u32,
@@ -248,8 +250,7 @@ fn draw_course(
     use plotters::style::text_anchor::{HPos, Pos, VPos};
     let count = |outcome| flights.iter().filter(|flight| flight.outcome == outcome).count();
     let caption = format!(
-        "{}: {} flights, {} reached the end, {} collided, {} timed out",
-        course.name(),
+        "{name}: {} flights, {} reached the end, {} collided, {} timed out",
         flights.len(),
         count(Outcome::ReachedEnd),
         count(Outcome::Collided),

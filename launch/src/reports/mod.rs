@@ -11,7 +11,8 @@ use std::io;
 use std::path::PathBuf;
 
 use skein_protocol::run::RunDirectory;
-use skein_simulator::course::Course;
+
+use crate::prepare::NamedCourse;
 
 /// Why a plot could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -53,7 +54,7 @@ pub enum ReportError {
 ///
 /// # Errors
 /// [`ReportError`] names the file that is there but cannot be used, or the picture that cannot be written.
-pub fn draw_all(run: &RunDirectory, courses: &[Course], window: usize) -> Result<Vec<PathBuf>, ReportError> {
+pub fn draw_all(run: &RunDirectory, courses: &[NamedCourse], window: usize) -> Result<Vec<PathBuf>, ReportError> {
     let mut pictures = Vec::new();
     let mut picture = |name: &str| {
         let path = run.plots().join(name);
@@ -63,7 +64,7 @@ pub fn draw_all(run: &RunDirectory, courses: &[Course], window: usize) -> Result
     if let Some(path) = existing(run.flights_csv()) {
         let flights = curves::read_flights(&path)?;
         // An evaluation course stands for the training course here: all start levels in turn leave (n + 1) / 2 walls on average.
-        let walls = courses.first().map_or(0, |course| course.walls().len());
+        let walls = courses.first().map_or(0, |course| course.course.walls().len());
         curves::draw_return(&flights, window, &picture("return.png"))?;
         curves::draw_walls_passed(&flights, window, (walls + 1) as f64 / 2.0, &picture("walls_passed.png"))?;
     }
@@ -88,10 +89,16 @@ mod tests {
     use safetensors::Dtype;
     use safetensors::tensor::TensorView;
 
+    use skein_simulator::course::Course;
+
     use super::*;
 
-    fn training() -> Course {
-        Course::load(Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/courses/training.toml")).unwrap()
+    fn training() -> NamedCourse {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/courses/training.toml");
+        NamedCourse {
+            name: "training".to_owned(),
+            course: Course::load(path).unwrap(),
+        }
     }
 
     fn write_flights(run: &RunDirectory) {

@@ -1,6 +1,6 @@
 //! `[courses]`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
@@ -37,6 +37,11 @@ impl Default for CoursesSection {
 }
 
 impl CoursesSection {
+    /// What a course is called in reports: its file's name without the ending.
+    pub fn name_of(course: &Path) -> String {
+        course.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    }
+
     /// All course files.
     pub fn paths_mut(&mut self) -> impl Iterator<Item = &mut PathBuf> {
         self.evaluation.iter_mut().chain([&mut self.training])
