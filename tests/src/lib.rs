@@ -1,1 +1,15 @@
 //! Whole-system tests: what only holds, or fails, between the packages. They lie in `tests/`, one file a subject.
+//!
+//! Here is what they share: runs of the real programs, with a time limit on every wait and nothing left behind, however a test ends.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+mod flights;
+mod leftovers;
+mod programs;
+mod run;
+
+pub use flights::{Flight, Learned, flights};
+pub use leftovers::{Process, leftovers, processes_of};
+pub use programs::{Output, program, repository, run_program};
+pub use run::{Ended, Recipe, Running};

@@ -1,0 +1,320 @@
+//! A run of the real programs: started, watched, ended, and cleared away.
+
+use std::fs::{self, File};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde::de::DeserializeOwned;
+use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::run::RunDirectory;
+use skein_protocol::summary::Summary;
+use tempfile::TempDir;
+
+use crate::flights::{Flight, Learned, flights};
+use crate::leftovers::{leftovers, processes_of};
+use crate::programs::{Output, program, repository};
+
+/// No run here takes a fifth of it on an idle machine.
+const LIMIT: Duration = Duration::from_secs(180);
+/// Between two looks at what is waited for.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// One run at a time in a test process: each takes all cores.
+static TURN: Mutex<()> = Mutex::new(());
+
+/// A run to be started.
+#[derive(Debug, Clone)]
+pub struct Recipe {
+    config: PathBuf,
+    overrides: Vec<String>,
+    environment: Vec<(String, String)>,
+    actors: u32,
+}
+
+impl Recipe {
+    /// The shipped `configs/smoke.toml`, two actors.
+    pub fn smoke() -> Self {
+        Self::of(repository().join("configs/smoke.toml"))
+    }
+
+    /// `tests/small.toml`, two actors: a few seconds.
+    pub fn small() -> Self {
+        Self::of(repository().join("tests/small.toml"))
+    }
+
+    /// The configuration file `config`, two actors.
+    pub fn of(config: PathBuf) -> Self {
+        Self {
+            config,
+            overrides: Vec::new(),
+            environment: Vec::new(),
+            actors: 2,
+        }
+    }
+
+    /// With so many actors.
+    pub fn actors(mut self, actors: u32) -> Self {
+        self.actors = actors;
+        self
+    }
+
+    /// With `--set section.key=value`.
+    pub fn set(mut self, setting: &str) -> Self {
+        self.overrides.push(setting.to_owned());
+        self
+    }
+
+    /// With this environment variable.
+    pub fn environment(mut self, name: &str, value: &str) -> Self {
+        self.environment.push((name.to_owned(), value.to_owned()));
+        self
+    }
+
+    /// Starts it; waits until no other run of this test process is under way.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    pub fn start(self) -> Running {
+        let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().canonicalize().unwrap().join("run");
+        let mut command = Command::new(program("skein"));
+        command
+            .arg("run")
+            .arg("--config")
+            .arg(&self.config)
+            .arg("--run-dir")
+            .arg(&root)
+            .args(["--actors", &self.actors.to_string()])
+            .args(self.overrides.iter().flat_map(|setting| ["--set", setting]))
+            .env_remove("RUST_LOG")
+            .env_remove("SKEIN_LOG_FORMAT")
+            .envs(self.environment)
+            .stdin(Stdio::null())
+            .stdout(File::create(folder.path().join("stdout")).unwrap())
+            .stderr(File::create(folder.path().join("stderr")).unwrap());
+        Running {
+            supervisor: command.spawn().unwrap(),
+            attached: Vec::new(),
+            directory: RunDirectory::new(root),
+            folder: Some(folder),
+            deadline: Instant::now() + LIMIT,
+            _turn: turn,
+        }
+    }
+
+    /// Runs it to its end and requires that it succeeds.
+    ///
+    /// # Panics
+    /// When it does not.
+    pub fn finish(self) -> Ended {
+        self.start().finish()
+    }
+}
+
+/// A run under way. Its processes and all they left are cleared away when it goes out of scope.
+#[derive(Debug)]
+pub struct Running {
+    supervisor: Child,
+    attached: Vec<Child>,
+    directory: RunDirectory,
+    folder: Option<TempDir>,
+    deadline: Instant,
+    _turn: MutexGuard<'static, ()>,
+}
+
+impl Running {
+    /// Its directory.
+    pub fn directory(&self) -> &RunDirectory {
+        &self.directory
+    }
+
+    /// What the supervisor has said on standard error so far.
+    pub fn stderr(&self) -> String {
+        let folder = self.folder.as_ref().expect("it is taken only at the end");
+        fs::read_to_string(folder.path().join("stderr")).unwrap()
+    }
+
+    /// Waits until `condition` gives something.
+    ///
+    /// # Panics
+    /// When the run ends before, or the time is up; `what` says what was waited for.
+    pub fn until<T>(&mut self, what: &str, mut condition: impl FnMut(&Self) -> Option<T>) -> T {
+        loop {
+            if let Some(found) = condition(self) {
+                return found;
+            }
+            let ended = self.supervisor.try_wait().unwrap();
+            assert!(ended.is_none(), "the run ended before {what}:\n{}", self.stderr());
+            assert!(Instant::now() < self.deadline, "never {what}:\n{}", self.stderr());
+            sleep(LOOK);
+        }
+    }
+
+    /// Waits until so many training flights are learned from.
+    ///
+    /// # Panics
+    /// As [`Running::until`].
+    pub fn until_flights(&mut self, count: usize) {
+        self.until(&format!("{count} flights were learned from"), |run| {
+            (flights(&run.directory).len() >= count).then_some(())
+        });
+    }
+
+    /// Starts `skein attach` with one actor.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    pub fn attach(&mut self) {
+        let attached = Command::new(program("skein"))
+            .arg("attach")
+            .arg("--run")
+            .arg(self.directory.root())
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        self.attached.push(attached);
+    }
+
+    /// Sends `signal` to the supervisor alone.
+    ///
+    /// # Panics
+    /// When it has been reaped already.
+    pub fn signal(&self, signal: Signal) {
+        let pid = Pid::from_raw(self.supervisor.id().cast_signed()).unwrap();
+        kill_process(pid, signal).unwrap();
+    }
+
+    /// Waits for the end of the supervisor and of those attached, which must succeed.
+    ///
+    /// # Panics
+    /// When the time is up, or one attached failed.
+    pub fn wait(mut self) -> Ended {
+        let status = loop {
+            if let Some(status) = self.supervisor.try_wait().unwrap() {
+                break status;
+            }
+            assert!(Instant::now() < self.deadline, "it does not end:\n{}", self.stderr());
+            sleep(LOOK);
+        };
+        for attached in &mut self.attached {
+            // It ends with the run, unless it hangs: then its end is not waited for here.
+            let end = Instant::now() + Duration::from_secs(20);
+            while attached.try_wait().unwrap().is_none() && Instant::now() < end {
+                sleep(LOOK);
+            }
+            let status = attached.try_wait().unwrap();
+            assert!(
+                status.is_some_and(|status| status.success()),
+                "skein attach: {status:?}"
+            );
+        }
+        let left = leftovers(&self.directory);
+        let folder = self.folder.take().expect("it is taken only here");
+        let read = |name| fs::read(folder.path().join(name)).unwrap();
+        Ended {
+            output: Output::of(status, &read("stdout"), &read("stderr")),
+            directory: self.directory.clone(),
+            left,
+            _folder: folder,
+        }
+    }
+
+    /// Waits for the end and requires that the run succeeded and left nothing behind.
+    ///
+    /// # Panics
+    /// When it did not.
+    pub fn finish(self) -> Ended {
+        let ended = self.wait();
+        assert_eq!(ended.output.code, Some(0), "{}", ended.output.stderr);
+        ended.assert_nothing_is_left();
+        ended
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // Nothing here may panic: a test that failed comes through here.
+        let _ = self.supervisor.kill();
+        let _ = self.supervisor.wait();
+        let end = Instant::now() + Duration::from_secs(10);
+        loop {
+            let left = processes_of(&self.directory);
+            left.iter().for_each(|process| process.signal(Signal::KILL));
+            if left.is_empty() || Instant::now() > end {
+                break;
+            }
+            sleep(LOOK);
+        }
+        for attached in &mut self.attached {
+            let _ = attached.wait();
+        }
+        if let Ok((identity, _)) = self.directory.open() {
+            identity.remove_transport();
+        }
+    }
+}
+
+/// A run that has ended. Its directory is removed when it goes out of scope.
+#[derive(Debug)]
+pub struct Ended {
+    /// How the supervisor ended.
+    pub output: Output,
+    /// The run's directory.
+    pub directory: RunDirectory,
+    left: Vec<String>,
+    _folder: TempDir,
+}
+
+impl Ended {
+    /// Requires that no process, shared memory or socket was left the moment the supervisor had ended.
+    ///
+    /// # Panics
+    /// When something was.
+    pub fn assert_nothing_is_left(&self) {
+        assert!(self.left.is_empty(), "left behind: {:#?}", self.left);
+    }
+
+    /// `summary.json`.
+    ///
+    /// # Panics
+    /// When it is not there or malformed.
+    pub fn summary(&self) -> Summary {
+        json(self.directory.summary_json())
+    }
+
+    /// `evaluation.json`.
+    ///
+    /// # Panics
+    /// As [`Ended::summary`].
+    pub fn evaluation(&self) -> EvaluationReport {
+        json(self.directory.evaluation_json())
+    }
+
+    /// `flights.csv`.
+    ///
+    /// # Panics
+    /// When it is malformed.
+    pub fn flights(&self) -> Vec<Flight> {
+        flights(&self.directory)
+    }
+
+    /// What must be the same however the run was flown.
+    ///
+    /// # Panics
+    /// As [`Ended::summary`].
+    pub fn learned(&self) -> Learned {
+        Learned::of(&self.directory, &self.summary())
+    }
+}
+
+fn json<T: DeserializeOwned>(path: PathBuf) -> T {
+    let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}

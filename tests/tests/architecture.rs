@@ -1,0 +1,110 @@
+//! Who may depend on whom. A package exists where a heavy dependency is fenced in; here is the fence.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+
+use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, PackageId};
+use skein_tests::repository;
+
+/// The folders a reader finds, and no others.
+const FOLDERS: [&str; 6] = ["actor", "configs", "launch", "learner", "protocol", "tests"];
+
+/// Whether programs alone are asked, or their tests too.
+#[derive(Clone, Copy, PartialEq)]
+enum Of {
+    Programs,
+    Tests,
+}
+
+/// Names of everything that `package` depends on, directly or not.
+fn dependencies(metadata: &Metadata, package: &str, of: Of) -> BTreeSet<String> {
+    let resolve = metadata.resolve.as_ref().unwrap();
+    let nodes: BTreeMap<&PackageId, _> = resolve.nodes.iter().map(|node| (&node.id, node)).collect();
+    let packages = metadata.workspace_packages();
+    let start = packages.iter().find(|found| found.name.as_str() == package).unwrap();
+    let mut seen: BTreeSet<&PackageId> = BTreeSet::new();
+    let mut to_see = vec![&start.id];
+    while let Some(id) = to_see.pop() {
+        for dependency in &nodes[id].deps {
+            // A dependency's own tests are nobody's business.
+            let for_tests = id == &start.id && of == Of::Tests;
+            let counts = dependency
+                .dep_kinds
+                .iter()
+                .any(|kind| for_tests || kind.kind != DependencyKind::Development);
+            if counts && seen.insert(&dependency.pkg) {
+                to_see.push(&dependency.pkg);
+            }
+        }
+    }
+    seen.iter().map(|id| metadata[id].name.to_string()).collect()
+}
+
+fn metadata() -> Metadata {
+    MetadataCommand::new()
+        .manifest_path(repository().join("Cargo.toml"))
+        // What this machine builds is all here already; what other platforms would build may not be.
+        .other_options(["--locked", "--offline", "--filter-platform", env!("SKEIN_TARGET")].map(str::to_owned))
+        .exec()
+        .unwrap()
+}
+
+#[test]
+fn every_package_keeps_to_its_side_of_the_fence() {
+    let metadata = metadata();
+    let of_ours: BTreeSet<String> = metadata
+        .workspace_packages()
+        .iter()
+        .map(|package| package.name.to_string())
+        .collect();
+    let torch = ["tch", "torch-sys"];
+    let physics = ["rapier3d", "parry3d"];
+    for (package, allowed, forbidden) in [
+        ("skein-simulator", &[][..], [&torch[..], &["iceoryx2"]].concat()),
+        ("skein-protocol", &[], [torch, physics].concat()),
+        ("skein-actor", &["skein-protocol", "skein-simulator"], torch.to_vec()),
+        ("skein-learner", &["skein-protocol"], physics.to_vec()),
+        ("skein-launch", &["skein-protocol", "skein-simulator"], torch.to_vec()),
+    ] {
+        for of in [Of::Programs, Of::Tests] {
+            let found = dependencies(&metadata, package, of);
+            let ours: Vec<_> = found.intersection(&of_ours).map(String::as_str).collect();
+            assert_eq!(ours, allowed, "packages of ours that {package} depends on");
+            for fenced in &forbidden {
+                assert!(!found.contains(*fenced), "{package} depends on {fenced}");
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_fenced_in_is_found_where_it_belongs() {
+    let metadata = metadata();
+    for (package, inside) in [
+        ("skein-learner", "tch"),
+        ("skein-simulator", "rapier3d"),
+        ("skein-protocol", "iceoryx2"),
+        ("skein-actor", "rapier3d"),
+    ] {
+        assert!(
+            dependencies(&metadata, package, Of::Programs).contains(inside),
+            "{package} does not depend on {inside}: the test of the fence sees nothing"
+        );
+    }
+}
+
+#[test]
+fn the_top_level_has_the_fixed_folders_and_no_others() {
+    let target = metadata().target_directory;
+    let found: BTreeSet<String> = fs::read_dir(repository())
+        .unwrap()
+        .map(|entry| entry.unwrap())
+        .filter(|entry| entry.path().is_dir() && entry.path() != target.as_std_path())
+        .map(|entry| entry.file_name().into_string().unwrap())
+        // Where runs go, and builds that went elsewhere; neither is in the repository.
+        .filter(|name| !name.starts_with('.') && name != "runs" && name != "target")
+        .collect();
+    assert_eq!(found, FOLDERS.map(str::to_owned).into_iter().collect());
+}

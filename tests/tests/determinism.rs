@@ -1,0 +1,87 @@
+//! Training is a function of configuration and seed: who flies, how many fly, and who dies meanwhile, changes nothing.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::collections::BTreeSet;
+
+use rustix::process::Signal;
+use skein_tests::{Ended, Process, Recipe, processes_of};
+
+/// The actors that flew training flights.
+fn crew(run: &Ended) -> BTreeSet<u32> {
+    run.flights().iter().map(|flight| flight.actor).collect()
+}
+
+#[test]
+fn one_two_and_four_actors_and_one_attached_half_way_learn_the_same_bit_for_bit() {
+    let alone = Recipe::smoke().actors(1).finish();
+    for actors in [2, 4] {
+        let run = Recipe::smoke().actors(actors).finish();
+        assert!(
+            crew(&run).len() > 1,
+            "of {actors} actors only one flew: nothing was compared"
+        );
+        run.learned().assert_same(&alone.learned(), &format!("{actors} actors"));
+    }
+    let mut run = Recipe::smoke().actors(1).start();
+    run.until_flights(alone.flights().len() / 2);
+    run.attach();
+    let joined = run.finish();
+    assert_eq!(
+        crew(&joined),
+        BTreeSet::from([0, 1]),
+        "the attached actor flew nothing: nothing was compared"
+    );
+    joined
+        .learned()
+        .assert_same(&alone.learned(), "an actor attached half-way");
+}
+
+#[test]
+fn actors_that_fly_while_the_learner_updates_change_nothing_either() {
+    let lagging = || Recipe::small().set("learning.policy_lag=1");
+    let alone = lagging().actors(1).finish();
+    let together = lagging().actors(3).finish();
+    assert!(crew(&together).len() > 1, "only one actor flew: nothing was compared");
+    together.learned().assert_same(&alone.learned(), "three actors");
+}
+
+#[test]
+fn an_actor_killed_in_the_middle_changes_nothing() {
+    let undisturbed = Recipe::small().finish();
+    let mut run = Recipe::small().start();
+    run.until_flights(10);
+    let victim = run.until("actor 0 flew", |run| actor(run.directory(), 0));
+    victim.signal(Signal::KILL);
+    let successor = run.until("actor 0 was started again", |run| {
+        actor(run.directory(), 0).filter(|actor| actor.pid != victim.pid)
+    });
+    successor.signal(Signal::KILL);
+    let disturbed = run.finish();
+    assert!(
+        disturbed.output.stderr.contains("killed by signal 9"),
+        "{}",
+        disturbed.output.stderr
+    );
+    disturbed
+        .learned()
+        .assert_same(&undisturbed.learned(), "an actor killed twice");
+}
+
+fn actor(run: &skein_protocol::run::RunDirectory, id: u32) -> Option<Process> {
+    processes_of(run)
+        .into_iter()
+        .find(|process| process.runs("skein-actor") && process.command.ends_with(&arguments(id)))
+}
+
+/// The end of an actor's command line; the kernel ends it with an empty string.
+fn arguments(id: u32) -> [String; 3] {
+    ["--id".to_owned(), id.to_string(), String::new()]
+}
+
+#[test]
+fn another_seed_learns_something_else() {
+    let one = Recipe::small().set("run.seed=1").finish().learned();
+    let two = Recipe::small().set("run.seed=2").finish().learned();
+    assert_ne!(one.policy_sha256(), two.policy_sha256());
+}

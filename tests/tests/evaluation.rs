@@ -1,0 +1,138 @@
+//! `skein-evaluate` on a run's snapshot gives the numbers that the run itself gave, and records what it flew.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::Path;
+
+use skein_protocol::evaluation::EvaluationReport;
+use skein_tests::{Ended, Recipe, run_program};
+
+/// Evaluates with `arguments` and returns the report.
+fn evaluate(folder: &Path, arguments: &[&str]) -> EvaluationReport {
+    let json = folder.join("report.json");
+    let output = run_program(
+        "skein-evaluate",
+        &[arguments, &["--json", json.to_str().unwrap()]].concat(),
+    );
+    assert_eq!(output.code, Some(0), "{}", output.stderr);
+    serde_json::from_str(&fs::read_to_string(json).unwrap()).unwrap()
+}
+
+#[test]
+fn a_runs_snapshot_flies_later_as_it_flew_in_the_run() {
+    let run = Recipe::small().set("evaluation.flights=8").finish();
+    let in_the_run = run.evaluation();
+    let directory = run.directory.root().to_str().unwrap();
+    let best = run.directory.best_snapshot();
+    let folder = tempfile::tempdir().unwrap();
+
+    for threads in ["1", "2", "5"] {
+        let later = evaluate(folder.path(), &["--run", directory, "--threads", threads]);
+        assert_eq!(later, in_the_run, "--run on {threads} threads");
+    }
+    let later = evaluate(folder.path(), &["--snapshot", best.to_str().unwrap()]);
+    assert_eq!(later, in_the_run, "--snapshot");
+    // The first flights do not depend on how many follow.
+    let fewer = evaluate(folder.path(), &["--run", directory, "--flights", "3"]);
+    assert!(fewer.courses.iter().all(|course| course.flights == 3));
+    assert_ne!(fewer, in_the_run);
+
+    a_recording_holds_every_step_of_every_flight(&run, folder.path());
+}
+
+/// Read as NumPy documents its format, without any of our code.
+fn a_recording_holds_every_step_of_every_flight(run: &Ended, folder: &Path) {
+    let file = folder.join("flights.npz");
+    evaluate(
+        folder,
+        &[
+            "--run",
+            run.directory.root().to_str().unwrap(),
+            "--record",
+            file.to_str().unwrap(),
+        ],
+    );
+    let closing = array(&file, "closing", "|u1");
+    let rows = closing.shape[0];
+    for (name, kind, row) in [
+        ("course", "<i4", &[][..]),
+        ("flight", "<i4", &[]),
+        ("step", "<i4", &[]),
+        ("position_m", "<f4", &[3]),
+        ("orientation", "<f4", &[4]),
+        ("velocity_mps", "<f4", &[3]),
+        ("depth", "|u1", &[72, 128]),
+        ("latent", "<f4", &[32]),
+        ("action", "<f4", &[2]),
+        ("reward_terms", "<f4", &[4]),
+        ("reward", "<f4", &[]),
+        ("walls_passed", "|u1", &[]),
+        ("terminated", "|u1", &[]),
+        ("truncated", "|u1", &[]),
+    ] {
+        let array = array(&file, name, kind);
+        assert_eq!(array.shape, [&[rows], row].concat(), "{name}");
+    }
+    let flights = closing.data.iter().filter(|&&closing| closing == 1).count();
+    assert_eq!(flights, 16, "eight flights on each of two courses");
+
+    // The rewards of all flights on the first course are those of the report.
+    let evaluation = run.evaluation();
+    let (course, reward) = (array(&file, "course", "<i4"), array(&file, "reward", "<f4"));
+    let total: f64 = course
+        .words()
+        .zip(reward.words())
+        .filter(|(course, _)| i32::from_le_bytes(*course) == 0)
+        .map(|(_, reward)| f64::from(f32::from_le_bytes(reward)))
+        .sum();
+    let reported = evaluation.courses[0].mean_return * 8.0;
+    assert!((total - reported).abs() < 1e-3, "recorded {total}, reported {reported}");
+}
+
+/// An array of a recording.
+struct Array {
+    shape: Vec<usize>,
+    data: Vec<u8>,
+}
+
+impl Array {
+    /// Its values of four bytes.
+    fn words(&self) -> impl Iterator<Item = [u8; 4]> {
+        self.data.chunks_exact(4).map(|word| word.try_into().unwrap())
+    }
+}
+
+/// Reads `name` from a `.npz` file: a zip of `.npy` files, whose header is a Python dictionary. Source: numpy.lib.format, version 1.0.
+fn array(file: &Path, name: &str, kind: &str) -> Array {
+    let mut zip = zip::ZipArchive::new(File::open(file).unwrap()).unwrap();
+    let mut bytes = Vec::new();
+    let mut entry = zip
+        .by_name(&format!("{name}.npy"))
+        .unwrap_or_else(|_| panic!("no array {name}"));
+    entry.read_to_end(&mut bytes).unwrap();
+    assert_eq!(&bytes[..8], b"\x93NUMPY\x01\x00", "{name}");
+    let data = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
+    let header = std::str::from_utf8(&bytes[10..data]).unwrap();
+    assert!(header.contains(&format!("'descr': '{kind}'")), "{name}: {header}");
+    assert!(header.contains("'fortran_order': False"), "{name}: {header}");
+    let (_, shape) = header.split_once("'shape': (").unwrap();
+    let (shape, _) = shape.split_once(')').unwrap();
+    let shape: Vec<usize> = shape
+        .split(',')
+        .map(str::trim)
+        .filter(|axis| !axis.is_empty())
+        .map(|axis| axis.parse().unwrap())
+        .collect();
+    let bytes_per_value: usize = kind[2..].parse().unwrap();
+    assert_eq!(
+        bytes.len() - data,
+        shape.iter().product::<usize>() * bytes_per_value,
+        "{name}: {header}"
+    );
+    Array {
+        shape,
+        data: bytes.split_off(data),
+    }
+}

@@ -1,0 +1,110 @@
+//! How a run ends before its time: in order, at once, or with its supervisor; and that nothing is left behind.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+use skein_protocol::snapshot::Snapshot;
+use skein_protocol::summary::Ending;
+use skein_tests::{Recipe, Running, leftovers, processes_of};
+
+/// What a shell reports of a program that Ctrl-C ended: 128 + SIGINT.
+const INTERRUPTED: i32 = 130;
+
+/// A run that would go on for hours, some way into it.
+fn long_run() -> Running {
+    let mut run = Recipe::small().set("run.flights=1000000").start();
+    run.until_flights(20);
+    run
+}
+
+#[test]
+fn the_first_interruption_saves_everything_learned() {
+    let run = long_run();
+    run.signal(Signal::INT);
+    let ended = run.wait();
+    assert_eq!(ended.output.code, Some(INTERRUPTED), "{}", ended.output.stderr);
+    ended.assert_nothing_is_left();
+
+    let summary = ended.summary();
+    assert_eq!(summary.ending, Ending::Interrupted);
+    assert!(summary.flights >= 20 && summary.updates > 0, "{summary:?}");
+    let (latest, _) = Snapshot::load(&ended.directory.latest_snapshot()).unwrap();
+    assert_eq!(latest.sha256(), summary.policy_sha256);
+    assert_eq!(
+        ended.flights().len() as u64,
+        summary.flights,
+        "flights that were not learned from are listed, or the reverse"
+    );
+    let checkpoint = ended
+        .directory
+        .checkpoints()
+        .join(format!("flight-{}", summary.flights));
+    assert!(checkpoint.join("manifest.json").is_file(), "no {checkpoint:?}");
+    for plot in ["return.png", "walls_passed.png"] {
+        assert!(
+            ended.directory.plots().join(plot).is_file(),
+            "{plot} could have been drawn"
+        );
+    }
+    assert!(
+        ended.output.stdout.contains("Interrupted after"),
+        "{}",
+        ended.output.stdout
+    );
+}
+
+#[test]
+fn the_second_interruption_ends_the_run_at_once() {
+    let mut run = long_run();
+    // A learner that cannot stop in order, now or ever.
+    let processes = processes_of(run.directory());
+    let learner = processes.iter().find(|process| process.runs("skein-learner")).unwrap();
+    learner.signal(Signal::STOP);
+    run.signal(Signal::INT);
+    run.until("the first interruption was heeded", |run| {
+        run.stderr().contains("stopping in order").then_some(())
+    });
+    run.signal(Signal::INT);
+    let begun = Instant::now();
+    let ended = run.wait();
+    assert_eq!(ended.output.code, Some(INTERRUPTED), "{}", ended.output.stderr);
+    ended.assert_nothing_is_left();
+    assert!(
+        begun.elapsed() < Duration::from_secs(10),
+        "it took {:?}",
+        begun.elapsed()
+    );
+    assert!(!ended.directory.summary_json().exists());
+}
+
+#[test]
+fn no_process_outlives_a_killed_supervisor() {
+    let run = long_run();
+    let directory = run.directory().clone();
+    assert_eq!(processes_of(&directory).len(), 4, "supervisor, learner, two actors");
+    run.signal(Signal::KILL);
+    let begun = Instant::now();
+    // The learner still saves what was learned.
+    while !processes_of(&directory).is_empty() {
+        assert!(
+            begun.elapsed() < Duration::from_secs(60),
+            "still there: {:?}",
+            leftovers(&directory)
+        );
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    assert!(directory.summary_json().is_file(), "the learner saved nothing");
+}
+
+#[test]
+fn a_learner_that_dies_ends_the_run_as_failed_and_nothing_is_left() {
+    let run = long_run();
+    let processes = processes_of(run.directory());
+    let learner = processes.iter().find(|process| process.runs("skein-learner")).unwrap();
+    learner.signal(Signal::KILL);
+    let ended = run.wait();
+    ended.output.assert_refused(&["learner", "killed by signal 9"]);
+    ended.assert_nothing_is_left();
+}

@@ -1,0 +1,138 @@
+//! What cannot be done is refused with one line that says what to change, and nothing is left of the attempt.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::fs;
+use std::path::Path;
+
+use skein_tests::{Output, Recipe, repository, run_program};
+use tempfile::TempDir;
+
+/// `skein run` with a configuration of its own, which must not come to life.
+struct Attempt {
+    folder: TempDir,
+}
+
+impl Attempt {
+    /// With `tests/small.toml`, and `more` behind it.
+    fn new(more: &str) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let courses = repository().join("configs/courses");
+        let text = fs::read_to_string(repository().join("tests/small.toml"))
+            .unwrap()
+            .replace("../configs/courses", courses.to_str().unwrap());
+        fs::write(folder.path().join("mine.toml"), text + more).unwrap();
+        Self { folder }
+    }
+
+    fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
+    fn run(&self, arguments: &[&str]) -> Output {
+        let (config, run) = (self.path().join("mine.toml"), self.path().join("run"));
+        let basic = [
+            "run",
+            "--config",
+            config.to_str().unwrap(),
+            "--run-dir",
+            run.to_str().unwrap(),
+            "--actors",
+            "1",
+        ];
+        run_program("skein", &[&basic, arguments].concat())
+    }
+
+    fn assert_refused(&self, arguments: &[&str], parts: &[&str]) {
+        self.run(arguments).assert_refused(parts);
+        assert!(
+            !self.path().join("run").exists(),
+            "a directory was made for a run that cannot be"
+        );
+    }
+}
+
+#[test]
+fn a_directory_that_is_not_empty() {
+    let attempt = Attempt::new("");
+    let run = attempt.path().join("run");
+    fs::create_dir(&run).unwrap();
+    fs::write(run.join("precious"), "data").unwrap();
+    attempt
+        .run(&[])
+        .assert_refused(&[run.to_str().unwrap(), "not empty", "--run-dir"]);
+    assert_eq!(fs::read_dir(&run).unwrap().count(), 1, "something was put beside it");
+}
+
+#[test]
+fn an_unknown_key_section_or_setting() {
+    Attempt::new("[replay]\ncapcity = 1000\n").assert_refused(&[], &["mine.toml", "[replay]", "capcity"]);
+    Attempt::new("[replays]\n").assert_refused(&[], &["mine.toml", "[replays]"]);
+    Attempt::new("[simulator.camera]\nzoom = 2\n").assert_refused(&[], &["mine.toml", "[simulator]", "zoom"]);
+    let sound = Attempt::new("");
+    sound.assert_refused(&["--set", "run.sede=1"], &["[run]", "sede"]);
+    sound.assert_refused(&["--set", "seed=1"], &["--set seed=1", "section.key=value"]);
+    sound.assert_refused(&["--set", "run.flights=many"], &["[run]", "flights"]);
+    sound.assert_refused(
+        &["--set", "learning.policy_lag=2"],
+        &["learning.policy_lag = 2", "above 1"],
+    );
+}
+
+#[test]
+fn a_configuration_or_course_that_is_not_there() {
+    let attempt = Attempt::new("");
+    attempt.assert_refused(&["--config", "/nowhere/mine.toml"], &["/nowhere/mine.toml"]);
+    attempt.assert_refused(
+        &["--set", "courses.training=/nowhere/course.toml"],
+        &["/nowhere/course.toml"],
+    );
+}
+
+#[test]
+fn a_course_that_cannot_be_flown() {
+    let attempt = Attempt::new("");
+    let shipped = fs::read_to_string(repository().join("configs/courses/training.toml")).unwrap();
+    let bent = attempt.path().join("bent.toml");
+    let set = format!("courses.training={}", bent.display());
+    let refused = |from: &str, to: &str, parts: &[&str]| {
+        let text = shipped.replacen(from, to, 1);
+        assert_ne!(text, shipped, "`{from}` is not in the shipped course");
+        fs::write(&bent, text).unwrap();
+        attempt.assert_refused(&["--set", &set], &[&["bent.toml"], parts].concat());
+    };
+    refused("width_m = 2.2", "width_m = 0.1", &["wall 1", "width_m = 0.1", "drone"]);
+    refused("centre_m = ", "centre_m = [2.9, 3.5] # ", &["wall 1", "centre_m"]);
+
+    // An unknown key is shown where it stands, on lines of its own.
+    fs::write(&bent, shipped.replacen("width_m = 2.2", "girth_m = 2.2", 1)).unwrap();
+    let output = attempt.run(&["--set", &set]);
+    output.assert_refused(&["bent.toml", "wall 1"]);
+    assert!(output.stderr.contains("unknown field `girth_m`"), "{}", output.stderr);
+}
+
+#[test]
+fn a_device_that_this_machine_does_not_have() {
+    let run = Recipe::small().set("run.device=cuda:7").start().wait();
+    assert_eq!(run.output.code, Some(1));
+    run.output.assert_refused(&["cuda:7", "cpu"]);
+    run.assert_nothing_is_left();
+}
+
+#[test]
+fn an_actor_for_a_run_that_is_not_there_or_over() {
+    run_program("skein", &["attach", "--run", "/nowhere/run"]).assert_refused(&["/nowhere/run"]);
+    let empty = tempfile::tempdir().unwrap();
+    let directory = empty.path().to_str().unwrap();
+    run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory]);
+    let over = Recipe::small().set("run.flights=1").finish();
+    let directory = over.directory.root().to_str().unwrap();
+    run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory, "not under way"]);
+}
+
+#[test]
+fn an_evaluation_of_nothing() {
+    run_program("skein-evaluate", &["--run", "/nowhere/run"]).assert_refused(&["/nowhere/run"]);
+    run_program("skein-evaluate", &["--snapshot", "/nowhere/best.safetensors"])
+        .assert_refused(&["/nowhere/best.safetensors"]);
+}

@@ -1,0 +1,82 @@
+//! The configurations that are shipped can be run, and the faithful one is the paper's.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use skein_protocol::config::{Config, Observation};
+use skein_simulator::course::Course;
+use skein_simulator::simulator::{Simulator, SimulatorSettings};
+use skein_simulator::vehicle::Preset;
+use skein_tests::repository;
+
+fn shipped() -> Vec<PathBuf> {
+    let mut files: Vec<_> = std::fs::read_dir(repository().join("configs"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.is_file())
+        .collect();
+    files.sort();
+    files
+}
+
+fn load(name: &str) -> Config {
+    Config::load(&repository().join("configs").join(name), &[]).unwrap()
+}
+
+#[test]
+fn the_three_configurations_are_there() {
+    let names: Vec<_> = shipped()
+        .iter()
+        .map(|path| path.file_name().unwrap().to_str().unwrap().to_owned())
+        .collect();
+    assert_eq!(names, ["local.toml", "paper.toml", "smoke.toml"]);
+}
+
+#[test]
+fn every_shipped_configuration_can_be_flown_as_it_stands() {
+    for file in shipped() {
+        let config = Config::load(&file, &[]).unwrap();
+        let settings: SimulatorSettings = toml::Value::Table(config.simulator)
+            .try_into()
+            .unwrap_or_else(|error| panic!("{}: {error}", file.display()));
+        for path in config.courses.evaluation.iter().chain([&config.courses.training]) {
+            let course = Arc::new(Course::load(path).unwrap());
+            assert!(
+                course.walls().len() >= usize::from(config.learning.levels),
+                "{}: more start levels than {} has walls",
+                file.display(),
+                path.display()
+            );
+            Simulator::new(course, &settings).unwrap();
+        }
+        Course::generate(0, &settings.generator).unwrap();
+        assert!((settings.max_steps as usize) < config.transport.max_records_per_flight);
+    }
+}
+
+#[test]
+fn the_faithful_configuration_is_the_papers() {
+    let paper = load("paper.toml");
+    assert_eq!(paper.run.flights, 4000);
+    assert_eq!(paper.learning.flights_per_epoch, 1);
+    assert_eq!(paper.learning.policy_lag, 0);
+    assert_eq!(paper.learning.warmup_steps, 2000);
+    assert_eq!(paper.learning.flights_per_level, 10);
+    assert_eq!(paper.learning.levels, 5);
+    assert_eq!(paper.learning.observation, Observation::Latent);
+    assert_eq!(paper.vae.train_steps, 10_000);
+    assert_eq!(paper.replay.capacity, 131_072);
+    assert_eq!(paper.replay.success_share, 0.125);
+    assert_eq!(paper.evaluation.window_flights, 50);
+    assert_eq!(paper.evaluation.flights, 100);
+    assert_eq!(paper.courses.generated_share, 0.0);
+    assert_eq!(
+        paper.courses.evaluation.len(),
+        4,
+        "training order, two rearranged, non-rectangular"
+    );
+    let settings: SimulatorSettings = toml::Value::Table(paper.simulator).try_into().unwrap();
+    assert_eq!(settings.vehicle.preset, Preset::Airsim);
+}

@@ -1,0 +1,232 @@
+//! What a run leaves in its directory, file by file, as it was promised; and nothing anywhere else.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+use skein_protocol::config::Config;
+use skein_protocol::snapshot::Snapshot;
+use skein_protocol::summary::Ending;
+use skein_tests::{Ended, Recipe};
+
+#[test]
+fn a_completed_run_leaves_what_it_promises() {
+    let run = Recipe::small().set("run.seed=7").finish();
+    the_configuration_is_resolved(&run);
+    the_flights_have_the_promised_columns(&run);
+    the_summary_agrees_with_the_flights(&run);
+    the_snapshots_are_those_of_the_summary(&run);
+    the_evaluation_is_of_the_best_snapshot(&run);
+    the_newest_checkpoint_is_of_the_end(&run);
+    the_curves_are_in_an_event_file(&run);
+    the_plots_show_something(&run);
+    every_process_has_its_log(&run);
+    the_conclusion_shows_the_table_and_the_paths(&run);
+}
+
+fn the_configuration_is_resolved(run: &Ended) {
+    let text = fs::read_to_string(run.directory.config()).unwrap();
+    let config: toml::Table = toml::from_str(&text).unwrap();
+    assert_eq!(config["run"]["seed"].as_integer(), Some(7));
+    assert_eq!(config["sac"]["hidden_width"].as_integer(), Some(32), "set in the file");
+    assert!(config["sac"]["discount"].is_float(), "a default that nobody set");
+    assert!(
+        text.contains(env!("CARGO_PKG_VERSION")),
+        "the version is missing:\n{text}"
+    );
+    // What it names is in the directory too.
+    let config = Config::load(&run.directory.config(), &[]).unwrap();
+    for course in config.courses.evaluation.iter().chain([&config.courses.training]) {
+        assert!(
+            course.starts_with(run.directory.courses()) && course.is_file(),
+            "{course:?}"
+        );
+    }
+}
+
+fn the_flights_have_the_promised_columns(run: &Ended) {
+    let text = fs::read_to_string(run.directory.flights_csv()).unwrap();
+    assert_eq!(
+        text.lines().next(),
+        Some("flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome")
+    );
+    let flights = run.flights();
+    assert_eq!(flights.len(), 40);
+    for (number, flight) in (0u64..).zip(&flights) {
+        // Ten flights from each level in turn.
+        assert_eq!(u64::from(flight.level), number / 10 % 5 + 1, "{flight:?}");
+        assert!((1..=160).contains(&flight.steps), "{flight:?}");
+        assert!(flight.walls_passed <= 5, "{flight:?}");
+        assert!(flight.r#return.parse::<f32>().unwrap().is_finite(), "{flight:?}");
+        assert!(
+            ["collided", "reached_end", "timed_out"].contains(&flight.outcome.as_str()),
+            "{flight:?}"
+        );
+    }
+}
+
+fn the_summary_agrees_with_the_flights(run: &Ended) {
+    let (summary, flights) = (run.summary(), run.flights());
+    assert_eq!(summary.skein_version, env!("CARGO_PKG_VERSION"));
+    assert_eq!(summary.seed, 7);
+    assert_eq!(summary.ending, Ending::Completed);
+    assert_eq!(summary.final_version.0, 4);
+    assert_eq!(summary.flights, flights.len() as u64);
+    assert_eq!(summary.steps, flights.iter().map(|flight| flight.steps).sum::<u64>());
+    assert!(summary.updates > 0 && summary.vae_updates > 0, "{summary:?}");
+    // Three on each of two courses, and at least one that confirmed the best snapshot.
+    assert!(summary.evaluation_flights > 6, "{summary:?}");
+    let accounted: f64 = summary.phase_secs.values().sum();
+    assert!(
+        summary.phase_secs.len() >= 5 && accounted > 0.0 && accounted <= summary.wall_secs,
+        "{summary:?}"
+    );
+}
+
+fn the_snapshots_are_those_of_the_summary(run: &Ended) {
+    let summary = run.summary();
+    let (latest, _) = Snapshot::load(&run.directory.latest_snapshot()).unwrap();
+    assert_eq!(latest.version, summary.final_version);
+    assert_eq!(latest.sha256(), summary.policy_sha256);
+    let (best, config) = Snapshot::load(&run.directory.best_snapshot()).unwrap();
+    assert_eq!(Some(best.version), summary.best_version);
+    assert_eq!(config.run.seed, 7, "a snapshot carries its configuration");
+}
+
+fn the_evaluation_is_of_the_best_snapshot(run: &Ended) {
+    let evaluation = run.evaluation();
+    let (best, _) = Snapshot::load(&run.directory.best_snapshot()).unwrap();
+    assert_eq!(evaluation.policy_version, best.version);
+    assert_eq!(evaluation.policy_sha256, best.sha256());
+    let names: Vec<_> = evaluation.courses.iter().map(|course| course.course.as_str()).collect();
+    assert_eq!(names, ["training", "non_rectangular"]);
+    for course in &evaluation.courses {
+        assert_eq!(course.flights, 3);
+        assert_eq!(course.walls_passed.len(), 5);
+        let rate = course.walls_passed.iter().sum::<u64>() as f64 / 15.0;
+        assert!((course.r - rate).abs() < 1e-9, "{course:?}");
+        let ended = course.collided + course.timed_out + (course.completed * 3.0).round() as u64;
+        assert_eq!(ended, 3, "{course:?}");
+    }
+}
+
+fn the_newest_checkpoint_is_of_the_end(run: &Ended) {
+    assert_eq!(
+        names_in(&run.directory.checkpoints()),
+        BTreeSet::from(["flight-20".to_owned(), "flight-40".to_owned()])
+    );
+}
+
+/// A record of an event file is its length, a checksum, the event, and a checksum. The first event names the format; curves go by their names.
+fn the_curves_are_in_an_event_file(run: &Ended) {
+    let folder = run.directory.tensorboard();
+    let names = names_in(&folder);
+    assert!(
+        names.len() == 1 && names.iter().all(|name| name.contains("tfevents")),
+        "{names:?}"
+    );
+    let bytes = fs::read(folder.join(names.first().unwrap())).unwrap();
+    let mut events = Vec::new();
+    let mut rest = bytes.as_slice();
+    while !rest.is_empty() {
+        let (length, after) = rest.split_first_chunk::<8>().unwrap();
+        let (event, after) = after[4..].split_at(u64::from_le_bytes(*length) as usize);
+        events.push(event);
+        rest = &after[4..];
+    }
+    let holds = |event: &[u8], text: &str| event.windows(text.len()).any(|part| part == text.as_bytes());
+    assert!(holds(events[0], "brain.Event:2"));
+    for (curve, least) in [
+        ("flight/return", 40),
+        ("window/walls_passed", 40),
+        ("sac/critic_loss", 1),
+        ("sac/temperature", 1),
+        ("vae/loss", 1),
+        ("replay/success_transitions", 4),
+    ] {
+        let points = events.iter().filter(|event| holds(event, curve)).count();
+        assert!(points >= least, "{curve} has {points} points");
+    }
+}
+
+fn the_plots_show_something(run: &Ended) {
+    let plots = [
+        "flight_paths.png",
+        "reconstructions.png",
+        "return.png",
+        "walls_passed.png",
+    ];
+    assert_eq!(
+        names_in(&run.directory.plots()),
+        plots.map(str::to_owned).into_iter().collect()
+    );
+    for plot in plots {
+        let file = fs::File::open(run.directory.plots().join(plot)).unwrap();
+        let mut reader = png::Decoder::new(std::io::BufReader::new(file)).read_info().unwrap();
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+        let info = reader.next_frame(&mut pixels).unwrap();
+        assert!(info.width >= 300 && info.height >= 150, "{plot}: {info:?}");
+        let colours: BTreeSet<_> = pixels.chunks_exact(info.color_type.samples()).collect();
+        assert!(
+            colours.len() > 20,
+            "{plot} has {} colours: it is as good as empty",
+            colours.len()
+        );
+    }
+}
+
+fn every_process_has_its_log(run: &Ended) {
+    for log in ["learner.log", "actor-0.log", "actor-1.log"] {
+        let text = fs::read_to_string(run.directory.logs().join(log)).unwrap();
+        assert!(text.contains("INFO"), "{log} says nothing:\n{text}");
+        assert!(
+            !text.contains("ERROR") && !text.contains("WARN"),
+            "{log} complains:\n{text}"
+        );
+    }
+}
+
+fn the_conclusion_shows_the_table_and_the_paths(run: &Ended) {
+    for part in [
+        "non_rectangular",
+        "flights.csv",
+        "plots/walls_passed.png",
+        "snapshots/best.safetensors",
+    ] {
+        assert!(
+            run.output.stdout.contains(part),
+            "{part} is missing:\n{}",
+            run.output.stdout
+        );
+    }
+}
+
+fn names_in(folder: &Path) -> BTreeSet<String> {
+    fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect()
+}
+
+#[test]
+fn logs_are_as_verbose_and_of_the_format_that_was_asked_for() {
+    let run = Recipe::small()
+        .set("run.flights=10")
+        .actors(1)
+        .environment("RUST_LOG", "debug")
+        .environment("SKEIN_LOG_FORMAT", "json")
+        .finish();
+    for log in ["learner.log", "actor-0.log"] {
+        let text = fs::read_to_string(run.directory.logs().join(log)).unwrap();
+        let levels: BTreeSet<String> = text
+            .lines()
+            .map(|line| {
+                let event: serde_json::Value = serde_json::from_str(line).unwrap();
+                event["level"].as_str().unwrap().to_owned()
+            })
+            .collect();
+        assert!(levels.contains("DEBUG"), "{log} has only {levels:?}");
+    }
+}
