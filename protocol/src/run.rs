@@ -92,7 +92,11 @@ impl RunDirectory {
         ] {
             fs::create_dir_all(&folder).map_err(io(folder.clone()))?;
         }
-        let text = format!("# Resolved by Skein {}.\n\n{}", env!("CARGO_PKG_VERSION"), config.to_toml());
+        let text = format!(
+            "# Resolved by Skein {}.\n\n{}",
+            env!("CARGO_PKG_VERSION"),
+            config.to_toml()
+        );
         fs::write(self.config(), text).map_err(io(self.config()))?;
         let resolved = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
         let identity = RunIdentity::new(&resolved);
