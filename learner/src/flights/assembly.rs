@@ -119,3 +119,82 @@ impl Assembly {
         Ok(std::mem::replace(self, empty).flight)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use bytemuck::Zeroable;
+    use skein_protocol::IMAGE_PIXELS;
+    use skein_protocol::ids::{Attempt, FlightId, PolicyVersion, RunId};
+    use skein_protocol::ticket::{CourseChoice, Exploration};
+
+    use super::*;
+
+    const ACTOR: ActorId = ActorId(2);
+    const LIFE: Incarnation = Incarnation(11);
+    /// Steps of the flight here.
+    const STEPS: u32 = 3;
+
+    fn ticket() -> Ticket {
+        Ticket {
+            run: RunId(1),
+            flight: FlightId(5),
+            attempt: Attempt(0),
+            policy_version: PolicyVersion(3),
+            course: CourseChoice::Training,
+            start_level: 1,
+            exploration: Exploration::Sample,
+            seed: 9,
+        }
+    }
+
+    fn assembly(keep: Keep) -> Assembly {
+        Assembly::new(ticket(), Epoch(0), keep, ACTOR, LIFE)
+    }
+
+    /// Record `step`, its image filled with its number.
+    fn record(step: u32) -> TransitionRecord {
+        let mut record = TransitionRecord::zeroed();
+        record.begin(&ticket(), ACTOR, LIFE, step);
+        record.depth.fill(step as u8);
+        if step == STEPS {
+            record.kind = RecordKind::Closing.code();
+            record.outcome = Outcome::TimedOut.code();
+        }
+        record
+    }
+
+    fn assemble(keep: Keep) -> CommittedFlight {
+        let mut assembly = assembly(keep);
+        for step in 0..STEPS {
+            assert!(matches!(assembly.push(&record(step)), Ok(Assembled::Step)));
+        }
+        match assembly.push(&record(STEPS)) {
+            Ok(Assembled::Whole(flight)) => *flight,
+            other => panic!("the closing record gives {other:?}"),
+        }
+    }
+
+    #[test]
+    fn no_flight_mixes_policy_versions() {
+        for strange in 1..=STEPS {
+            let mut assembly = assembly(Keep::Latents);
+            for step in 0..strange {
+                assembly.push(&record(step)).unwrap();
+            }
+            let mut newer = record(strange);
+            newer.policy_version += 1;
+            let fault = assembly.push(&newer).unwrap_err();
+            let (name, found, expected) = ("policy_version", 4, 3);
+            assert_eq!(fault, RecordFault::Mismatch { name, found, expected });
+        }
+        assert_eq!(assemble(Keep::Latents).policy_version, PolicyVersion(3));
+    }
+
+    #[test]
+    fn depth_images_are_copied_only_for_who_wants_them() {
+        assert_eq!(assemble(Keep::Latents).depth, None);
+        let kept = assemble(Keep::Depth).depth.unwrap();
+        let images: Vec<_> = kept.chunks_exact(IMAGE_PIXELS).map(|image| image.to_vec()).collect();
+        assert_eq!(images, (0..=3).map(|step| vec![step; IMAGE_PIXELS]).collect::<Vec<_>>());
+    }
+}
