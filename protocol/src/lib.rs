@@ -34,3 +34,6 @@ pub const IMAGE_PIXELS: usize = IMAGE_WIDTH * IMAGE_HEIGHT;
 pub const LATENT: usize = 32;
 /// Length of an action: lateral and vertical velocity, each in [-1, 1].
 pub const ACTION: usize = 2;
+/// Bounds of the logarithm of a policy's standard deviation, for actor and learner alike: beyond them tanh saturates or the noise vanishes (as in the
+/// authors' implementation of arXiv:1812.05905).
+pub const LOG_STD: (f32, f32) = (-20.0, 2.0);

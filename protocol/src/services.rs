@@ -228,7 +228,6 @@ impl<'a> Opener<'a> {
             .service_builder(&service_name("weights")?)
             .publish_subscribe::<[u8]>()
             .user_header::<SnapshotHeader>()
-            .payload_alignment(Alignment::new(64).expect("64 is a power of two"))
             .max_publishers(1)
             .max_subscribers(self.actors)
             .max_nodes(self.nodes())

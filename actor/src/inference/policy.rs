@@ -4,13 +4,10 @@
 
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
-use skein_protocol::ACTION;
 use skein_protocol::snapshot::POLICY_LAYERS;
+use skein_protocol::{ACTION, LOG_STD};
 
 use super::matrix::{add_bias, add_bias_relu, multiply, transposed};
-
-/// Bounds of the logarithm of the standard deviation, the same as the learner's: beyond them tanh saturates or the noise vanishes.
-const LOG_STD: (f32, f32) = (-20.0, 2.0);
 
 /// The policy's parameters, arranged for [`Policy::distribution`].
 #[derive(Debug)]

@@ -16,4 +16,4 @@ pub use decoder::Decoder;
 pub use encoder::{Encoder, LOG_VARIANCE_BOUND, pixels};
 pub use flat::{Layout, ParameterSpec, Parameters};
 pub use layers::{Convolution, Linear, TransposedConvolution};
-pub use policy::{LOG_STD_MAX, LOG_STD_MIN, Policy, PolicySample};
+pub use policy::{Policy, PolicySample};

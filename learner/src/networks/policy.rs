@@ -2,15 +2,10 @@
 
 use std::f64::consts::{LN_2, PI};
 
-use skein_protocol::ACTION;
+use skein_protocol::{ACTION, LOG_STD};
 use tch::Tensor;
 
 use super::{Layout, Linear, Parameters};
-
-/// Lower bound of the logarithm of the standard deviation (as in the authors' implementation of arXiv:1812.05905).
-pub const LOG_STD_MIN: f64 = -20.0;
-/// Upper bound of the logarithm of the standard deviation (likewise).
-pub const LOG_STD_MAX: f64 = 2.0;
 
 /// Four fully connected layers with ReLU between (paper, section 3.4); the last gives mean and log standard deviation of a Gaussian, which tanh squashes into
 /// the action (arXiv:1812.05905, appendix C).
@@ -56,7 +51,7 @@ impl Policy {
             output.narrow(1, 0, ACTION as i64),
             output.narrow(1, ACTION as i64, ACTION as i64),
         );
-        (mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX))
+        (mean, log_std.clamp(f64::from(LOG_STD.0), f64::from(LOG_STD.1)))
     }
 
     /// The action without noise, tanh of the mean, `[n, 2]`.
