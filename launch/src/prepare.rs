@@ -111,7 +111,8 @@ pub fn prepare(
     actors: usize,
 ) -> Result<Prepared, PrepareError> {
     let mut config = Config::load(config_file, overrides)?;
-    check(config_file, &config, actors)?;
+    let settings = check(config_file, &config, actors)?;
+    config.simulator = written_out(&settings);
     let root = create_empty(run_directory)?;
     copy_courses(&root, &mut config)?;
     let run = RunDirectory::new(root);
@@ -149,7 +150,15 @@ pub fn load_courses(config: &Config) -> Result<Vec<NamedCourse>, CourseError> {
     config.courses.evaluation.iter().map(load).collect()
 }
 
-fn check(config_file: &Path, config: &Config, actors: usize) -> Result<(), PrepareError> {
+/// The `[simulator]` section with the defaults of all that was not set: what was flown stays known when the defaults change.
+fn written_out(settings: &SimulatorSettings) -> toml::Table {
+    // By way of text: a number of single precision would drag the digits of its double along.
+    let text = toml::to_string(settings).expect("every setting is representable in TOML");
+    toml::from_str(&text).expect("what was written as TOML is TOML")
+}
+
+/// Checks everything, and returns the simulator's settings.
+fn check(config_file: &Path, config: &Config, actors: usize) -> Result<SimulatorSettings, PrepareError> {
     let in_file = || config_file.to_owned();
     let settings: SimulatorSettings =
         config
@@ -186,7 +195,7 @@ fn check(config_file: &Path, config: &Config, actors: usize) -> Result<(), Prepa
             max: config.transport.max_actors,
         });
     }
-    Ok(())
+    Ok(settings)
 }
 
 /// Creates `directory` unless it is there and empty, and returns its absolute path.
@@ -226,6 +235,8 @@ fn copy_courses(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
 
 #[cfg(test)]
 mod tests {
+    use serde::Deserialize;
+
     use super::*;
 
     fn shipped(name: &str) -> PathBuf {
@@ -256,6 +267,15 @@ mod tests {
             Course::load(shipped("training.toml")).unwrap()
         );
         assert_eq!(prepared.run.open().unwrap().0, prepared.identity);
+    }
+
+    #[test]
+    fn the_simulators_defaults_are_written_out_to_the_last_bit() {
+        let mut settings = SimulatorSettings::default();
+        settings.vehicle.control_period_secs = 0.1;
+        let written = written_out(&settings);
+        assert_eq!(written["vehicle"]["control_period_secs"].to_string(), "0.1");
+        assert_eq!(SimulatorSettings::deserialize(written).unwrap(), settings);
     }
 
     #[test]
