@@ -48,10 +48,12 @@ fn actors_that_fly_while_the_learner_updates_change_nothing_either() {
 
 #[test]
 fn an_actor_killed_in_the_middle_changes_nothing() {
-    let undisturbed = Recipe::small().finish();
-    let mut run = Recipe::small().start();
+    // Long enough that the actor's second life falls into the run.
+    let long = || Recipe::small().set("run.flights=150");
+    let undisturbed = long().finish();
+    let mut run = long().start();
     run.until_flights(10);
-    let victim = run.until("actor 0 flew", |run| actor(run.directory(), 0));
+    let victim = actor(run.directory(), 0).unwrap();
     victim.signal(Signal::KILL);
     let successor = run.until("actor 0 was started again", |run| {
         actor(run.directory(), 0).filter(|actor| actor.pid != victim.pid)

@@ -31,7 +31,18 @@ fn the_configuration_is_resolved(run: &Ended) {
     let config: toml::Table = toml::from_str(&text).unwrap();
     assert_eq!(config["run"]["seed"].as_integer(), Some(7));
     assert_eq!(config["sac"]["hidden_width"].as_integer(), Some(32), "set in the file");
-    assert!(config["sac"]["discount"].is_float(), "a default that nobody set");
+    for [section, key] in [["sac", "discount"], ["vae", "kl_weight"]] {
+        assert!(
+            config[section][key].is_float(),
+            "{section}.{key} is a default that nobody set"
+        );
+    }
+    let vehicle = &config["simulator"]["vehicle"];
+    assert_eq!(vehicle["preset"].as_str(), Some("point"), "set in the file");
+    assert!(
+        vehicle["control_period_secs"].is_float() && config["simulator"]["max_steps"].is_integer(),
+        "defaults of the simulator are missing:\n{text}"
+    );
     assert!(
         text.contains(env!("CARGO_PKG_VERSION")),
         "the version is missing:\n{text}"
