@@ -103,8 +103,10 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         courses,
     } = &prepared;
     eprintln!(
-        "skein: {actors} actors, {} training flights, seed {}",
-        config.run.flights, config.run.seed
+        "skein: {actors} {}, {} training flights, seed {}",
+        if actors == 1 { "actor" } else { "actors" },
+        config.run.flights,
+        config.run.seed
     );
     eprintln!("skein: everything goes to {}", run.root().display());
 

@@ -61,6 +61,22 @@ pub enum PrepareError {
         /// The transport's limit.
         records: usize,
     },
+    /// Training would start from a level that its course does not have.
+    #[error(
+        "{}: learning.levels = {levels} is more than the {walls} walls of {}: no flight could start from the last level; set it to {walls} or fewer",
+        config.display(),
+        course
+    )]
+    TooManyLevels {
+        /// The configuration file.
+        config: PathBuf,
+        /// Start levels asked for.
+        levels: u8,
+        /// The course, or the ranges of generated ones.
+        course: String,
+        /// Its walls.
+        walls: u8,
+    },
     /// More actors than the transport has room for.
     #[error("{actors} actors are more than transport.max_actors = {max}: start fewer, or raise it")]
     TooManyActors {
@@ -176,11 +192,18 @@ fn check(config_file: &Path, config: &Config, actors: usize) -> Result<Simulator
             source,
         })?;
     }
+    check_level_count(
+        config_file,
+        config,
+        &Course::load(&config.courses.training)?,
+        &config.courses.training.display(),
+    )?;
     if config.courses.generated_share > 0.0 {
-        Course::generate(0, &settings.generator).map_err(|source| PrepareError::Ranges {
+        let course = Course::generate(0, &settings.generator).map_err(|source| PrepareError::Ranges {
             config: in_file(),
             source,
         })?;
+        check_level_count(config_file, config, &course, &"[simulator.generator] wall_x_m")?;
     }
     let records = config.transport.max_records_per_flight;
     if settings.max_steps as usize + 1 > records {
@@ -196,6 +219,25 @@ fn check(config_file: &Path, config: &Config, actors: usize) -> Result<Simulator
         });
     }
     Ok(settings)
+}
+
+/// Whether training can start from every level it is to start from on `course`, which the user knows as `name`.
+fn check_level_count(
+    config_file: &Path,
+    config: &Config,
+    course: &Course,
+    name: &dyn std::fmt::Display,
+) -> Result<(), PrepareError> {
+    let (levels, walls) = (config.learning.levels, course.levels());
+    if levels <= walls {
+        return Ok(());
+    }
+    Err(PrepareError::TooManyLevels {
+        config: config_file.to_owned(),
+        levels,
+        course: name.to_string(),
+        walls,
+    })
 }
 
 /// Creates `directory` unless it is there and empty, and returns its absolute path.
@@ -221,9 +263,13 @@ fn copy_courses(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
     let mut copies: BTreeMap<OsString, PathBuf> = BTreeMap::new();
     let courses = &mut config.courses;
     for path in courses.evaluation.iter_mut().chain([&mut courses.training]) {
-        let mut name = path.file_name().unwrap_or(path.as_os_str()).to_owned();
-        while copies.get(&name).is_some_and(|original| original != path) {
-            name.push("_");
+        let stem = CoursesSection::name_of(path);
+        let mut name = OsString::from(format!("{stem}.toml"));
+        for number in 2.. {
+            if copies.get(&name).is_none_or(|original| original == path) {
+                break;
+            }
+            name = format!("{stem}_{number}.toml").into();
         }
         let copy = folder.join(&name);
         fs::copy(&*path, &copy).map_err(|source| PrepareError::Io { path: copy, source })?;
@@ -287,7 +333,11 @@ mod tests {
         let set = format!("courses.evaluation=[{:?}, {other:?}]", shipped("training.toml"));
         let prepared = prepare(&config, &[set], &directory.path().join("run"), 1).unwrap();
         assert_eq!(prepared.courses.len(), 2);
-        assert_ne!(prepared.courses[0], prepared.courses[1]);
+        assert_ne!(prepared.courses[0].course, prepared.courses[1].course);
+        assert_eq!(
+            (&*prepared.courses[0].name, &*prepared.courses[1].name),
+            ("training", "training_2")
+        );
     }
 
     #[test]
@@ -309,6 +359,18 @@ mod tests {
                 vec!["max_steps = 256", "transport.max_records_per_flight = 256", "257"],
             ),
             ("", "courses.training=\"/nowhere.toml\"", 1, vec!["/nowhere.toml"]),
+            (
+                "[learning]\nlevels = 6",
+                "",
+                1,
+                vec!["test.toml", "learning.levels = 6", "5 walls", "training.toml"],
+            ),
+            (
+                "[simulator.generator]\nwall_x_m = [10.0, 20.0]",
+                "courses.generated_share=0.5",
+                1,
+                vec!["learning.levels = 5", "2 walls", "wall_x_m"],
+            ),
             (
                 "[transport]\nmax_actors = 3",
                 "",
