@@ -10,6 +10,9 @@ use crate::simulator::{LevelUp, Outcome, StepReport};
 /// Edge of the square in the image's middle that the action reward looks at, pixels.
 const CENTRE_SIDE: usize = 16;
 
+/// Largest reward, either way, that can be set.
+const MAX_REWARD: f32 = 1e6;
+
 /// Size of each reward term.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -33,6 +36,38 @@ impl Default for RewardSettings {
             action_scale: 1.0,
         }
     }
+}
+
+impl RewardSettings {
+    /// Checks that every reward is a number that sums of rewards can hold.
+    ///
+    /// # Errors
+    /// [`RewardSettingsError`] names the key.
+    pub fn validate(&self) -> Result<(), RewardSettingsError> {
+        for (key, value) in [
+            ("collision", self.collision),
+            ("level_up", self.level_up),
+            ("destination", self.destination),
+            ("action_scale", self.action_scale),
+        ] {
+            if !(-MAX_REWARD..=MAX_REWARD).contains(&value) {
+                return Err(RewardSettingsError { key, value });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A reward no critic can learn.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error(
+    "[simulator.reward] {key} = {value} is outside [-{MAX_REWARD}, {MAX_REWARD}]: no critic can learn returns of that size"
+)]
+pub struct RewardSettingsError {
+    /// The key.
+    pub key: &'static str,
+    /// Its value.
+    pub value: f32,
 }
 
 /// What each term gave in one step.
@@ -100,6 +135,19 @@ mod tests {
             level_up,
             outcome,
         }
+    }
+
+    #[test]
+    fn a_reward_that_is_no_number_is_refused_by_key() {
+        for value in [f32::NAN, f32::INFINITY, -2e6] {
+            let settings = RewardSettings {
+                collision: value,
+                ..RewardSettings::default()
+            };
+            let refusal = settings.validate().unwrap_err().to_string();
+            assert!(refusal.contains("[simulator.reward] collision ="), "{refusal}");
+        }
+        assert_eq!(RewardSettings::default().validate(), Ok(()));
     }
 
     #[test]

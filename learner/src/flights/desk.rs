@@ -18,7 +18,7 @@ use skein_protocol::transition::{RecordFault, TransitionRecord};
 use super::assembly::{Assembled, Assembly, Keep};
 use crate::flight::CommittedFlight;
 
-/// Times a flight may fail in the simulator: it is a function of its ticket, so it will fail again.
+/// Times a flight may fail, in the simulator or by numbers that make no sense: it is a function of its ticket, so it will fail again.
 const MOST_FAILURES: u32 = 3;
 
 /// A flight to be flown.
@@ -53,13 +53,15 @@ pub struct Faults {
 }
 
 /// A flight that no actor can fly.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("flight {flight} failed in the simulator {failures} times; the actors' logs say why")]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("flight {flight} failed {failures} times, at last because {why}; the logs of learner and actors say more")]
 pub struct HopelessFlight {
     /// The flight.
     pub flight: FlightId,
     /// Its failures.
     pub failures: u32,
+    /// What went wrong the last time.
+    pub why: String,
 }
 
 /// The book-keeping.
@@ -202,28 +204,48 @@ impl Desk {
             }
             Ok(Assembled::Failed) => {
                 let flight = issued.order.ticket.flight;
-                let failures = self.failures.entry(flight).or_default();
-                *failures += 1;
-                if *failures >= MOST_FAILURES {
-                    return Err(HopelessFlight {
-                        flight,
-                        failures: *failures,
-                    });
-                }
-                self.reissue_first(id, "failed in the simulator");
-                Ok(None)
+                self.fail(id, flight, "the simulator broke down").map(|()| None)
             }
             Err(fault) => {
-                self.refuse(id, record, fault);
-                Ok(None)
+                let flight = issued.order.ticket.flight;
+                self.refuse(id, flight, record, fault).map(|()| None)
             }
         }
     }
 
-    fn refuse(&mut self, id: ActorId, record: &TransitionRecord, fault: RecordFault) {
-        tracing::warn!(actor = %id, flight = record.flight, step = record.step, %fault, "record refused");
+    fn refuse(
+        &mut self,
+        id: ActorId,
+        flight: FlightId,
+        record: &TransitionRecord,
+        fault: RecordFault,
+    ) -> Result<(), HopelessFlight> {
+        tracing::warn!(actor = %id, %flight, step = record.step, %fault, "record refused");
         self.faults.refused += 1;
-        self.reissue_first(id, "has a hole");
+        match fault {
+            // Something got lost on the way, which need not happen again.
+            RecordFault::Mismatch { .. } => {
+                self.reissue_first(id, "has a hole");
+                Ok(())
+            }
+            // What an actor computed makes no sense, and a flight is a function of its ticket.
+            fault => self.fail(id, flight, &fault.to_string()),
+        }
+    }
+
+    /// Has the first flight of actor `id` flown again, but not for ever.
+    fn fail(&mut self, id: ActorId, flight: FlightId, why: &str) -> Result<(), HopelessFlight> {
+        let failures = self.failures.entry(flight).or_default();
+        *failures += 1;
+        if *failures >= MOST_FAILURES {
+            return Err(HopelessFlight {
+                flight,
+                failures: *failures,
+                why: why.to_owned(),
+            });
+        }
+        self.reissue_first(id, "failed");
+        Ok(())
     }
 
     /// Gives up actors that are silent and tickets that take too long.

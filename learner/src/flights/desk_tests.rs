@@ -203,23 +203,33 @@ fn a_ticket_that_takes_too_long_is_issued_again_though_its_actor_lives() {
     assert!(feed(&mut desk, &records(&tickets[0], 0, LIFE), now).is_empty());
 }
 
-#[test]
-fn a_flight_that_fails_in_the_simulator_is_given_up_in_the_end() {
+/// Lets flight 0 fail as often as it may, by `damage` to its first record.
+fn fail_for_ever(damage: fn(&mut TransitionRecord)) -> HopelessFlight {
     let now = Instant::now();
     let (mut desk, tickets) = desk(now);
     let mut ticket = tickets[0];
-    for failure in 1..=MOST_FAILURES {
+    for _ in 1..MOST_FAILURES {
         let mut record = records(&ticket, 0, LIFE)[0];
-        record.kind = RecordKind::Failed.code();
-        match desk.on_record(&record, now) {
-            Ok(flown) => assert!(flown.is_none() && failure < MOST_FAILURES),
-            Err(hopeless) => assert_eq!((hopeless.flight, failure), (FlightId(0), MOST_FAILURES)),
-        }
-        if failure < MOST_FAILURES {
-            let rest = tickets_for(&desk.issue(now), 0, LIFE);
-            ticket = *rest.iter().find(|ticket| ticket.flight == FlightId(0)).unwrap();
-        }
+        damage(&mut record);
+        assert!(desk.on_record(&record, now).unwrap().is_none());
+        let issued = tickets_for(&desk.issue(now), 0, LIFE);
+        ticket = *issued.iter().find(|ticket| ticket.flight == FlightId(0)).unwrap();
     }
+    let mut record = records(&ticket, 0, LIFE)[0];
+    damage(&mut record);
+    desk.on_record(&record, now).unwrap_err()
+}
+
+#[test]
+fn a_flight_that_always_fails_is_given_up_with_the_reason() {
+    let broken_down = fail_for_ever(|record| record.kind = RecordKind::Failed.code());
+    assert!(
+        broken_down
+            .to_string()
+            .contains("flight 0 failed 3 times, at last because the simulator broke down")
+    );
+    let senseless = fail_for_ever(|record| record.reward = f32::NAN);
+    assert!(senseless.to_string().contains("reward is not finite"), "{senseless}");
 }
 
 /// What may happen next to one of three actors.
@@ -260,6 +270,8 @@ proptest! {
         let mut lives = [LIFE; 3];
         let mut held: [VecDeque<Ticket>; 3] = Default::default();
         let mut committed: BTreeMap<u64, CommittedFlight> = BTreeMap::new();
+        // More than that, and the flight is given up: another test.
+        let mut poisonings: BTreeMap<FlightId, u32> = BTreeMap::new();
         let calm = (0..3 * ORDERS as usize).map(|turn| ((turn % 3) as u32, Event::FlyNext));
         let quiet = calm.clone().chain([(0, Event::Silence)]).chain(calm);
         for (actor, event) in events.into_iter().chain(quiet) {
@@ -279,7 +291,13 @@ proptest! {
                 Event::FlyNext => {}
                 Event::LoseRecord(at) if at < sent.len() => drop(sent.remove(at)),
                 Event::RepeatRecord(at) if at < sent.len() => sent.insert(at, sent[at]),
-                Event::Poison(at) if at < sent.len() => sent[at].reward = f32::NAN,
+                Event::Poison(at) if at < sent.len() => {
+                    let poisoned = poisonings.entry(FlightId(sent[at].flight)).or_default();
+                    *poisoned += 1;
+                    if *poisoned < MOST_FAILURES {
+                        sent[at].reward = f32::NAN;
+                    }
+                }
                 Event::DieMidway => {
                     sent.truncate(1);
                     restart = true;

@@ -58,6 +58,7 @@ impl Simulator {
     /// [`SimulatorError`] names the setting or the course at fault.
     pub fn new(course: Arc<Course>, settings: &SimulatorSettings) -> Result<Self, SimulatorError> {
         settings.vehicle.validate()?;
+        settings.reward.validate()?;
         if settings.max_steps == 0 {
             return Err(SimulatorError::NoSteps);
         }

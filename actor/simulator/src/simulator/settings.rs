@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::camera::{CameraFault, CameraSettings};
 use crate::course::GeneratorRanges;
-use crate::reward::RewardSettings;
+use crate::reward::{RewardSettings, RewardSettingsError};
 use crate::vehicle::{VehicleSettings, VehicleSettingsError};
 
 /// Everything about a simulator but its course: the `[simulator]` section of the configuration.
@@ -46,6 +46,9 @@ pub enum SimulatorError {
     /// A camera setting is out of bounds.
     #[error(transparent)]
     Camera(#[from] CameraFault),
+    /// A reward is out of bounds.
+    #[error(transparent)]
+    Reward(#[from] RewardSettingsError),
     /// No flight could ever begin.
     #[error("[simulator] max_steps = 0: every flight would be over before its first step; give it at least 1")]
     NoSteps,
