@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require};
 
-/// `[courses]`: what is flown through. Paths are relative to the configuration file.
+/// `[courses]`: what is flown through. Paths are relative to the configuration file; given with `--set`, to the working directory.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoursesSection {

@@ -1,6 +1,7 @@
 //! Reading a configuration file, with overrides, and writing it back.
 
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use toml::{Table, Value};
@@ -17,7 +18,7 @@ pub enum ConfigError {
         path: PathBuf,
         /// Why.
         #[source]
-        source: std::io::Error,
+        source: io::Error,
     },
     /// The file is not TOML.
     #[error("{} is not valid TOML: {source}", path.display())]
@@ -53,15 +54,51 @@ pub enum ConfigError {
         /// What is wrong with it.
         problem: String,
     },
+    /// The file could be used, were it not for an override.
+    #[error("with --set {text}, {source}")]
+    Overridden {
+        /// The override as given.
+        text: String,
+        /// What is wrong now.
+        #[source]
+        source: Box<ConfigError>,
+    },
+}
+
+/// The override that brought about the failure of `attempt` with all of `overrides`: since it, and not before, the attempt fails with these very words.
+/// `None` when the file alone fails so.
+///
+/// `attempt` is given the first so many overrides, and returns what the user would be told; `None` when it succeeds.
+pub fn culprit<'a>(overrides: &'a [String], attempt: impl Fn(&[String]) -> Option<String>) -> Option<&'a String> {
+    let failure = attempt(overrides);
+    (0..overrides.len())
+        .rev()
+        .find(|&count| attempt(&overrides[..count]) != failure)
+        .map(|count| &overrides[count])
 }
 
 impl Config {
     /// Reads `path`, applies `overrides` (`section.key=value`, the value in TOML's notation or a bare word) and validates the result. Course paths
-    /// become relative to the working directory.
+    /// become relative to the working directory: in the file they are relative to the file, in an override to the working directory.
     ///
     /// # Errors
-    /// [`ConfigError`] names file, key, value and remedy.
+    /// [`ConfigError`] names file, key, value and remedy, and the override that is to blame.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let error = match Self::resolve(path, overrides) {
+            Err(error) if !matches!(error, ConfigError::Override { .. }) => error,
+            settled => return settled,
+        };
+        let told = |overrides: &[String]| Self::resolve(path, overrides).err().map(|error| error.to_string());
+        Err(match culprit(overrides, told) {
+            Some(text) => ConfigError::Overridden {
+                text: text.clone(),
+                source: Box::new(error),
+            },
+            None => error,
+        })
+    }
+
+    fn resolve(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         let text = fs::read_to_string(path).map_err(|source| ConfigError::Read {
             path: path.to_owned(),
             source,
@@ -138,8 +175,24 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
             .as_table_mut()
             .ok_or_else(|| fail("names a value where a section is expected"))?;
     }
-    target.insert(key.to_owned(), parse_value(value.trim()));
+    let mut value = parse_value(value.trim());
+    if matches!((sections, key), ("courses", "training" | "evaluation")) {
+        make_absolute(&mut value).map_err(|error| fail(&format!("no path can be made of it ({error})")))?;
+    }
+    target.insert(key.to_owned(), value);
     Ok(())
+}
+
+/// Paths on the command line are the user's, who knows nothing of the configuration file's folder. What is no path is left for validation to refuse.
+fn make_absolute(value: &mut Value) -> io::Result<()> {
+    match value {
+        Value::String(path) => {
+            *path = std::path::absolute(&*path)?.to_string_lossy().into_owned();
+            Ok(())
+        }
+        Value::Array(values) => values.iter_mut().try_for_each(make_absolute),
+        _ => Ok(()),
+    }
 }
 
 /// A value in TOML's notation, or else the text itself: `--set run.device=cpu` needs no quotes.
@@ -184,6 +237,55 @@ mod tests {
     fn course_paths_are_relative_to_the_file() {
         let config = load("[courses]\ntraining = \"a/b.toml\"", &[]).unwrap();
         assert!(config.courses.training.is_absolute() && config.courses.training.ends_with("a/b.toml"));
+    }
+
+    #[test]
+    fn course_paths_in_overrides_are_relative_to_the_working_directory() {
+        let here = std::env::current_dir().unwrap();
+        let config = load(
+            "",
+            &[
+                "courses.training=a/b.toml",
+                "courses.evaluation=[\"c.toml\", \"/d.toml\"]",
+            ],
+        )
+        .unwrap();
+        assert_eq!(config.courses.training, here.join("a/b.toml"));
+        assert_eq!(config.courses.evaluation, [here.join("c.toml"), "/d.toml".into()]);
+        let error = load("", &["courses.training="]).unwrap_err();
+        assert!(error.contains("--set courses.training="), "{error}");
+    }
+
+    #[test]
+    fn the_override_that_is_to_blame_is_named_and_no_other() {
+        for (text, overrides, blamed) in [
+            (
+                "",
+                vec!["run.seed=2", "run.sed=3", "sac.discount=0.9"],
+                Some("run.sed=3"),
+            ),
+            ("[rum]", vec!["run.sed=3"], Some("run.sed=3")),
+            ("[run]\nsed = 1", vec!["run.seed=2"], None),
+            ("[run]\nseed = -1", vec!["run.seed=-2"], Some("run.seed=-2")),
+            (
+                "",
+                vec!["run.seed=-2", "run.seed=-1", "run.seed=1", "run.seed=-2"],
+                Some("run.seed=-2"),
+            ),
+            (
+                "[learning]\nwarmup_steps = 200",
+                vec!["run.seed=2", "replay.capacity=100"],
+                Some("replay.capacity=100"),
+            ),
+            ("", vec!["run.device=gpu"], Some("run.device=gpu")),
+        ] {
+            let error = load(text, &overrides).unwrap_err();
+            match blamed {
+                Some(blamed) => assert!(error.starts_with(&format!("with --set {blamed}, ")), "{error}"),
+                None => assert!(!error.contains("--set"), "{error}"),
+            }
+            assert!(error.contains("test.toml"), "{error}");
+        }
     }
 
     #[test]

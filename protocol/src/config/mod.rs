@@ -20,7 +20,7 @@ use xxhash_rust::xxh3::xxh3_64;
 
 pub use courses::CoursesSection;
 pub use evaluation::EvaluationSection;
-pub use file::ConfigError;
+pub use file::{ConfigError, culprit};
 pub use learning::{LearningSection, Observation};
 pub use replay::{ReplaySection, SuccessRule};
 pub use run::{CheckpointSection, Device, RunSection};
