@@ -9,7 +9,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use skein_protocol::config::{Config, ConfigError, CoursesSection};
+use skein_protocol::config::{Config, ConfigError, CoursesSection, culprit};
 use skein_protocol::run::{RunDirectory, RunError, RunIdentity};
 use skein_simulator::course::{Course, CourseError, RangesError};
 use skein_simulator::simulator::{Simulator, SimulatorError, SimulatorSettings};
@@ -100,6 +100,15 @@ pub enum PrepareError {
     /// The run's directory cannot be set up.
     #[error(transparent)]
     Run(#[from] RunError),
+    /// The run could be started, were it not for an override.
+    #[error("with --set {text}, {source}")]
+    Overridden {
+        /// The override as given.
+        text: String,
+        /// What is wrong now.
+        #[source]
+        source: Box<PrepareError>,
+    },
 }
 
 /// A run that is ready to be started.
@@ -127,7 +136,7 @@ pub fn prepare(
     actors: usize,
 ) -> Result<Prepared, PrepareError> {
     let mut config = Config::load(config_file, overrides)?;
-    let settings = check(config_file, &config, actors)?;
+    let settings = check(config_file, &config, actors).map_err(|error| blame(error, config_file, overrides, actors))?;
     config.simulator = written_out(&settings);
     let root = create_empty(run_directory)?;
     copy_courses(&root, &mut config)?;
@@ -171,6 +180,23 @@ fn written_out(settings: &SimulatorSettings) -> toml::Table {
     // By way of text: a number of single precision would drag the digits of its double along.
     let text = toml::to_string(settings).expect("every setting is representable in TOML");
     toml::from_str(&text).expect("what was written as TOML is TOML")
+}
+
+/// Adds to the `error` of a check the override that brought it about, if one did.
+fn blame(error: PrepareError, config_file: &Path, overrides: &[String], actors: usize) -> PrepareError {
+    let told = |overrides: &[String]| {
+        let checked = Config::load(config_file, overrides)
+            .map_err(PrepareError::from)
+            .and_then(|config| check(config_file, &config, actors));
+        checked.err().map(|error| error.to_string())
+    };
+    match culprit(overrides, told) {
+        Some(text) => PrepareError::Overridden {
+            text: text.clone(),
+            source: Box::new(error),
+        },
+        None => error,
+    }
 }
 
 /// Checks everything, and returns the simulator's settings.
@@ -358,7 +384,24 @@ mod tests {
                 1,
                 vec!["max_steps = 256", "transport.max_records_per_flight = 256", "257"],
             ),
-            ("", "courses.training=\"/nowhere.toml\"", 1, vec!["/nowhere.toml"]),
+            (
+                "",
+                "courses.training=\"/nowhere.toml\"",
+                1,
+                vec!["with --set courses.training=", "/nowhere.toml"],
+            ),
+            (
+                "",
+                "simulator.max_step=1",
+                1,
+                vec!["with --set simulator.max_step=1, ", "test.toml", "[simulator]"],
+            ),
+            (
+                "",
+                "simulator.max_steps=256",
+                1,
+                vec!["with --set simulator.max_steps=256, ", "max_records_per_flight"],
+            ),
             (
                 "[learning]\nlevels = 6",
                 "",
