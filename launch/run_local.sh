@@ -13,11 +13,13 @@ Options:
   --actors N               actors to start [default: number of cores]
   --config FILE            what to train and how [default: configs/local.toml]; see configs/ for others
   --run-dir DIR            where everything goes; must be new or empty [default: runs/<date>_<time>]
-  --set section.key=value  change one setting of the config, for example --set run.seed=7; may be repeated
+  --set section.key=value  change one setting of the config, for example --set run.seed=7; may be repeated;
+                           paths are relative to the working directory, in FILE they are relative to FILE
   -h, --help               this text
 
-Ctrl-C stops in order: flights in the air are abandoned, everything learned is saved. A second Ctrl-C stops at once.
-RUST_LOG=debug makes the logs in DIR/logs say more.
+Ctrl-C stops in order: flights in the air are abandoned, the updates of the epoch are finished, everything learned is saved. A
+second Ctrl-C stops at once.
+RUST_LOG=debug makes the logs in DIR/logs say more; SKEIN_LOG_FORMAT=json writes them as one JSON object a line.
 
 Exit status: 0 finished, 1 failed, 130 interrupted.
 END
