@@ -11,13 +11,17 @@
 //! Nothing here blocks and nothing here is trusted to arrive: iceoryx2 loses samples silently when a peer dies or has not connected yet. Tickets bound
 //! what is in flight, so no buffer can overflow; a flight with a hole is discarded and its ticket issued again; every wait has a deadline.
 //!
+//! Only the learner creates services; everybody else joins those that are there, so that an actor of a run that is over leaves nothing behind.
+//!
 //! Services carry protocol version, run, configuration and snapshot layout as attributes: a process that differs in one of them is refused on opening.
 
 use std::fmt::Debug;
-use std::time::Duration;
+use std::path::PathBuf;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
 
 use iceoryx2::config::Config as IceoryxConfig;
-use iceoryx2::node::Node;
+use iceoryx2::node::{Node, NodeState, NodeView};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
@@ -49,6 +53,13 @@ const BORROWED_RECORDS: usize = 2;
 const SNAPSHOT_HISTORY: usize = 4;
 /// Snapshots that exist at once in shared memory: the history, one being written, and those that slow readers still hold.
 const SNAPSHOT_SLOTS: usize = 8;
+
+/// How long an actor waits for a learner that starts at the same time.
+const JOIN_PATIENCE: Duration = Duration::from_secs(20);
+/// Time between two looks whether it is there.
+const JOIN_INTERVAL: Duration = Duration::from_millis(50);
+/// The name of the learner's node, by which others know that it is alive.
+const LEARNER: &str = "learner";
 
 /// The learner's ends.
 #[derive(Debug)]
@@ -100,11 +111,38 @@ pub struct ServiceError {
     pub remedy: &'static str,
 }
 
+/// Why a process could not join the services of a run.
+#[derive(Debug, thiserror::Error)]
+pub enum JoinError {
+    /// The run is over, was never started on this machine, or its learner died.
+    #[error("no learner of this run is there: none came to {} within {patience_secs} s", transport_root.display())]
+    NoLearner {
+        /// [`RunIdentity::transport_root`].
+        transport_root: PathBuf,
+        /// Seconds it was waited for.
+        patience_secs: f64,
+    },
+    /// There is one, but its services cannot be used.
+    #[error(transparent)]
+    Service(#[from] ServiceError),
+}
+
+impl ServiceError {
+    /// Whether waiting may help: the learner has not created the service yet, or its predecessor's is being removed.
+    fn may_pass(&self) -> bool {
+        ["DoesNotExist", "HangsInCreation", "IsMarkedForDestruction"]
+            .iter()
+            .any(|cause| self.cause.contains(cause))
+    }
+}
+
 fn failed<E: Debug>(service: &'static str, operation: &'static str) -> impl FnOnce(E) -> ServiceError {
     move |error| {
         let cause = format!("{error:?}");
         let remedy = if cause.contains("IncompatibleAttributes") || cause.contains("IncompatibleTypes") {
             "; this process and the run differ in program version or configuration: start it from the same build and run directory"
+        } else if cause.contains("DoesNotExist") {
+            "; the learner of this run has not opened it, or is gone"
         } else if cause.contains("ExceedsMax") {
             "; no slot is free: raise transport.max_actors, or end the other learner of this run"
         } else if cause.contains("InsufficientPermissions") {
@@ -121,15 +159,61 @@ fn failed<E: Debug>(service: &'static str, operation: &'static str) -> impl FnOn
     }
 }
 
+/// How services come to be.
+#[derive(Debug, Clone, Copy)]
+enum Manner {
+    /// They are created unless they are there.
+    Create,
+    /// They are created by the learner, until the deadline.
+    Join { deadline: Instant },
+}
+
+impl Manner {
+    fn joining(patience: Duration) -> Self {
+        Self::Join {
+            deadline: Instant::now() + patience,
+        }
+    }
+}
+
 /// Opens services of one run with the limits its configuration asks for.
 struct Opener<'a> {
     node: &'a Node<Ipc>,
+    manner: Manner,
     attributes: AttributeVerifier,
     actors: usize,
 }
 
+/// Creates or joins a service of the [`Opener`], as its manner says. A macro, because builders of different payloads have no trait in common.
+macro_rules! opened {
+    ($opener:expr, $service:expr, $builder:expr) => {
+        match $opener.manner {
+            Manner::Create => $builder
+                .open_or_create_with_attributes(&$opener.attributes)
+                .map_err(failed($service, "opening")),
+            Manner::Join { deadline } => join(deadline, $service, || {
+                $builder.open_with_attributes(&$opener.attributes)
+            }),
+        }
+    };
+}
+
+/// Tries to open a service until it is there and complete, or the deadline has passed.
+fn join<S, E: Debug>(
+    deadline: Instant,
+    service: &'static str,
+    open: impl Fn() -> Result<S, E>,
+) -> Result<S, ServiceError> {
+    loop {
+        match open().map_err(failed(service, "opening")) {
+            Err(error) if error.may_pass() && Instant::now() < deadline => sleep(JOIN_INTERVAL),
+            settled => return settled,
+        }
+    }
+}
+
 impl<'a> Opener<'a> {
-    fn new(node: &'a Node<Ipc>, identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
+    fn new(node: &'a Node<Ipc>, manner: Manner, identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
         let layout = SnapshotLayout::of(config).digest();
         let mut attributes = AttributeVerifier::new();
         for (key, value) in [
@@ -150,6 +234,7 @@ impl<'a> Opener<'a> {
         // A restarted actor may come before its dead predecessor's slots are reclaimed; the learner's own waker takes one.
         Ok(Self {
             node,
+            manner,
             attributes,
             actors: 2 * config.transport.max_actors,
         })
@@ -164,40 +249,46 @@ impl<'a> Opener<'a> {
         config: &Config,
     ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, TransitionRecord, ()>, ServiceError>
     {
-        self.node
-            .service_builder(&service_name("transitions")?)
-            .publish_subscribe::<TransitionRecord>()
-            .payload_alignment(Alignment::new(64).expect("64 is a power of two"))
-            .max_publishers(self.actors)
-            .max_subscribers(1)
-            .max_nodes(self.nodes())
-            // Every flight an actor holds a ticket for fits whole, so a record is never refused for want of room.
-            .subscriber_max_buffer_size(config.transport.max_records_per_flight * config.transport.tickets_per_actor)
-            .subscriber_max_borrowed_samples(BORROWED_RECORDS)
-            .history_size(0)
-            .enable_safe_overflow(false)
-            .open_or_create_with_attributes(&self.attributes)
-            .map_err(failed("transitions", "opening"))
+        let name = service_name("transitions")?;
+        let builder = || {
+            self.node
+                .service_builder(&name)
+                .publish_subscribe::<TransitionRecord>()
+                .payload_alignment(Alignment::new(64).expect("64 is a power of two"))
+                .max_publishers(self.actors)
+                .max_subscribers(1)
+                .max_nodes(self.nodes())
+                // Every flight an actor holds a ticket for fits whole, so a record is never refused for want of room.
+                .subscriber_max_buffer_size(
+                    config.transport.max_records_per_flight * config.transport.tickets_per_actor,
+                )
+                .subscriber_max_borrowed_samples(BORROWED_RECORDS)
+                .history_size(0)
+                .enable_safe_overflow(false)
+        };
+        opened!(self, "transitions", builder())
     }
 
     fn status(
         &self,
     ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, StatusRecord, ()>, ServiceError>
     {
-        self.node
-            .service_builder(&service_name("status")?)
-            .publish_subscribe::<StatusRecord>()
-            .max_publishers(self.actors)
-            .max_subscribers(1)
-            .max_nodes(self.nodes())
-            .subscriber_max_buffer_size(8)
-            .subscriber_max_borrowed_samples(1)
-            // A late joiner of a learner, or a restarted one, hears of its actors at once.
-            .history_size(1)
-            // Only the newest signs of life matter.
-            .enable_safe_overflow(true)
-            .open_or_create_with_attributes(&self.attributes)
-            .map_err(failed("status", "opening"))
+        let name = service_name("status")?;
+        let builder = || {
+            self.node
+                .service_builder(&name)
+                .publish_subscribe::<StatusRecord>()
+                .max_publishers(self.actors)
+                .max_subscribers(1)
+                .max_nodes(self.nodes())
+                .subscriber_max_buffer_size(8)
+                .subscriber_max_borrowed_samples(1)
+                // A late joiner of a learner, or a restarted one, hears of its actors at once.
+                .history_size(1)
+                // Only the newest signs of life matter.
+                .enable_safe_overflow(true)
+        };
+        opened!(self, "status", builder())
     }
 
     fn control(
@@ -205,39 +296,43 @@ impl<'a> Opener<'a> {
         config: &Config,
     ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, ControlRecord, ()>, ServiceError>
     {
-        self.node
-            .service_builder(&service_name("control")?)
-            .publish_subscribe::<ControlRecord>()
-            .max_publishers(1)
-            .max_subscribers(self.actors)
-            .max_nodes(self.nodes())
-            // All tickets pass by every actor: room for everyone's while this one flies.
-            .subscriber_max_buffer_size(4 * config.transport.max_actors * config.transport.tickets_per_actor + 64)
-            .subscriber_max_borrowed_samples(1)
-            .history_size(0)
-            .enable_safe_overflow(false)
-            .open_or_create_with_attributes(&self.attributes)
-            .map_err(failed("control", "opening"))
+        let name = service_name("control")?;
+        let builder = || {
+            self.node
+                .service_builder(&name)
+                .publish_subscribe::<ControlRecord>()
+                .max_publishers(1)
+                .max_subscribers(self.actors)
+                .max_nodes(self.nodes())
+                // All tickets pass by every actor: room for everyone's while this one flies.
+                .subscriber_max_buffer_size(4 * config.transport.max_actors * config.transport.tickets_per_actor + 64)
+                .subscriber_max_borrowed_samples(1)
+                .history_size(0)
+                .enable_safe_overflow(false)
+        };
+        opened!(self, "control", builder())
     }
 
     fn weights(
         &self,
     ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, [u8], SnapshotHeader>, ServiceError>
     {
-        self.node
-            .service_builder(&service_name("weights")?)
-            .publish_subscribe::<[u8]>()
-            .user_header::<SnapshotHeader>()
-            .max_publishers(1)
-            .max_subscribers(self.actors)
-            .max_nodes(self.nodes())
-            .subscriber_max_buffer_size(SNAPSHOT_HISTORY)
-            .subscriber_max_borrowed_samples(1)
-            .history_size(SNAPSHOT_HISTORY)
-            // The newest snapshots win.
-            .enable_safe_overflow(true)
-            .open_or_create_with_attributes(&self.attributes)
-            .map_err(failed("weights", "opening"))
+        let name = service_name("weights")?;
+        let builder = || {
+            self.node
+                .service_builder(&name)
+                .publish_subscribe::<[u8]>()
+                .user_header::<SnapshotHeader>()
+                .max_publishers(1)
+                .max_subscribers(self.actors)
+                .max_nodes(self.nodes())
+                .subscriber_max_buffer_size(SNAPSHOT_HISTORY)
+                .subscriber_max_borrowed_samples(1)
+                .history_size(SNAPSHOT_HISTORY)
+                // The newest snapshots win.
+                .enable_safe_overflow(true)
+        };
+        opened!(self, "weights", builder())
     }
 
     fn event(
@@ -246,15 +341,17 @@ impl<'a> Opener<'a> {
         notifiers: usize,
         listeners: usize,
     ) -> Result<event::PortFactory<Ipc>, ServiceError> {
-        self.node
-            .service_builder(&service_name(name)?)
-            .event()
-            .max_notifiers(notifiers)
-            .max_listeners(listeners)
-            .max_nodes(self.nodes())
-            .event_id_max_value(1)
-            .open_or_create_with_attributes(&self.attributes)
-            .map_err(failed(name, "opening"))
+        let service = service_name(name)?;
+        let builder = || {
+            self.node
+                .service_builder(&service)
+                .event()
+                .max_notifiers(notifiers)
+                .max_listeners(listeners)
+                .max_nodes(self.nodes())
+                .event_id_max_value(1)
+        };
+        opened!(self, name, builder())
     }
 }
 
@@ -262,7 +359,8 @@ fn service_name(name: &'static str) -> Result<ServiceName, ServiceError> {
     name.try_into().map_err(failed(name, "naming"))
 }
 
-fn node(identity: &RunIdentity, name: &str) -> Result<Node<Ipc>, ServiceError> {
+/// iceoryx2's settings for one run. Called before anything else of iceoryx2 is.
+fn transport_config(identity: &RunIdentity) -> Result<IceoryxConfig, ServiceError> {
     // Everything iceoryx2 would print goes wrong again, with our words, in the errors returned here.
     set_log_level(LogLevel::Fatal);
     let mut config = IceoryxConfig::default();
@@ -272,6 +370,11 @@ fn node(identity: &RunIdentity, name: &str) -> Result<Node<Ipc>, ServiceError> {
         .set_root_path(&Path::new(root.as_bytes()).map_err(failed("all", "setting the root path"))?);
     config.global.prefix =
         FileName::new(identity.transport_prefix.as_bytes()).map_err(failed("all", "setting the prefix"))?;
+    Ok(config)
+}
+
+fn node(identity: &RunIdentity, name: &str) -> Result<Node<Ipc>, ServiceError> {
+    let config = transport_config(identity)?;
     NodeBuilder::new()
         .name(&NodeName::new(name).map_err(failed("all", "naming the node"))?)
         .signal_handling_mode(SignalHandlingMode::Disabled)
@@ -280,14 +383,51 @@ fn node(identity: &RunIdentity, name: &str) -> Result<Node<Ipc>, ServiceError> {
         .map_err(failed("all", "creating the node"))
 }
 
+/// Whether the learner of a run is alive on this machine. Looking leaves no trace.
+///
+/// # Errors
+/// [`ServiceError`] when the run's processes cannot be looked at: it belongs to another user.
+pub fn is_learner_alive(identity: &RunIdentity) -> Result<bool, ServiceError> {
+    if !identity.transport_root.exists() {
+        return Ok(false);
+    }
+    let mut is_alive = false;
+    Node::<Ipc>::list(&transport_config(identity)?, |state| {
+        if let NodeState::Alive(node) = state {
+            is_alive |= node
+                .details()
+                .as_ref()
+                .is_some_and(|details| details.name().as_str() == LEARNER);
+        }
+        CallbackProgression::Continue
+    })
+    .map_err(failed("all", "looking for the learner"))?;
+    Ok(is_alive)
+}
+
+/// A node called `name` for a process that joins a learner. It is made only once there is a learner, because making it creates the transport's folder.
+fn join_learner(identity: &RunIdentity, name: &str, patience: Duration) -> Result<Node<Ipc>, JoinError> {
+    let deadline = Instant::now() + patience;
+    while !is_learner_alive(identity)? {
+        if Instant::now() >= deadline {
+            return Err(JoinError::NoLearner {
+                transport_root: identity.transport_root.clone(),
+                patience_secs: patience.as_secs_f64(),
+            });
+        }
+        sleep(JOIN_INTERVAL);
+    }
+    Ok(node(identity, name)?)
+}
+
 impl LearnerPorts {
     /// Opens the learner's ends of every service, on the thread that will use them.
     ///
     /// # Errors
     /// [`ServiceError`] says which service and what differs; a second learner of one run is refused.
     pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
-        let node = node(identity, "learner")?;
-        let open = Opener::new(&node, identity, config)?;
+        let node = node(identity, LEARNER)?;
+        let open = Opener::new(&node, Manner::Create, identity, config)?;
         let layout = SnapshotLayout::of(config);
         let weights_factory = open.weights()?;
         Ok(Self {
@@ -427,10 +567,10 @@ impl LearnerWaker {
     /// Opens the waker, on the thread that will use it.
     ///
     /// # Errors
-    /// [`ServiceError`] says what differs.
-    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
-        let node = node(identity, "learner-waker")?;
-        let open = Opener::new(&node, identity, config)?;
+    /// [`JoinError`] says what differs, or that the receiving thread has not opened its ends.
+    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
+        let node = join_learner(identity, "learner-waker", JOIN_PATIENCE)?;
+        let open = Opener::new(&node, Manner::joining(JOIN_PATIENCE), identity, config)?;
         let wake_learner = open
             .event("wake-learner", open.actors, 1)?
             .notifier_builder()
@@ -455,13 +595,17 @@ impl LearnerWaker {
 }
 
 impl ActorPorts {
-    /// Opens an actor's ends of every service, on the thread that will use them.
+    /// Opens an actor's ends of every service, on the thread that will use them. Waits a while for a learner that is starting.
     ///
     /// # Errors
-    /// [`ServiceError`] says which service and what differs.
-    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
-        let node = node(identity, "actor")?;
-        let open = Opener::new(&node, identity, config)?;
+    /// [`JoinError::NoLearner`] when none came; nothing is left of the attempt then. [`JoinError::Service`] says which service and what differs.
+    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
+        Self::open_within(JOIN_PATIENCE, identity, config)
+    }
+
+    fn open_within(patience: Duration, identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
+        let node = join_learner(identity, "actor", patience)?;
+        let open = Opener::new(&node, Manner::joining(patience), identity, config)?;
         Ok(Self {
             run: identity.run,
             layout: SnapshotLayout::of(config),
@@ -632,7 +776,7 @@ mod tests {
             LearnerPorts::open(&self.identity, &self.config)
         }
 
-        fn actor(&self) -> Result<ActorPorts, ServiceError> {
+        fn actor(&self) -> Result<ActorPorts, JoinError> {
             ActorPorts::open(&self.identity, &self.config)
         }
     }
@@ -743,5 +887,38 @@ mod tests {
             refusal.contains("differ in program version or configuration"),
             "{refusal}"
         );
+    }
+
+    #[test]
+    fn an_actor_waits_for_the_learner() {
+        let run = Run::new();
+        let (identity, config) = (run.identity.clone(), run.config.clone());
+        let actor = std::thread::spawn(move || ActorPorts::open(&identity, &config).map(drop));
+        sleep(3 * JOIN_INTERVAL);
+        assert!(!actor.is_finished(), "the actor did not wait");
+        let _learner = run.learner().unwrap();
+        actor.join().unwrap().unwrap();
+    }
+
+    #[test]
+    fn an_actor_of_a_run_that_is_over_leaves_nothing_behind() {
+        let run = Run::new();
+        drop(run.learner().unwrap());
+        run.identity.remove_transport();
+        assert!(!is_learner_alive(&run.identity).unwrap());
+        let refusal = ActorPorts::open_within(2 * JOIN_INTERVAL, &run.identity, &run.config).unwrap_err();
+        assert!(matches!(refusal, JoinError::NoLearner { .. }), "{refusal}");
+        assert!(!run.identity.transport_root.exists());
+    }
+
+    #[test]
+    fn a_transport_folder_alone_is_no_learner() {
+        let run = Run::new();
+        let learner = run.learner().unwrap();
+        let _waker = LearnerWaker::open(&run.identity, &run.config).unwrap();
+        assert!(is_learner_alive(&run.identity).unwrap());
+        drop(learner);
+        assert!(run.identity.transport_root.exists());
+        assert!(!is_learner_alive(&run.identity).unwrap());
     }
 }
