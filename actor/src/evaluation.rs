@@ -4,6 +4,7 @@
 //! cores; which thread flies which changes nothing.
 
 use std::convert::Infallible;
+use std::io;
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -22,6 +23,9 @@ use crate::courses::{Courses, EvaluationCourse, Simulators};
 use crate::environment_loop::{Directive, FlightError, FlightFault, Pilot, RecordLink};
 use crate::inference::Network;
 
+/// Most threads of an evaluation: more cores than any machine we know of has, few enough for every system's limits.
+pub const MAX_THREADS: usize = 512;
+
 /// What is to be flown.
 #[derive(Debug)]
 pub struct Evaluation<'a> {
@@ -33,7 +37,7 @@ pub struct Evaluation<'a> {
     pub courses: Arc<Courses>,
     /// Flights per course.
     pub flights: u64,
-    /// Threads to fly on; without influence on the result.
+    /// Most threads to fly on; without influence on the result. See [`Evaluation::threads`].
     pub threads: NonZeroUsize,
     /// What to keep of the flights.
     pub keep: Keep,
@@ -68,37 +72,43 @@ pub struct EvaluatedFlight {
 
 /// Why an evaluation came to nothing.
 #[derive(Debug, thiserror::Error)]
-#[error("course \"{course}\", flight {flight}: {fault}")]
-pub struct EvaluationError {
-    /// The course.
-    pub course: String,
-    /// The flight's number on that course, from 0.
-    pub flight: u64,
-    /// What went wrong.
-    #[source]
-    pub fault: FlightFault,
+pub enum EvaluationError {
+    /// A flight cannot be flown.
+    #[error("course \"{course}\", flight {flight}: {fault}")]
+    Flight {
+        /// The course.
+        course: String,
+        /// The flight's number on that course, from 0.
+        flight: u64,
+        /// What went wrong.
+        #[source]
+        fault: FlightFault,
+    },
+    /// The system has no room for so many threads.
+    #[error("cannot start thread {thread} of {threads}: {source}; ask for fewer")]
+    Thread {
+        /// The thread's number, from 1.
+        thread: usize,
+        /// How many were wanted.
+        threads: usize,
+        /// Why.
+        source: io::Error,
+    },
 }
 
 impl Evaluation<'_> {
+    /// Threads that are flown on: not more than there are flights, nor than [`MAX_THREADS`].
+    pub fn threads(&self) -> usize {
+        let flights = usize::try_from(self.total()).unwrap_or(usize::MAX);
+        self.threads.get().min(flights).min(MAX_THREADS)
+    }
+
     /// Flies all flights.
     ///
     /// # Errors
-    /// [`EvaluationError`] names the first flight, in course and flight order, that cannot be flown.
+    /// [`EvaluationError`] names the first flight, in course and flight order, that cannot be flown, or the thread that cannot be had.
     pub fn run(&self) -> Result<Evaluated, EvaluationError> {
-        let network = Network::new(self.snapshot, &SnapshotLayout::of(self.config));
-        let next = AtomicU64::new(0);
-        let mut flown: Vec<_> = std::thread::scope(|scope| {
-            let threads: Vec<_> = (0..self.threads.get())
-                .map(|_| scope.spawn(|| self.fly_next_until_done(&network, &next)))
-                .collect();
-            threads
-                .into_iter()
-                .flat_map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
-                .collect()
-        });
-        flown.sort_by_key(|(index, _)| *index);
-
-        let mut flights = flown.into_iter().map(|(_, flight)| flight);
+        let mut flights = self.fly_all()?.into_iter();
         let mut courses = Vec::new();
         let mut by_course = Vec::new();
         for EvaluationCourse { name, course } in self.courses.evaluation() {
@@ -118,6 +128,41 @@ impl Evaluation<'_> {
         })
     }
 
+    /// Every flight's end, in course and flight order.
+    fn fly_all(&self) -> Result<Vec<Result<EvaluatedFlight, EvaluationError>>, EvaluationError> {
+        let network = Network::new(self.snapshot, &SnapshotLayout::of(self.config));
+        let next = AtomicU64::new(0);
+        let threads = self.threads();
+        let mut flown: Vec<_> = std::thread::scope(|scope| {
+            let start = |thread: usize| {
+                std::thread::Builder::new()
+                    .name(format!("evaluation-{thread}"))
+                    .spawn_scoped(scope, || self.fly_next_until_done(&network, &next))
+                    .map_err(|source| {
+                        // Those that have started find nothing left to fly.
+                        next.store(self.total(), Ordering::Relaxed);
+                        EvaluationError::Thread {
+                            thread,
+                            threads,
+                            source,
+                        }
+                    })
+            };
+            let started = (1..=threads).map(start).collect::<Result<Vec<_>, _>>()?;
+            Ok(started
+                .into_iter()
+                .flat_map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+                .collect())
+        })?;
+        flown.sort_by_key(|(index, _)| *index);
+        Ok(flown.into_iter().map(|(_, flight)| flight).collect())
+    }
+
+    /// Flights on all courses together.
+    fn total(&self) -> u64 {
+        self.flights * self.courses.evaluation().len() as u64
+    }
+
     /// One thread's share: whatever flight is next. The number counts flights through all courses.
     fn fly_next_until_done(
         &self,
@@ -127,11 +172,10 @@ impl Evaluation<'_> {
         let simulators = Simulators::new(Arc::clone(&self.courses));
         let agent = Agent::new(self.config.learning.observation);
         let mut pilot = Pilot::new(ActorId(0), Incarnation(0), simulators, agent);
-        let total = self.flights * self.courses.evaluation().len() as u64;
         let mut flown = Vec::new();
         loop {
             let index = next.fetch_add(1, Ordering::Relaxed);
-            if index >= total {
+            if index >= self.total() {
                 return flown;
             }
             flown.push((
@@ -170,7 +214,7 @@ impl Evaluation<'_> {
             }),
             Err(FlightError::Fault(fault)) => {
                 let course = self.courses.evaluation()[course as usize].name.clone();
-                Err(EvaluationError { course, flight, fault })
+                Err(EvaluationError::Flight { course, flight, fault })
             }
             Err(FlightError::Link(never)) => match never {},
             Err(FlightError::Abandoned) => unreachable!("nobody tells an evaluation to stop"),
@@ -211,22 +255,30 @@ mod tests {
     use super::*;
     use crate::testing::{config, random_snapshot};
 
-    fn evaluated(threads: usize, keep: Keep) -> Evaluated {
+    /// What `look` sees of an evaluation on two courses.
+    fn look_at<T>(flights: u64, threads: usize, keep: Keep, look: impl Fn(&Evaluation<'_>) -> T) -> T {
         let mut config = config("");
         config.courses.evaluation.truncate(2);
-        let snapshot = random_snapshot(&SnapshotLayout::of(&config), 3);
-        let courses = Arc::new(Courses::of_files(&config, &config.courses.evaluation).unwrap());
-        let threads = NonZeroUsize::new(threads).unwrap();
-        Evaluation {
-            snapshot: &snapshot,
+        look(&Evaluation {
+            snapshot: &random_snapshot(&SnapshotLayout::of(&config), 3),
             config: &config,
-            courses,
-            flights: 5,
-            threads,
+            courses: Arc::new(Courses::of_files(&config, &config.courses.evaluation).unwrap()),
+            flights,
+            threads: NonZeroUsize::new(threads).unwrap(),
             keep,
-        }
-        .run()
-        .unwrap()
+        })
+    }
+
+    fn evaluated(threads: usize, keep: Keep) -> Evaluated {
+        look_at(5, threads, keep, |evaluation| evaluation.run().unwrap())
+    }
+
+    #[test]
+    fn threads_are_limited_by_flights_and_absolutely() {
+        let threads = |flights, threads| look_at(flights, threads, Keep::Scores, |evaluation| evaluation.threads());
+        assert_eq!(threads(5, 3), 3);
+        assert_eq!(threads(5, 100_000), 10);
+        assert_eq!(threads(1_000_000, 100_000), MAX_THREADS);
     }
 
     #[test]

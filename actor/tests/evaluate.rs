@@ -113,6 +113,31 @@ fn a_snapshot_file_alone_is_flown_and_recorded() {
 }
 
 #[test]
+fn more_threads_than_flights_are_not_started() {
+    let folder = run_folder();
+    let arguments = ["--run", ".", "--flights", "3", "--threads", "100000"];
+    let output = evaluate(folder.path(), &arguments);
+    assert!(output.status.success(), "{output:?}");
+    let announced = String::from_utf8(output.stderr).unwrap();
+    assert!(announced.contains("on each of 2 courses, 6 threads"), "{announced}");
+}
+
+#[test]
+fn a_thread_that_cannot_be_started_is_an_error() {
+    let folder = run_folder();
+    let output = Command::new(env!("CARGO_BIN_EXE_skein-evaluate"))
+        .current_dir(folder.path())
+        .args(["--run", ".", "--flights", "2", "--threads", "2"])
+        // A stack larger than the address space.
+        .env("RUST_MIN_STACK", (1u64 << 60).to_string())
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert!(error.contains("cannot start thread 1 of 2"), "{error}");
+}
+
+#[test]
 fn errors_name_the_file_and_the_remedy() {
     let folder = run_folder();
     let at = folder.path();

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use anyhow::{Context, bail};
 use clap::{Args, Parser};
 use skein_actor::courses::Courses;
-use skein_actor::evaluation::{Evaluation, Keep};
+use skein_actor::evaluation::{Evaluation, Keep, MAX_THREADS};
 use skein_actor::recording::{COLUMNS, write_recording};
 use skein_protocol::config::Config;
 use skein_protocol::failure::with_causes;
@@ -39,8 +39,8 @@ struct Arguments {
     /// Also write every step of every flight to this file, as .npz; takes 9.3 KiB of memory for each step, about 1 MiB for each whole flight.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Threads to fly on. By default one a core.
-    #[arg(long, value_name = "N")]
+    // Not a doc comment: those cannot name the constant.
+    #[arg(long, value_name = "N", help = threads_help())]
     threads: Option<NonZeroUsize>,
 }
 
@@ -82,13 +82,6 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .threads
         .map_or_else(std::thread::available_parallelism, Ok)
         .unwrap_or(NonZeroUsize::MIN);
-    eprintln!(
-        "snapshot {} of {}: {flights} flights on each of {} courses, {threads} threads",
-        snapshot.version,
-        path.display(),
-        files.len()
-    );
-
     let keep = if arguments.record.is_some() {
         Keep::Records
     } else {
@@ -102,6 +95,13 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threads,
         keep,
     };
+    eprintln!(
+        "snapshot {} of {}: {flights} flights on each of {} courses, {} threads",
+        snapshot.version,
+        path.display(),
+        files.len(),
+        evaluation.threads()
+    );
     let evaluated = evaluation.run()?;
 
     println!("{}", evaluated.report);
@@ -174,6 +174,10 @@ fn evaluation_courses(config: &Config, snapshot: &Path) -> anyhow::Result<Vec<Pa
         })
     };
     config.courses.evaluation.iter().map(find).collect()
+}
+
+fn threads_help() -> String {
+    format!("Most threads to fly on, at most {MAX_THREADS} and one a flight. By default one a core")
 }
 
 /// The arrays of a recording, for the long help.
