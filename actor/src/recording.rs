@@ -184,13 +184,41 @@ pub struct RecordingError {
 /// # Errors
 /// [`RecordingError`] names the file.
 pub fn write_recording(path: &Path, courses: &[&str], flights: &[Vec<EvaluatedFlight>]) -> Result<(), RecordingError> {
-    let aside = path.with_extension("npz.tmp");
+    let aside = aside(path);
     write_npz(&aside, courses, flights)
         .and_then(|()| fs::rename(&aside, path))
-        .map_err(|source| RecordingError {
-            path: path.to_owned(),
-            source,
+        .map_err(|source| {
+            // Half a recording is of no use; where there is none to remove, nothing remains either.
+            let _ = fs::remove_file(&aside);
+            failed(path, source)
         })
+}
+
+/// Checks, before anything is flown, that [`write_recording`] can write to `path`. Leaves nothing behind and an existing file as it is.
+///
+/// # Errors
+/// [`RecordingError`] names the file.
+pub fn check_recordable(path: &Path) -> Result<(), RecordingError> {
+    if fs::metadata(path).is_ok_and(|there| !there.is_file()) {
+        let source = io::Error::other("it is there and no regular file, so no recording can replace it");
+        return Err(failed(path, source));
+    }
+    let aside = aside(path);
+    File::create(&aside)
+        .and_then(|_| fs::remove_file(&aside))
+        .map_err(|source| failed(path, source))
+}
+
+/// Where a recording lies until it is whole.
+fn aside(path: &Path) -> PathBuf {
+    path.with_extension("npz.tmp")
+}
+
+fn failed(path: &Path, source: io::Error) -> RecordingError {
+    RecordingError {
+        path: path.to_owned(),
+        source,
+    }
 }
 
 fn write_npz(path: &Path, courses: &[&str], flights: &[Vec<EvaluatedFlight>]) -> io::Result<()> {
@@ -350,7 +378,32 @@ mod tests {
 
     #[test]
     fn a_file_that_cannot_be_written_is_named() {
-        let error = write_recording(Path::new("/nonexistent/flights.npz"), &[], &[]).unwrap_err();
-        assert!(error.to_string().contains("/nonexistent/flights.npz"));
+        let file = Path::new("/nonexistent/flights.npz");
+        for error in [write_recording(file, &[], &[]), check_recordable(file)] {
+            assert!(error.unwrap_err().to_string().contains("/nonexistent/flights.npz"));
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_replaced_is_refused_before_and_no_attempt_leaves_anything() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let names = || {
+            let mut names: Vec<_> = fs::read_dir(folder.path())
+                .unwrap()
+                .map(|entry| entry.unwrap().file_name())
+                .collect();
+            names.sort();
+            names
+        };
+        fs::create_dir(at("folder")).unwrap();
+        fs::write(at("earlier.npz"), b"earlier").unwrap();
+        assert!(check_recordable(&at("folder")).is_err());
+        assert!(check_recordable(Path::new("/dev/null")).is_err());
+        write_recording(&at("folder"), &["near"], &[vec![flight(0, 1)]]).unwrap_err();
+        check_recordable(&at("earlier.npz")).unwrap();
+        check_recordable(&at("new.npz")).unwrap();
+        assert_eq!(names(), ["earlier.npz", "folder"]);
+        assert_eq!(fs::read(at("earlier.npz")).unwrap(), b"earlier");
     }
 }

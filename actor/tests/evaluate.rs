@@ -113,6 +113,40 @@ fn a_snapshot_file_alone_is_flown_and_recorded() {
 }
 
 #[test]
+fn files_that_cannot_be_written_are_refused_before_anything_is_flown() {
+    let folder = run_folder();
+    let at = folder.path();
+    for option in ["--json", "--record"] {
+        for file in ["/proc/result", "none/result", "courses"] {
+            let error = error_of(at, &["--run", ".", option, file]);
+            assert!(error.contains(&format!("{file}: ")), "{error}");
+            assert!(!error.contains("flights on each of"), "{error}");
+        }
+    }
+}
+
+#[test]
+fn an_evaluation_that_fails_leaves_no_file_and_changes_none() {
+    let folder = run_folder();
+    let at = folder.path();
+    std::fs::write(at.join("earlier.json"), "earlier").unwrap();
+    std::os::unix::fs::symlink("later.json", at.join("link.json")).unwrap();
+    for json in ["new.json", "earlier.json", "link.json"] {
+        let outputs = ["--json", json, "--record", "new.npz"];
+        let error = error_of(
+            at,
+            &[["--run", ".", "--course", "none.toml"].as_slice(), &outputs].concat(),
+        );
+        assert!(error.contains("none.toml"), "{error}");
+    }
+    for name in ["new.json", "later.json", "new.npz", "new.npz.tmp"] {
+        assert!(!at.join(name).exists(), "{name}");
+    }
+    assert!(at.join("link.json").is_symlink());
+    assert_eq!(std::fs::read_to_string(at.join("earlier.json")).unwrap(), "earlier");
+}
+
+#[test]
 fn more_threads_than_flights_are_not_started() {
     let folder = run_folder();
     let arguments = ["--run", ".", "--flights", "3", "--threads", "100000"];

@@ -1,6 +1,6 @@
 //! `skein-evaluate`: flies a trained snapshot and counts.
 
-use std::fs;
+use std::fs::{self, File, OpenOptions};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -10,7 +10,7 @@ use anyhow::{Context, bail};
 use clap::{Args, Parser};
 use skein_actor::courses::Courses;
 use skein_actor::evaluation::{Evaluation, Keep, MAX_THREADS};
-use skein_actor::recording::{COLUMNS, write_recording};
+use skein_actor::recording::{COLUMNS, check_recordable, write_recording};
 use skein_protocol::config::Config;
 use skein_protocol::failure::with_causes;
 use skein_protocol::run::RunDirectory;
@@ -67,8 +67,12 @@ fn main() -> ExitCode {
 }
 
 fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    for file in [&arguments.json, &arguments.record].into_iter().flatten() {
+    if let Some(file) = &arguments.json {
         check_writable(file)?;
+    }
+    if let Some(file) = &arguments.record {
+        check_folder(file)?;
+        check_recordable(file)?;
     }
     let path = snapshot_path(&arguments.subject)?;
     let (snapshot, config) = Snapshot::load(&path)?;
@@ -120,8 +124,28 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Minutes of flying must not end in a mistyped folder.
+/// Minutes of flying must not end in a file that cannot be written. Leaves nothing behind and an existing file as it is.
 fn check_writable(file: &Path) -> anyhow::Result<()> {
+    check_folder(file)?;
+    let cannot_write = || format!("cannot write {}", file.display());
+    match fs::metadata(file) {
+        // Opening a pipe would wait for its reader.
+        Ok(there) if !there.is_file() && !there.is_dir() => Ok(()),
+        Ok(_) => OpenOptions::new()
+            .write(true)
+            .open(file)
+            .map(drop)
+            .with_context(cannot_write),
+        Err(_) => File::create(file)
+            .and_then(|_| fs::canonicalize(file))
+            // The link that names it, if there is one, stays.
+            .and_then(fs::remove_file)
+            .with_context(cannot_write),
+    }
+}
+
+/// The system's word for a missing folder is the one for a missing file.
+fn check_folder(file: &Path) -> anyhow::Result<()> {
     let folder = match file.parent() {
         Some(folder) if folder != Path::new("") => folder,
         _ => Path::new("."),
