@@ -69,7 +69,7 @@ pub enum ConfigError {
 /// `None` when the file alone fails so.
 ///
 /// `attempt` is given the first so many overrides, and returns what the user would be told; `None` when it succeeds.
-pub fn culprit<'a>(overrides: &'a [String], attempt: impl Fn(&[String]) -> Option<String>) -> Option<&'a String> {
+pub fn culprit(overrides: &[String], attempt: impl Fn(&[String]) -> Option<String>) -> Option<&String> {
     let failure = attempt(overrides);
     (0..overrides.len())
         .rev()
