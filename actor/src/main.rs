@@ -14,19 +14,19 @@ use skein_actor::courses::{Courses, Simulators};
 use skein_actor::environment_loop::Pilot;
 use skein_actor::service::{Ending, LearnerLine, serve};
 use skein_actor::weights::Weights;
-use skein_protocol::failure::with_causes;
+use skein_protocol::failure::{EXIT_LEARNER_GONE, with_causes};
 use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::logging::{LogFormat, log_to_file};
 use skein_protocol::run::RunDirectory;
-use skein_protocol::services::ActorPorts;
+use skein_protocol::services::{ActorPorts, JoinError};
 use skein_protocol::snapshot::SnapshotLayout;
 use tracing::{error, info};
 
 /// Flies for a run, beside its learner and other actors, until the run is over.
 ///
 /// Actors come and go as they like: what is learned does not depend on them. The log goes to logs/actor-ID.log in the run's directory (RUST_LOG says what is
-/// logged, SKEIN_LOG_FORMAT=json how). Exit status: 0 when the run is over or on SIGTERM or SIGINT, 1 on an error, 3 when the learner has been silent for
-/// transport.learner_silence_secs.
+/// logged, SKEIN_LOG_FORMAT=json how). Exit status: 0 when the run is over or on SIGTERM or SIGINT, 1 on an error, 3 when there is no learner or it has
+/// been silent for transport.learner_silence_secs.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
@@ -38,21 +38,22 @@ struct Arguments {
     id: Option<u32>,
 }
 
-/// The learner is gone, and nobody has said that the run is over.
-const EXIT_LEARNER_SILENT: u8 = 3;
-
 fn main() -> ExitCode {
     match run(&Arguments::parse()) {
         Ok(Ending::Stopped | Ending::Signalled) => ExitCode::SUCCESS,
         Ok(Ending::LearnerSilent) => {
             eprintln!("skein-actor: nothing was heard of the learner for transport.learner_silence_secs; leaving");
-            ExitCode::from(EXIT_LEARNER_SILENT)
+            ExitCode::from(EXIT_LEARNER_GONE)
         }
         Err(error) => {
+            let exit_code = match error.downcast_ref() {
+                Some(JoinError::NoLearner { .. }) => ExitCode::from(EXIT_LEARNER_GONE),
+                _ => ExitCode::FAILURE,
+            };
             let error = with_causes(error.as_ref());
             error!(error, "actor failed");
             eprintln!("skein-actor: {error}");
-            ExitCode::FAILURE
+            exit_code
         }
     }
 }
