@@ -15,6 +15,7 @@ use skein_protocol::config::Config;
 use skein_protocol::failure::with_causes;
 use skein_protocol::ids::ActorId;
 use skein_protocol::run::{RunDirectory, RunError};
+use skein_protocol::services::is_learner_alive;
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
@@ -115,6 +116,7 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         programs,
         actors: claim_actors(run, actors)?,
         learner_threads: config.run.learner_threads,
+        learner_grace: supervisor::LEARNER_GRACE,
     };
     let mut display = Display::new();
     let outcome = runtime()?.block_on(async {
@@ -137,7 +139,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let programs = Programs::beside_this()?;
     let run = open(&arguments.run)?;
     let (identity, config) = run.open()?;
-    if !identity.transport_root.exists() {
+    if !is_learner_alive(&identity)? {
         bail!("the run in {} is not under way on this machine", run.root().display());
     }
     let actors = claim_actors(&run, arguments.count as usize)?;
@@ -152,6 +154,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
         programs,
         actors,
         learner_threads: config.run.learner_threads,
+        learner_grace: supervisor::LEARNER_GRACE,
     };
     let mut display = Display::new();
     runtime()?.block_on(async {

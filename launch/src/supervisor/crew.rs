@@ -1,6 +1,7 @@
 //! The actors of one supervisor: started, restarted when they die, told to end.
 
 use std::collections::VecDeque;
+use std::fmt;
 use std::io;
 use std::path::Path;
 use std::time::Instant;
@@ -10,10 +11,10 @@ use skein_protocol::run::RunDirectory;
 use tokio::sync::{mpsc, watch};
 use tokio::time::sleep;
 
-use super::Event;
 use super::log_tail::log_tail;
 use super::process::{Exit, Launch, Order, Orphaned, Output, reap};
 use super::restarts::{MAX_DEATHS, Restarts, Verdict, WINDOW};
+use super::{Event, SupervisorError};
 
 /// The actors of one supervisor.
 pub(super) struct Crew<'a> {
@@ -23,7 +24,7 @@ pub(super) struct Crew<'a> {
     events: mpsc::Sender<Event>,
     members: Vec<Member>,
     after_death: AfterDeath,
-    last_failure: Option<String>,
+    last_failure: Option<GivenUp>,
     /// What the user should be told, oldest first.
     warnings: VecDeque<String>,
 }
@@ -41,8 +42,26 @@ enum State {
     Flying,
     /// Died; will be started again.
     Resting,
-    /// Ended, or was given up.
+    /// Not started, ended, or given up.
     Gone,
+}
+
+/// Why an actor is not started again.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum GivenUp {
+    /// It found no learner: another life would find none either.
+    LearnerGone,
+    /// It died too often.
+    KeepsDying(String),
+}
+
+impl fmt::Display for GivenUp {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::LearnerGone => f.write_str("the last heard nothing of the learner"),
+            Self::KeepsDying(how) => f.write_str(how),
+        }
+    }
 }
 
 /// What becomes of an actor that failed.
@@ -55,23 +74,20 @@ enum AfterDeath {
 }
 
 impl<'a> Crew<'a> {
-    /// Starts one process for each of `actors`. Their ends come as [`Event`]s, numbered as in `actors`.
-    ///
-    /// # Errors
-    /// When one cannot be started; those started before it are killed.
-    pub(super) fn start(
+    /// A crew of `actors`, none of them started yet. Their ends will come as [`Event`]s, numbered as in `actors`.
+    pub(super) fn new(
         run: &'a RunDirectory,
         program: &'a Path,
         actors: &[ActorId],
         events: mpsc::Sender<Event>,
-    ) -> io::Result<Self> {
+    ) -> Self {
         let (orders, _) = watch::channel(Order::Run);
         let member = |&id| Member {
             id,
-            state: State::Resting,
+            state: State::Gone,
             restarts: Restarts::default(),
         };
-        let mut crew = Self {
+        Self {
             run,
             program,
             orders,
@@ -80,11 +96,24 @@ impl<'a> Crew<'a> {
             after_death: AfterDeath::Restart,
             last_failure: None,
             warnings: VecDeque::new(),
-        };
-        for number in 0..crew.members.len() {
-            crew.start_member(number)?;
         }
-        Ok(crew)
+    }
+
+    /// Starts a process for each actor.
+    ///
+    /// # Errors
+    /// When one cannot be started; those started before it are told to end at once.
+    pub(super) fn start(&mut self) -> Result<(), SupervisorError> {
+        for number in 0..self.members.len() {
+            if let Err(source) = self.start_member(number) {
+                self.order(Order::Kill);
+                return Err(SupervisorError::Start {
+                    program: self.program.to_owned(),
+                    source,
+                });
+            }
+        }
+        Ok(())
     }
 
     fn start_member(&mut self, number: usize) -> io::Result<()> {
@@ -120,6 +149,12 @@ impl<'a> Crew<'a> {
         if self.after_death == AfterDeath::LetGo || *exit == Exit::Success {
             return;
         }
+        if *exit == Exit::LearnerGone {
+            self.last_failure = Some(GivenUp::LearnerGone);
+            self.warnings
+                .push_back(format!("actor {} heard nothing of the learner and left", member.id));
+            return;
+        }
         let log = self.run.actor_log(member.id);
         match member.restarts.died(Instant::now()) {
             Verdict::RestartAfter(pause) => {
@@ -144,7 +179,7 @@ impl<'a> Crew<'a> {
                     log.display(),
                     log_tail(&log)
                 );
-                self.last_failure = Some(failure.clone());
+                self.last_failure = Some(GivenUp::KeepsDying(failure.clone()));
                 self.warnings.push_back(failure);
             }
         }
@@ -180,8 +215,8 @@ impl<'a> Crew<'a> {
     }
 
     /// Why the last actor that was given up was; `None` if none was.
-    pub(super) fn last_failure(&self) -> Option<&str> {
-        self.last_failure.as_deref()
+    pub(super) fn last_failure(&self) -> Option<&GivenUp> {
+        self.last_failure.as_ref()
     }
 
     /// The next thing to tell the user.

@@ -24,6 +24,16 @@ pub(super) fn log_tail(path: &Path) -> String {
         .join("\n")
 }
 
+/// What `program` printed last about why it ended, without its name: programs of ours write `name: reason` on standard error, which goes to their log.
+/// `None` if the log holds no such words.
+pub(super) fn last_words(path: &Path, program: &Path) -> Option<String> {
+    let start = format!("{}: ", program.file_name()?.to_str()?);
+    let text = read_end(path).ok()?;
+    let lines: Vec<_> = text.lines().collect();
+    let first = lines.iter().rposition(|line| line.starts_with(&start))?;
+    lines[first..].join("\n").strip_prefix(&start).map(str::to_owned)
+}
+
 fn read_end(path: &Path) -> std::io::Result<String> {
     let mut file = File::open(path)?;
     let length = file.metadata()?.len();
@@ -46,6 +56,20 @@ mod tests {
         let tail = log_tail(&path);
         assert_eq!(tail.lines().count(), LINES);
         assert!(tail.ends_with("    line 4999"), "{tail}");
+    }
+
+    #[test]
+    fn last_words_are_the_programs_own_and_its_last() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("learner.log");
+        let program = Path::new("/bin/skein-learner");
+        std::fs::write(
+            &path,
+            "INFO starts\nskein-learner: old\nERROR x\nskein-learner: no device\nuse cpu\n",
+        )
+        .unwrap();
+        assert_eq!(last_words(&path, program).unwrap(), "no device\nuse cpu");
+        assert_eq!(last_words(&path, Path::new("/bin/skein-actor")), None);
     }
 
     #[test]

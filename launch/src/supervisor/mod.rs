@@ -1,5 +1,8 @@
 //! Starts, watches, stops and reaps the processes of a run.
 //!
+//! The learner comes first, and the actors once it has reported for the first time: what keeps it from starting is then told once, and nobody waits for
+//! a learner that will not come.
+//!
 //! The order of a stop matters: the learner is told first, because it abandons the flights in the air, saves what was learned and tells the actors
 //! itself; only actors that are still there afterwards are ended from here. Every wait has a deadline, so that a stop always comes to an end, and
 //! every way out of this module leaves no process behind.
@@ -26,12 +29,12 @@ use tokio::process::ChildStdout;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep_until, timeout};
 
-use crew::Crew;
-use log_tail::log_tail;
+use crew::{Crew, GivenUp};
+use log_tail::{last_words, log_tail};
 use process::{Exit, Launch, Order, Orphaned, Output, reap};
 
-/// How long the learner may take to save everything once it is told to stop.
-const LEARNER_GRACE: Duration = Duration::from_secs(90);
+/// How long the learner may show no progress once it is told to stop: it finishes the updates of its epoch, which show, and saves, which does not.
+pub const LEARNER_GRACE: Duration = Duration::from_secs(90);
 /// How long actors may take to follow the learner's word that the run is over.
 const ACTOR_GRACE: Duration = Duration::from_secs(5);
 /// How long actors may take to follow SIGTERM.
@@ -81,6 +84,8 @@ pub struct Plan {
     pub actors: Vec<ActorId>,
     /// Threads of the learner's tensor operations.
     pub learner_threads: usize,
+    /// [`LEARNER_GRACE`].
+    pub learner_grace: Duration,
 }
 
 /// How supervision ended, when nothing failed.
@@ -110,6 +115,9 @@ pub enum SupervisorError {
         #[source]
         source: io::Error,
     },
+    /// The learner ended before it had reported once.
+    #[error("the learner cannot start: {0}")]
+    LearnerCannotStart(String),
     /// The learner ended where it should not have.
     #[error("the learner ended with {exit}; its log {} ends with\n{tail}", log.display())]
     LearnerFailed {
@@ -120,6 +128,9 @@ pub enum SupervisorError {
         /// The log's last lines.
         tail: String,
     },
+    /// The learner of a run that actors were added to is no more.
+    #[error("the learner of {} is gone", .0.display())]
+    LearnerGone(PathBuf),
     /// No actor is left.
     #[error("no actor is left: {0}")]
     NoActors(String),
@@ -158,36 +169,38 @@ pub async fn run(
 ) -> Result<Ended, SupervisorError> {
     let (events, mut inbox) = mpsc::channel(EVENTS);
     let learner = start_learner(plan, events.clone())?;
-    let mut crew = match Crew::start(&plan.run, &plan.programs.actor, &plan.actors, events) {
-        Ok(crew) => crew,
-        Err(source) => {
-            learner.send_replace(Order::Kill);
-            drain(&mut inbox).await;
-            return Err(SupervisorError::Start {
-                program: plan.programs.actor.clone(),
-                source,
-            });
-        }
-    };
+    let mut crew = Crew::new(&plan.run, &plan.programs.actor, &plan.actors, events);
 
     // While the learner is there.
+    let mut work: Option<Work> = None;
     let mut stop = Stop::NotYet;
     let mut failure = None;
     let exit = loop {
         let deadline = stop.deadline();
         tokio::select! {
             Some(event) = inbox.recv() => match event {
-                Event::LearnerSaid(line) => heed(&line, watcher),
+                Event::LearnerSaid(line) => {
+                    let Some(progress) = heed(&line, watcher) else { continue };
+                    let done = Work::of(&progress);
+                    if work.is_none() && stop == Stop::NotYet && let Err(error) = crew.start() {
+                        failure = Some(error);
+                        stop = Stop::AtOnce;
+                        learner.send_replace(Order::Kill);
+                    }
+                    if work.replace(done) != Some(done) {
+                        stop = stop.progressed(plan.learner_grace);
+                    }
+                }
                 Event::LearnerExited(exit) => break exit,
                 Event::ActorExited(number, exit) => crew.exited(number, &exit),
                 Event::RestartDue(number) => crew.restart(number),
             },
             Some(()) = interrupts.recv() => {
-                stop = stop.interrupted();
+                stop = stop.interrupted(plan.learner_grace);
                 match stop {
                     Stop::AtOnce => { learner.send_replace(Order::Kill); crew.order(Order::Kill); }
                     _ => {
-                        watcher.warn("stopping in order; once more stops at once, without saving");
+                        watcher.warn("stopping in order: finishing the updates of this epoch; Ctrl-C again stops at once, without saving");
                         learner.send_replace(Order::Terminate);
                     }
                 }
@@ -206,9 +219,9 @@ pub async fn run(
             && !crew.is_alive()
             && let Some(reason) = crew.last_failure()
         {
-            failure = Some(SupervisorError::NoActors(reason.to_owned()));
+            failure = Some(SupervisorError::NoActors(reason.to_string()));
             stop = Stop::InOrder {
-                deadline: Instant::now() + LEARNER_GRACE,
+                deadline: Instant::now() + plan.learner_grace,
             };
             learner.send_replace(Order::Terminate);
         }
@@ -217,7 +230,10 @@ pub async fn run(
     // The learner is gone, and so should be the actors.
     if exit != Exit::Success && stop != Stop::AtOnce {
         crew.order(Order::Terminate);
-        failure.get_or_insert_with(|| learner_failed(plan, exit.to_string()));
+        failure.get_or_insert_with(|| match work {
+            Some(_) => learner_failed(plan, exit.to_string()),
+            None => learner_cannot_start(plan, &exit),
+        });
     }
     dismiss(&mut crew, &mut inbox, interrupts).await;
     match failure {
@@ -237,17 +253,11 @@ pub async fn attach(
     watcher: &mut impl Watcher,
 ) -> Result<Ended, SupervisorError> {
     let (events, mut inbox) = mpsc::channel(EVENTS);
-    let program = &plan.programs.actor;
-    let mut crew = match Crew::start(&plan.run, program, &plan.actors, events) {
-        Ok(crew) => crew,
-        Err(source) => {
-            drain(&mut inbox).await;
-            return Err(SupervisorError::Start {
-                program: program.clone(),
-                source,
-            });
-        }
-    };
+    let mut crew = Crew::new(&plan.run, &plan.programs.actor, &plan.actors, events);
+    if let Err(error) = crew.start() {
+        dismiss(&mut crew, &mut inbox, interrupts).await;
+        return Err(error);
+    }
     let mut ended = Ended::Finished;
     while crew.is_alive() && ended == Ended::Finished {
         tokio::select! {
@@ -267,8 +277,29 @@ pub async fn attach(
     }
     dismiss(&mut crew, &mut inbox, interrupts).await;
     match crew.last_failure() {
-        Some(reason) if ended == Ended::Finished => Err(SupervisorError::NoActors(reason.to_owned())),
+        Some(reason) if ended == Ended::Finished => Err(match reason {
+            GivenUp::LearnerGone => SupervisorError::LearnerGone(plan.run.root().to_owned()),
+            GivenUp::KeepsDying(_) => SupervisorError::NoActors(reason.to_string()),
+        }),
         _ => Ok(ended),
+    }
+}
+
+/// What the learner has done so far, as far as its reports show it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Work {
+    flights: u64,
+    updates: u64,
+    vae_updates: u64,
+}
+
+impl Work {
+    fn of(progress: &Progress) -> Self {
+        Self {
+            flights: progress.flights,
+            updates: progress.updates,
+            vae_updates: progress.vae_updates,
+        }
     }
 }
 
@@ -284,12 +315,22 @@ enum Stop {
 }
 
 impl Stop {
-    fn interrupted(self) -> Self {
+    fn interrupted(self, grace: Duration) -> Self {
         match self {
             Self::NotYet => Self::InOrder {
-                deadline: Instant::now() + LEARNER_GRACE,
+                deadline: Instant::now() + grace,
             },
             Self::InOrder { .. } | Self::AtOnce => Self::AtOnce,
+        }
+    }
+
+    /// A learner that still gets somewhere is not killed.
+    fn progressed(self, grace: Duration) -> Self {
+        match self {
+            Self::InOrder { .. } => Self::InOrder {
+                deadline: Instant::now() + grace,
+            },
+            Self::NotYet | Self::AtOnce => self,
         }
     }
 
@@ -338,11 +379,21 @@ async fn listen(mut lines: Lines<BufReader<ChildStdout>>, events: mpsc::Sender<E
     }
 }
 
-/// Passes a line of the learner on. What is not a report is shown as it is: somebody meant it to be read.
-fn heed(line: &str, watcher: &mut impl Watcher) {
-    match serde_json::from_str(line) {
-        Ok(progress) => watcher.progress(&progress),
-        Err(_) => watcher.warn(line),
+/// Passes a line of the learner on, and returns it if it is a report. What is none is shown as it is: somebody meant it to be read.
+fn heed(line: &str, watcher: &mut impl Watcher) -> Option<Progress> {
+    let Ok(progress) = serde_json::from_str(line) else {
+        watcher.warn(line);
+        return None;
+    };
+    watcher.progress(&progress);
+    Some(progress)
+}
+
+/// The learner's own words if it had any, else all that its log shows.
+fn learner_cannot_start(plan: &Plan, exit: &Exit) -> SupervisorError {
+    match last_words(&plan.run.learner_log(), &plan.programs.learner) {
+        Some(words) => SupervisorError::LearnerCannotStart(words),
+        None => learner_failed(plan, exit.to_string()),
     }
 }
 
@@ -382,9 +433,4 @@ fn note_exit(crew: &mut Crew<'_>, event: Event) {
     if let Event::ActorExited(number, exit) = event {
         crew.exited(number, &exit);
     }
-}
-
-/// Waits until every task that watches a process has ended.
-async fn drain(inbox: &mut mpsc::Receiver<Event>) {
-    while inbox.recv().await.is_some() {}
 }

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
 use rustix::process::{Pid, Signal, getppid, kill_process, set_parent_process_death_signal};
+use skein_protocol::failure::EXIT_LEARNER_GONE;
 use tokio::process::{Child, Command};
 use tokio::sync::watch;
 
@@ -28,6 +29,8 @@ pub(super) enum Order {
 pub(super) enum Exit {
     /// Status 0.
     Success,
+    /// [`EXIT_LEARNER_GONE`].
+    LearnerGone,
     /// Anything else, in words.
     Failure(String),
 }
@@ -37,6 +40,7 @@ impl Exit {
         match status {
             Ok(status) if status.success() => Self::Success,
             Ok(status) => match (status.code(), status.signal()) {
+                (Some(code), _) if code == i32::from(EXIT_LEARNER_GONE) => Self::LearnerGone,
                 (Some(code), _) => Self::Failure(format!("exit status {code}")),
                 (None, Some(signal)) => Self::Failure(format!("killed by signal {signal}")),
                 (None, None) => Self::Failure(status.to_string()),
@@ -50,6 +54,7 @@ impl fmt::Display for Exit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Success => f.write_str("exit status 0"),
+            Self::LearnerGone => write!(f, "exit status {EXIT_LEARNER_GONE}"),
             Self::Failure(how) => f.write_str(how),
         }
     }

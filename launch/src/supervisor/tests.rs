@@ -27,12 +27,13 @@ impl Watcher for Seen {
     }
 }
 
-const PROGRESS: &str = r#"{"phase":"flying","flights":7,"total_flights":9,"evaluation_flights":[0,0],"steps":1,"updates":0,"vae_updates":0,"steps_per_sec":1.0,"updates_per_sec":0.0,"walls_passed":null,"mean_return":null,"temperature":null,"vae_loss":null,"actors":1,"elapsed_secs":1.0}"#;
+/// A shell function that reports so many updates.
+const REPORT: &str = r#"report() { echo '{"phase":"flying","flights":7,"total_flights":9,"evaluation_flights":[0,0],"steps":1,"updates":'$1',"vae_updates":0,"steps_per_sec":1.0,"updates_per_sec":0.0,"walls_passed":null,"mean_return":null,"temperature":null,"vae_loss":null,"actors":1,"elapsed_secs":1.0}'; }"#;
 
 /// An actor that flies until the learner's script says stop.
 const FAITHFUL_ACTOR: &str = "while [ ! -e $dir/stop ]; do sleep 0.02; done";
 /// A learner that runs until it is told to stop.
-const ENDLESS_LEARNER: &str = "trap 'touch $dir/saved $dir/stop; exit 0' TERM; while :; do sleep 0.02; done";
+const ENDLESS_LEARNER: &str = "trap 'touch $dir/saved $dir/stop; exit 0' TERM; report 0; while :; do sleep 0.02; done";
 
 struct Stage {
     directory: TempDir,
@@ -50,7 +51,7 @@ impl Stage {
             let path = directory.path().join(name);
             fs::write(
                 &path,
-                format!("#!/bin/sh\ndir=$2 id=$4\necho $$ >> $dir/pids\n{body}\n"),
+                format!("#!/bin/sh\ndir=$2 id=$4\necho $$ >> $dir/pids\n{REPORT}\n{body}\n"),
             )
             .unwrap();
             fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
@@ -65,6 +66,7 @@ impl Stage {
             programs,
             actors: vec![ActorId(0), ActorId(1)],
             learner_threads: 1,
+            learner_grace: LEARNER_GRACE,
         };
         Self { directory, plan }
     }
@@ -92,6 +94,24 @@ impl Stage {
         (result, seen)
     }
 
+    /// Adds the actors to a run whose learner is not of our making.
+    fn attach(&self) -> (Result<Ended, SupervisorError>, Seen) {
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .unwrap();
+        let mut seen = Seen::default();
+        let (_sender, mut interrupts) = mpsc::channel(1);
+        let result = runtime.block_on(attach(&self.plan, &mut interrupts, &mut seen));
+        self.assert_nothing_is_left();
+        (result, seen)
+    }
+
+    /// The processes that were started.
+    fn processes(&self) -> usize {
+        fs::read_to_string(self.directory.path().join("pids")).map_or(0, |pids| pids.lines().count())
+    }
+
     /// Neither a process nor a zombie of those that were started.
     fn assert_nothing_is_left(&self) {
         let pids = fs::read_to_string(self.directory.path().join("pids")).unwrap();
@@ -111,10 +131,7 @@ async fn never(_: mpsc::Sender<()>) {}
 
 #[test]
 fn a_run_ends_when_its_learner_does() {
-    let stage = Stage::new(
-        &format!("echo '{PROGRESS}'; echo a remark; touch $dir/stop"),
-        FAITHFUL_ACTOR,
-    );
+    let stage = Stage::new("report 0; echo a remark; touch $dir/stop", FAITHFUL_ACTOR);
     let (result, seen) = stage.run(never);
     assert_eq!(result.unwrap(), Ended::Finished);
     assert_eq!(seen.flights, [7]);
@@ -126,8 +143,7 @@ fn a_dead_actor_is_started_again() {
     let actor = format!(
         "if mkdir $dir/died-$id 2>/dev/null; then kill -9 $$; fi; touch $dir/second-life-$id; {FAITHFUL_ACTOR}"
     );
-    let learner =
-        "while [ ! -e $dir/second-life-0 ] || [ ! -e $dir/second-life-1 ]; do sleep 0.02; done; touch $dir/stop";
+    let learner = "report 0; while [ ! -e $dir/second-life-0 ] || [ ! -e $dir/second-life-1 ]; do sleep 0.02; done; touch $dir/stop";
     let (result, seen) = Stage::new(learner, &actor).run(never);
     assert_eq!(result.unwrap(), Ended::Finished);
     assert!(
@@ -140,7 +156,10 @@ fn a_dead_actor_is_started_again() {
 
 #[test]
 fn a_learner_that_dies_ends_the_run_and_its_last_words_are_told() {
-    let stage = Stage::new("echo 'no such device' >&2; exit 3", "while :; do sleep 0.02; done");
+    let stage = Stage::new(
+        "report 0; echo 'no such device' >&2; exit 3",
+        "while :; do sleep 0.02; done",
+    );
     let (result, _) = stage.run(never);
     let error = result.unwrap_err().to_string();
     assert!(
@@ -164,7 +183,7 @@ fn actors_that_keep_dying_end_the_run_but_what_was_learned_is_saved() {
 
 #[test]
 fn the_first_interruption_stops_in_order() {
-    let stage = Stage::new(&format!("echo '{PROGRESS}'; {ENDLESS_LEARNER}"), FAITHFUL_ACTOR);
+    let stage = Stage::new(ENDLESS_LEARNER, FAITHFUL_ACTOR);
     let learner_up = stage.plan.run.root().join("pids");
     let (result, _) = stage.run(|interrupts| async move {
         until(|| fs::read_to_string(&learner_up).is_ok_and(|pids| pids.lines().count() == 3)).await;
@@ -177,7 +196,7 @@ fn the_first_interruption_stops_in_order() {
 
 #[test]
 fn the_second_interruption_stops_at_once() {
-    let deaf = "trap '' TERM; while :; do sleep 0.02; done";
+    let deaf = "trap '' TERM; report 0; while :; do sleep 0.02; done";
     let stage = Stage::new(deaf, deaf);
     let pids = stage.plan.run.root().join("pids");
     let begun = std::time::Instant::now();
@@ -206,4 +225,78 @@ fn a_program_that_cannot_be_started_leaves_nothing_behind() {
     if stage.has("pids") {
         stage.assert_nothing_is_left();
     }
+}
+
+#[test]
+fn a_learner_that_cannot_start_is_quoted_once_and_no_actor_is_started() {
+    let stage = Stage::new(
+        "echo '2026-01-01 ERROR no such device' >&2; echo 'learner: no such device' >&2; exit 1",
+        FAITHFUL_ACTOR,
+    );
+    let (result, seen) = stage.run(never);
+    assert_eq!(
+        result.unwrap_err().to_string(),
+        "the learner cannot start: no such device"
+    );
+    assert_eq!((&*seen.warnings, stage.processes()), ("", 1));
+}
+
+#[test]
+fn actors_that_find_no_learner_are_not_started_again() {
+    let stage = Stage::new("", "exit 3");
+    let (result, _) = stage.attach();
+    let error = result.unwrap_err().to_string();
+    assert_eq!(
+        error,
+        format!("the learner of {} is gone", stage.directory.path().display())
+    );
+    assert_eq!(stage.processes(), 2);
+}
+
+/// A learner that goes on reporting for a second after it is told to stop, with `$n` counting up, and then saves.
+fn slow_to_stop(report: &str) -> Stage {
+    let learner = format!(
+        "trap 'told=1' TERM; n=0; report 0; while [ -z $told ]; do sleep 0.02; done
+        while [ $n -lt 10 ]; do n=$((n+1)); {report}; sleep 0.1; done; touch $dir/saved $dir/stop"
+    );
+    let mut stage = Stage::new(&learner, FAITHFUL_ACTOR);
+    stage.plan.learner_grace = Duration::from_millis(500);
+    stage
+}
+
+#[test]
+fn a_learner_that_still_updates_is_given_time_to_save() {
+    let stage = slow_to_stop("report $n");
+    let pids = stage.plan.run.root().join("pids");
+    let (result, seen) = stage.run(|interrupts| interrupt_when_all_fly(pids, interrupts));
+    assert_eq!(result.unwrap(), Ended::Interrupted);
+    assert!(stage.has("saved"));
+    assert_eq!(
+        seen.warnings
+            .matches("finishing the updates of this epoch; Ctrl-C again")
+            .count(),
+        1
+    );
+}
+
+#[test]
+fn a_learner_that_only_repeats_itself_is_killed() {
+    let stage = slow_to_stop("report 0");
+    let pids = stage.plan.run.root().join("pids");
+    let (result, seen) = stage.run(|interrupts| interrupt_when_all_fly(pids, interrupts));
+    assert!(
+        matches!(result, Err(SupervisorError::LearnerFailed { .. })),
+        "{result:?}"
+    );
+    assert!(
+        !stage.has("saved") && seen.warnings.contains("killed"),
+        "{}",
+        seen.warnings
+    );
+}
+
+async fn interrupt_when_all_fly(pids: PathBuf, interrupts: mpsc::Sender<()>) {
+    until(|| fs::read_to_string(&pids).is_ok_and(|pids| pids.lines().count() == 3)).await;
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    interrupts.send(()).await.unwrap();
 }
