@@ -13,6 +13,7 @@ mod crew;
 mod log_tail;
 mod process;
 mod restarts;
+mod stop;
 #[cfg(test)]
 mod tests;
 
@@ -32,6 +33,7 @@ use tokio::time::{Instant, sleep_until, timeout};
 use crew::{Crew, GivenUp};
 use log_tail::{last_words, log_tail};
 use process::{Exit, Launch, Order, Orphaned, Output, reap};
+use stop::{Stop, Work};
 
 /// How long the learner may show no progress once it is told to stop: it finishes the updates of its epoch, which show, and saves, which does not.
 pub const LEARNER_GRACE: Duration = Duration::from_secs(90);
@@ -282,63 +284,6 @@ pub async fn attach(
             GivenUp::KeepsDying(_) => SupervisorError::NoActors(reason.to_string()),
         }),
         _ => Ok(ended),
-    }
-}
-
-/// What the learner has done so far, as far as its reports show it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Work {
-    flights: u64,
-    updates: u64,
-    vae_updates: u64,
-}
-
-impl Work {
-    fn of(progress: &Progress) -> Self {
-        Self {
-            flights: progress.flights,
-            updates: progress.updates,
-            vae_updates: progress.vae_updates,
-        }
-    }
-}
-
-/// How far a stop has come.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Stop {
-    NotYet,
-    /// The learner is told; it is killed at the deadline.
-    InOrder {
-        deadline: Instant,
-    },
-    AtOnce,
-}
-
-impl Stop {
-    fn interrupted(self, grace: Duration) -> Self {
-        match self {
-            Self::NotYet => Self::InOrder {
-                deadline: Instant::now() + grace,
-            },
-            Self::InOrder { .. } | Self::AtOnce => Self::AtOnce,
-        }
-    }
-
-    /// A learner that still gets somewhere is not killed.
-    fn progressed(self, grace: Duration) -> Self {
-        match self {
-            Self::InOrder { .. } => Self::InOrder {
-                deadline: Instant::now() + grace,
-            },
-            Self::NotYet | Self::AtOnce => self,
-        }
-    }
-
-    fn deadline(self) -> Option<Instant> {
-        match self {
-            Self::InOrder { deadline } => Some(deadline),
-            Self::NotYet | Self::AtOnce => None,
-        }
     }
 }
 
