@@ -13,6 +13,7 @@ mod generator;
 mod mesh;
 mod opening;
 mod polygon;
+mod whereabouts;
 
 use std::fmt;
 
