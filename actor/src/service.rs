@@ -229,8 +229,8 @@ impl<'a> LearnerLine<'a> {
             .ports
             .wait(self.limits.heartbeat.saturating_sub(self.last_said.elapsed()))
         {
-            // A signal interrupts the wait; anything lasting shows as silence. Either way there is no hurry.
-            debug!(%error, "wait ended early");
+            // Anything lasting shows as silence, so there is no hurry.
+            debug!(%error, "cannot wait for the learner");
             std::thread::sleep(Duration::from_millis(10));
         }
     }

@@ -9,7 +9,8 @@
 //! | `wake-learner`, `wake-actors` | event | both | that there is something to read |
 //!
 //! Nothing here blocks and nothing here is trusted to arrive: iceoryx2 loses samples silently when a peer dies or has not connected yet. Tickets bound
-//! what is in flight, so no buffer can overflow; a flight with a hole is discarded and its ticket issued again; every wait has a deadline.
+//! what is in flight, so no buffer can overflow but that of a process that was stopped, which misses what does not fit; a flight with a hole is discarded
+//! and its ticket issued again; every wait has a deadline.
 //!
 //! Only the learner creates services; everybody else joins those that are there, so that an actor of a run that is over leaves nothing behind.
 //!
@@ -22,7 +23,7 @@ use std::time::{Duration, Instant};
 
 use iceoryx2::config::Config as IceoryxConfig;
 use iceoryx2::node::{Node, NodeState, NodeView};
-use iceoryx2::port::listener::Listener;
+use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -54,6 +55,8 @@ const SNAPSHOT_HISTORY: usize = 4;
 /// Snapshots that exist at once in shared memory: the history, one being written, and those that slow readers still hold.
 const SNAPSHOT_SLOTS: usize = 8;
 
+/// Shortest wait for an event: the system counts in microseconds and takes none of them for no limit at all.
+const SHORTEST_WAIT: Duration = Duration::from_micros(1);
 /// How long an actor waits for a learner that starts at the same time.
 const JOIN_PATIENCE: Duration = Duration::from_secs(20);
 /// Time between two looks whether it is there.
@@ -420,6 +423,15 @@ fn join_learner(identity: &RunIdentity, name: &str, patience: Duration) -> Resul
     Ok(node(identity, name)?)
 }
 
+/// Waits for an event or a signal, not longer than `timeout`.
+fn wait(wake: &Listener<Ipc>, timeout: Duration) -> Result<(), ListenerWaitError> {
+    match wake.timed_wait(|_| {}, timeout.max(SHORTEST_WAIT)) {
+        // A process that was stopped and continued, from a terminal say, is interrupted too; whoever waits looks round and waits again.
+        Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
+        Err(error) => Err(error),
+    }
+}
+
 impl LearnerPorts {
     /// Opens the learner's ends of every service, on the thread that will use them.
     ///
@@ -473,15 +485,12 @@ impl LearnerPorts {
         })
     }
 
-    /// Waits until an actor has something to say, or `timeout` has passed.
+    /// Waits until an actor has something to say, `timeout` has passed, or a signal has come.
     ///
     /// # Errors
     /// [`ServiceError`] when the wait itself fails.
     pub fn wait(&self, timeout: Duration) -> Result<(), ServiceError> {
-        self.wake
-            .timed_wait(|_| {}, timeout)
-            .map(drop)
-            .map_err(failed("wake-learner", "waiting"))
+        wait(&self.wake, timeout).map_err(failed("wake-learner", "waiting"))
     }
 
     /// The next transition record, if one has arrived.
@@ -652,15 +661,12 @@ impl ActorPorts {
         self.run
     }
 
-    /// Waits until the learner has something to say, or `timeout` has passed.
+    /// Waits until the learner has something to say, `timeout` has passed, or a signal has come.
     ///
     /// # Errors
     /// [`ServiceError`] when the wait itself fails.
     pub fn wait(&self, timeout: Duration) -> Result<(), ServiceError> {
-        self.wake
-            .timed_wait(|_| {}, timeout)
-            .map(drop)
-            .map_err(failed("wake-actors", "waiting"))
+        wait(&self.wake, timeout).map_err(failed("wake-actors", "waiting"))
     }
 
     /// A record in shared memory, to be written in place. It holds whatever was in that memory before.
@@ -866,6 +872,33 @@ mod tests {
         }
         for step in 0..records {
             assert_eq!(learner.receive_transition().unwrap().unwrap().step, step as u32);
+        }
+    }
+
+    #[test]
+    fn a_wait_of_no_time_ends() {
+        let (say, heard) = std::sync::mpsc::channel();
+        std::thread::spawn(move || {
+            let run = Run::new();
+            let (learner, actor) = (run.learner().unwrap(), run.actor().unwrap());
+            learner.wait(Duration::ZERO).unwrap();
+            actor.wait(Duration::from_nanos(1)).unwrap();
+            say.send(()).unwrap();
+        });
+        heard.recv_timeout(Duration::from_secs(5)).unwrap();
+    }
+
+    #[test]
+    fn a_process_that_was_stopped_and_continued_goes_on() {
+        let run = Run::new();
+        let (learner, actor) = (run.learner().unwrap(), run.actor().unwrap());
+        for wait in [&|time| learner.wait(time), &|time| actor.wait(time)] as [&dyn Fn(Duration) -> _; 2] {
+            let mut stopper = std::process::Command::new("sh")
+                .args(["-c", "sleep 0.1; kill -STOP $PPID; sleep 0.1; kill -CONT $PPID"])
+                .spawn()
+                .unwrap();
+            wait(Duration::from_secs(1)).unwrap();
+            stopper.wait().unwrap();
         }
     }
 
