@@ -1,0 +1,187 @@
+//! An actor's ends of the services.
+
+use std::time::Duration;
+
+use iceoryx2::node::Node;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::*;
+
+use super::joining::{JOIN_PATIENCE, JoinError, join_learner};
+use super::opening::{Manner, Opener};
+use super::{Ipc, ServiceError, failed, wait};
+use crate::config::Config;
+use crate::ids::RunId;
+use crate::run::RunIdentity;
+use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
+use crate::status::StatusRecord;
+use crate::ticket::ControlRecord;
+use crate::transition::TransitionRecord;
+
+/// A transition record in shared memory, being written.
+pub type LoanedTransition = iceoryx2::sample_mut::SampleMut<Ipc, TransitionRecord, ()>;
+/// Samples an actor loans at one time: the record being completed and the next one, whose image its reward needs.
+const LOANED_RECORDS: usize = 2;
+/// An actor's ends.
+#[derive(Debug)]
+pub struct ActorPorts {
+    run: RunId,
+    layout: SnapshotLayout,
+    transitions: Publisher<Ipc, TransitionRecord, ()>,
+    status: Publisher<Ipc, StatusRecord, ()>,
+    control: Subscriber<Ipc, ControlRecord, ()>,
+    weights: Subscriber<Ipc, [u8], SnapshotHeader>,
+    wake: Listener<Ipc>,
+    wake_learner: Notifier<Ipc>,
+    // Held so that the node outlives its ports and is seen as alive.
+    _node: Node<Ipc>,
+}
+
+impl ActorPorts {
+    /// Opens an actor's ends of every service, on the thread that will use them. Waits a while for a learner that is starting.
+    ///
+    /// # Errors
+    /// [`JoinError::NoLearner`] when none came; nothing is left of the attempt then. [`JoinError::Service`] says which service and what differs.
+    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
+        Self::open_within(JOIN_PATIENCE, identity, config)
+    }
+
+    pub(super) fn open_within(patience: Duration, identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
+        let node = join_learner(identity, "actor", patience)?;
+        let open = Opener::new(&node, Manner::joining(patience), identity, config)?;
+        Ok(Self {
+            run: identity.run,
+            layout: SnapshotLayout::of(config),
+            transitions: open
+                .transitions(config)?
+                .publisher_builder()
+                .max_loaned_samples(LOANED_RECORDS)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+                .map_err(failed("transitions", "publishing"))?,
+            status: open
+                .status()?
+                .publisher_builder()
+                .max_loaned_samples(1)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+                .map_err(failed("status", "publishing"))?,
+            control: open
+                .control(config)?
+                .subscriber_builder()
+                .create()
+                .map_err(failed("control", "subscribing"))?,
+            weights: open
+                .weights()?
+                .subscriber_builder()
+                .create()
+                .map_err(failed("weights", "subscribing"))?,
+            wake: open
+                .event("wake-actors", 1, open.actors)?
+                .listener_builder()
+                .create()
+                .map_err(failed("wake-actors", "listening"))?,
+            wake_learner: open
+                .event("wake-learner", open.actors, 1)?
+                .notifier_builder()
+                .create()
+                .map_err(failed("wake-learner", "notifying"))?,
+            _node: node,
+        })
+    }
+
+    /// The run.
+    pub fn run(&self) -> RunId {
+        self.run
+    }
+
+    /// Waits until the learner has something to say, `timeout` has passed, or a signal has come.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the wait itself fails.
+    pub fn wait(&self, timeout: Duration) -> Result<(), ServiceError> {
+        wait(&self.wake, timeout).map_err(failed("wake-actors", "waiting"))
+    }
+
+    /// A record in shared memory, to be written in place. It holds whatever was in that memory before.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the learner holds all of this actor's memory, which tickets rule out.
+    pub fn loan_transition(&self) -> Result<LoanedTransition, ServiceError> {
+        let sample = self
+            .transitions
+            .loan_uninit()
+            .map_err(failed("transitions", "loaning"))?;
+        // SAFETY: the record is plain data, for which every bit pattern is valid, and the memory is a shared mapping that the operating system
+        // and iceoryx2 have initialised with zeros.
+        Ok(unsafe { sample.assume_init() })
+    }
+
+    /// Sends a record without a copy. That it arrives is not promised: the learner counts.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the connection is broken.
+    pub fn send_transition(&self, record: LoanedTransition) -> Result<(), ServiceError> {
+        record.send().map(drop).map_err(failed("transitions", "sending"))
+    }
+
+    /// Sends a sign of life.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when there is no memory to send it in.
+    pub fn send_status(&self, record: StatusRecord) -> Result<(), ServiceError> {
+        self.status
+            .send_copy(record)
+            .map(drop)
+            .map_err(failed("status", "sending"))
+    }
+
+    /// The next control record, if one has arrived.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the learner's memory cannot be mapped.
+    pub fn receive_control(&self) -> Result<Option<ControlRecord>, ServiceError> {
+        let sample = self.control.receive().map_err(failed("control", "receiving"))?;
+        Ok(sample.map(|sample| *sample))
+    }
+
+    /// The next snapshot, if one has arrived; the inner result says whether it can be flown.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the learner's memory cannot be mapped.
+    pub fn receive_snapshot(&self) -> Result<Option<Result<Snapshot, crate::snapshot::SnapshotError>>, ServiceError> {
+        let sample = self.weights.receive().map_err(failed("weights", "receiving"))?;
+        Ok(sample.map(|sample| Snapshot::receive(sample.user_header(), sample.payload(), self.run, &self.layout)))
+    }
+
+    /// Wakes the learner.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the event cannot be raised.
+    pub fn wake_learner(&self) -> Result<(), ServiceError> {
+        self.wake_learner
+            .notify()
+            .map(drop)
+            .map_err(failed("wake-learner", "notifying"))
+    }
+
+    /// Connects to a learner that has come. To be called regularly.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the learner's memory cannot be mapped.
+    pub fn maintain(&self) -> Result<(), ServiceError> {
+        self.control
+            .update_connections()
+            .map_err(failed("control", "connecting"))?;
+        self.weights
+            .update_connections()
+            .map_err(failed("weights", "connecting"))?;
+        self.transitions
+            .update_connections()
+            .map_err(failed("transitions", "connecting"))?;
+        self.status.update_connections().map_err(failed("status", "connecting"))
+    }
+}

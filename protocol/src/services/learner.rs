@@ -1,0 +1,220 @@
+//! The learner's ends of the services.
+
+use std::time::Duration;
+
+use iceoryx2::node::Node;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::*;
+
+use super::joining::{JOIN_PATIENCE, JoinError, LEARNER, join_learner};
+use super::opening::{Manner, Opener};
+use super::{Ipc, ServiceError, failed, node, wait};
+use crate::config::Config;
+use crate::ids::RunId;
+use crate::run::RunIdentity;
+use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
+use crate::status::StatusRecord;
+use crate::ticket::ControlRecord;
+use crate::transition::TransitionRecord;
+
+/// A transition record in shared memory, received.
+pub type ReceivedTransition = iceoryx2::sample::Sample<Ipc, TransitionRecord, ()>;
+
+/// Snapshots that exist at once in shared memory: the history, one being written, and those that slow readers still hold.
+const SNAPSHOT_SLOTS: usize = 8;
+
+/// The learner's ends.
+#[derive(Debug)]
+pub struct LearnerPorts {
+    run: RunId,
+    layout: SnapshotLayout,
+    transitions: Subscriber<Ipc, TransitionRecord, ()>,
+    status: Subscriber<Ipc, StatusRecord, ()>,
+    control: Publisher<Ipc, ControlRecord, ()>,
+    weights: Publisher<Ipc, [u8], SnapshotHeader>,
+    wake: Listener<Ipc>,
+    wake_actors: Notifier<Ipc>,
+    node: Node<Ipc>,
+}
+
+/// Wakes the learner's receiving thread from another thread of the learner: ports belong to the thread that opened them.
+#[derive(Debug)]
+pub struct LearnerWaker {
+    wake_learner: Notifier<Ipc>,
+    _node: Node<Ipc>,
+}
+
+impl LearnerPorts {
+    /// Opens the learner's ends of every service, on the thread that will use them.
+    ///
+    /// # Errors
+    /// [`ServiceError`] says which service and what differs; a second learner of one run is refused.
+    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
+        let node = node(identity, LEARNER)?;
+        let open = Opener::new(&node, Manner::Create, identity, config)?;
+        let layout = SnapshotLayout::of(config);
+        let weights_factory = open.weights()?;
+        Ok(Self {
+            run: identity.run,
+            transitions: open
+                .transitions(config)?
+                .subscriber_builder()
+                .create()
+                .map_err(failed("transitions", "subscribing"))?,
+            status: open
+                .status()?
+                .subscriber_builder()
+                .create()
+                .map_err(failed("status", "subscribing"))?,
+            control: open
+                .control(config)?
+                .publisher_builder()
+                .max_loaned_samples(1)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+                .map_err(failed("control", "publishing"))?,
+            weights: weights_factory
+                .publisher_builder()
+                .initial_max_slice_len(layout.values() * size_of::<f32>())
+                .allocation_strategy(AllocationStrategy::Static)
+                .max_loaned_samples(1)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .override_sample_preallocation(|worst_case| worst_case.min(SNAPSHOT_SLOTS))
+                .create()
+                .map_err(failed("weights", "publishing"))?,
+            wake: open
+                .event("wake-learner", open.actors, 1)?
+                .listener_builder()
+                .create()
+                .map_err(failed("wake-learner", "listening"))?,
+            wake_actors: open
+                .event("wake-actors", 1, open.actors)?
+                .notifier_builder()
+                .create()
+                .map_err(failed("wake-actors", "notifying"))?,
+            layout,
+            node,
+        })
+    }
+
+    /// Waits until an actor has something to say, `timeout` has passed, or a signal has come.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the wait itself fails.
+    pub fn wait(&self, timeout: Duration) -> Result<(), ServiceError> {
+        wait(&self.wake, timeout).map_err(failed("wake-learner", "waiting"))
+    }
+
+    /// The next transition record, if one has arrived.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when an actor's memory cannot be mapped.
+    pub fn receive_transition(&self) -> Result<Option<ReceivedTransition>, ServiceError> {
+        self.transitions.receive().map_err(failed("transitions", "receiving"))
+    }
+
+    /// The next status record, if one has arrived.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when an actor's memory cannot be mapped.
+    pub fn receive_status(&self) -> Result<Option<StatusRecord>, ServiceError> {
+        let sample = self.status.receive().map_err(failed("status", "receiving"))?;
+        Ok(sample.map(|sample| *sample))
+    }
+
+    /// Sends `record` to the actors connected now; a lost one is made good by the ticket's deadline.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when there is no memory to send it in.
+    pub fn send_control(&self, record: ControlRecord) -> Result<(), ServiceError> {
+        self.control
+            .send_copy(record)
+            .map(drop)
+            .map_err(failed("control", "sending"))
+    }
+
+    /// Copies `snapshot` into shared memory once; every actor reads it there.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when there is no memory to send it in.
+    pub fn publish(&self, snapshot: &Snapshot) -> Result<(), ServiceError> {
+        let bytes: &[u8] = bytemuck::cast_slice(&snapshot.values);
+        let mut sample = self
+            .weights
+            .loan_slice_uninit(bytes.len())
+            .map_err(failed("weights", "loaning"))?;
+        *sample.user_header_mut() = snapshot.header(self.run, &self.layout);
+        sample
+            .write_from_slice(bytes)
+            .send()
+            .map(drop)
+            .map_err(failed("weights", "sending"))
+    }
+
+    /// Wakes all actors that wait.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the event cannot be raised.
+    pub fn wake_actors(&self) -> Result<(), ServiceError> {
+        self.wake_actors
+            .notify()
+            .map(drop)
+            .map_err(failed("wake-actors", "notifying"))
+    }
+
+    /// Connects to actors that have come, hands late joiners the newest snapshots, and reclaims what dead processes held. To be called regularly.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when a peer's memory cannot be mapped.
+    pub fn maintain(&self) -> Result<(), ServiceError> {
+        self.transitions
+            .update_connections()
+            .map_err(failed("transitions", "connecting"))?;
+        self.status
+            .update_connections()
+            .map_err(failed("status", "connecting"))?;
+        self.weights
+            .update_connections()
+            .map_err(failed("weights", "connecting"))?;
+        self.control
+            .update_connections()
+            .map_err(failed("control", "connecting"))?;
+        self.node.try_cleanup_dead_nodes();
+        Ok(())
+    }
+}
+
+impl LearnerWaker {
+    /// Opens the waker, on the thread that will use it.
+    ///
+    /// # Errors
+    /// [`JoinError`] says what differs, or that the receiving thread has not opened its ends.
+    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
+        let node = join_learner(identity, "learner-waker", JOIN_PATIENCE)?;
+        let open = Opener::new(&node, Manner::joining(JOIN_PATIENCE), identity, config)?;
+        let wake_learner = open
+            .event("wake-learner", open.actors, 1)?
+            .notifier_builder()
+            .create()
+            .map_err(failed("wake-learner", "notifying"))?;
+        Ok(Self {
+            wake_learner,
+            _node: node,
+        })
+    }
+
+    /// Wakes the receiving thread.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the event cannot be raised.
+    pub fn wake(&self) -> Result<(), ServiceError> {
+        self.wake_learner
+            .notify()
+            .map(drop)
+            .map_err(failed("wake-learner", "notifying"))
+    }
+}

@@ -1,0 +1,228 @@
+//! Opening services: every name and every limit.
+
+use std::fmt::Debug;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use iceoryx2::node::Node;
+use iceoryx2::prelude::*;
+use iceoryx2::service::port_factory::event;
+
+use super::joining::JOIN_INTERVAL;
+use super::{Ipc, ServiceError, failed};
+use crate::PROTOCOL_VERSION;
+use crate::config::Config;
+use crate::run::RunIdentity;
+use crate::snapshot::{SnapshotHeader, SnapshotLayout};
+use crate::status::StatusRecord;
+use crate::ticket::ControlRecord;
+use crate::transition::TransitionRecord;
+
+/// Records the learner holds while it looks at them.
+const BORROWED_RECORDS: usize = 2;
+/// Snapshots a late joiner still gets: with policy lag 1 two versions are in use, and an evaluation adds a third.
+pub(super) const SNAPSHOT_HISTORY: usize = 4;
+/// How services come to be.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Manner {
+    /// They are created unless they are there.
+    Create,
+    /// They are created by the learner, until the deadline.
+    Join { deadline: Instant },
+}
+
+impl Manner {
+    pub(super) fn joining(patience: Duration) -> Self {
+        Self::Join {
+            deadline: Instant::now() + patience,
+        }
+    }
+}
+
+/// Opens services of one run with the limits its configuration asks for.
+pub(super) struct Opener<'a> {
+    pub(super) node: &'a Node<Ipc>,
+    pub(super) manner: Manner,
+    attributes: AttributeVerifier,
+    pub(super) actors: usize,
+}
+
+/// Creates or joins a service of the [`Opener`], as its manner says. A macro, because builders of different payloads have no trait in common.
+macro_rules! opened {
+    ($opener:expr, $service:expr, $builder:expr) => {
+        match $opener.manner {
+            Manner::Create => $builder
+                .open_or_create_with_attributes(&$opener.attributes)
+                .map_err(failed($service, "opening")),
+            Manner::Join { deadline } => join(deadline, $service, || {
+                $builder.open_with_attributes(&$opener.attributes)
+            }),
+        }
+    };
+}
+
+/// Tries to open a service until it is there and complete, or the deadline has passed.
+fn join<S, E: Debug>(
+    deadline: Instant,
+    service: &'static str,
+    open: impl Fn() -> Result<S, E>,
+) -> Result<S, ServiceError> {
+    loop {
+        match open().map_err(failed(service, "opening")) {
+            Err(error) if error.may_pass() && Instant::now() < deadline => sleep(JOIN_INTERVAL),
+            settled => return settled,
+        }
+    }
+}
+
+impl<'a> Opener<'a> {
+    pub(super) fn new(
+        node: &'a Node<Ipc>,
+        manner: Manner,
+        identity: &RunIdentity,
+        config: &Config,
+    ) -> Result<Self, ServiceError> {
+        let layout = SnapshotLayout::of(config).digest();
+        let mut attributes = AttributeVerifier::new();
+        for (key, value) in [
+            ("protocol", PROTOCOL_VERSION.to_string()),
+            ("run", format!("{:016x}", identity.run.0)),
+            ("config", format!("{:016x}", identity.config_digest)),
+            ("snapshot-layout", format!("{layout:016x}")),
+        ] {
+            let key = key.try_into().map_err(failed("all", "naming an attribute"))?;
+            let value = value
+                .as_str()
+                .try_into()
+                .map_err(failed("all", "setting an attribute"))?;
+            attributes = attributes
+                .require(&key, &value)
+                .map_err(failed("all", "setting an attribute"))?;
+        }
+        // A restarted actor may come before its dead predecessor's slots are reclaimed; the learner's own waker takes one.
+        Ok(Self {
+            node,
+            manner,
+            attributes,
+            actors: 2 * config.transport.max_actors,
+        })
+    }
+
+    pub(super) fn nodes(&self) -> usize {
+        self.actors + 2
+    }
+
+    pub(super) fn transitions(
+        &self,
+        config: &Config,
+    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, TransitionRecord, ()>, ServiceError>
+    {
+        let name = service_name("transitions")?;
+        let builder = || {
+            self.node
+                .service_builder(&name)
+                .publish_subscribe::<TransitionRecord>()
+                .payload_alignment(Alignment::new(64).expect("64 is a power of two"))
+                .max_publishers(self.actors)
+                .max_subscribers(1)
+                .max_nodes(self.nodes())
+                // Every flight an actor holds a ticket for fits whole, so a record is never refused for want of room.
+                .subscriber_max_buffer_size(
+                    config.transport.max_records_per_flight * config.transport.tickets_per_actor,
+                )
+                .subscriber_max_borrowed_samples(BORROWED_RECORDS)
+                .history_size(0)
+                .enable_safe_overflow(false)
+        };
+        opened!(self, "transitions", builder())
+    }
+
+    pub(super) fn status(
+        &self,
+    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, StatusRecord, ()>, ServiceError>
+    {
+        let name = service_name("status")?;
+        let builder = || {
+            self.node
+                .service_builder(&name)
+                .publish_subscribe::<StatusRecord>()
+                .max_publishers(self.actors)
+                .max_subscribers(1)
+                .max_nodes(self.nodes())
+                .subscriber_max_buffer_size(8)
+                .subscriber_max_borrowed_samples(1)
+                // A late joiner of a learner, or a restarted one, hears of its actors at once.
+                .history_size(1)
+                // Only the newest signs of life matter.
+                .enable_safe_overflow(true)
+        };
+        opened!(self, "status", builder())
+    }
+
+    pub(super) fn control(
+        &self,
+        config: &Config,
+    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, ControlRecord, ()>, ServiceError>
+    {
+        let name = service_name("control")?;
+        let builder = || {
+            self.node
+                .service_builder(&name)
+                .publish_subscribe::<ControlRecord>()
+                .max_publishers(1)
+                .max_subscribers(self.actors)
+                .max_nodes(self.nodes())
+                // All tickets pass by every actor: room for everyone's while this one flies.
+                .subscriber_max_buffer_size(4 * config.transport.max_actors * config.transport.tickets_per_actor + 64)
+                .subscriber_max_borrowed_samples(1)
+                .history_size(0)
+                .enable_safe_overflow(false)
+        };
+        opened!(self, "control", builder())
+    }
+
+    pub(super) fn weights(
+        &self,
+    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, [u8], SnapshotHeader>, ServiceError>
+    {
+        let name = service_name("weights")?;
+        let builder = || {
+            self.node
+                .service_builder(&name)
+                .publish_subscribe::<[u8]>()
+                .user_header::<SnapshotHeader>()
+                .max_publishers(1)
+                .max_subscribers(self.actors)
+                .max_nodes(self.nodes())
+                .subscriber_max_buffer_size(SNAPSHOT_HISTORY)
+                .subscriber_max_borrowed_samples(1)
+                .history_size(SNAPSHOT_HISTORY)
+                // The newest snapshots win.
+                .enable_safe_overflow(true)
+        };
+        opened!(self, "weights", builder())
+    }
+
+    pub(super) fn event(
+        &self,
+        name: &'static str,
+        notifiers: usize,
+        listeners: usize,
+    ) -> Result<event::PortFactory<Ipc>, ServiceError> {
+        let service = service_name(name)?;
+        let builder = || {
+            self.node
+                .service_builder(&service)
+                .event()
+                .max_notifiers(notifiers)
+                .max_listeners(listeners)
+                .max_nodes(self.nodes())
+                .event_id_max_value(1)
+        };
+        opened!(self, name, builder())
+    }
+}
+
+fn service_name(name: &'static str) -> Result<ServiceName, ServiceError> {
+    name.try_into().map_err(failed(name, "naming"))
+}
