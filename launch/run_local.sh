@@ -21,7 +21,7 @@ Ctrl-C stops in order: flights in the air are abandoned, the updates of the epoc
 second Ctrl-C stops at once.
 RUST_LOG=debug makes the logs in DIR/logs say more; SKEIN_LOG_FORMAT=json writes them as one JSON object a line.
 
-Exit status: 0 finished, 1 failed, 130 interrupted.
+Exit status: 0 finished, 1 failed, 2 called wrongly, 130 interrupted.
 END
 
 build

@@ -47,12 +47,13 @@ fn sentence(summary: &Summary) -> String {
         Ending::Interrupted => "Interrupted",
     };
     format!(
-        "{ending} after {}: {} flights, {} steps, {} updates, {} VAE updates. Policy {}.\n",
+        "{ending} after {}: {} flights, {} steps, {} updates, {} VAE updates. Final policy (version {}): {}.\n",
         Clock(summary.wall_secs),
         summary.flights,
         summary.steps,
         summary.updates,
         summary.vae_updates,
+        summary.final_version,
         summary.policy_sha256.get(..16).unwrap_or(&summary.policy_sha256)
     )
 }

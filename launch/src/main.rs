@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use clap::{Args, Parser, Subcommand};
 use skein_launch::conclusion::conclusion;
 use skein_launch::display::Display;
-use skein_launch::prepare::{Prepared, load_courses, prepare};
+use skein_launch::prepare::{Prepared, ideal_walls_passed, load_courses, prepare};
 use skein_launch::reports;
 use skein_launch::supervisor::{self, Ended, Plan, Programs};
 use skein_protocol::config::Config;
@@ -110,6 +110,12 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         config.run.seed
     );
     eprintln!("skein: everything goes to {}", run.root().display());
+    if !config.courses.evaluation.contains(&config.courses.training) {
+        eprintln!(
+            "skein: note: the training course is not among courses.evaluation; the best snapshot is chosen on {}",
+            courses.first().map_or("none", |course| &course.name)
+        );
+    }
 
     let plan = Plan {
         run: run.clone(),
@@ -127,7 +133,8 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     identity.remove_transport();
 
     // Plots are a service: a run that failed may have left something worth looking at, and one that succeeded has, plots or not.
-    if let Err(error) = reports::draw_all(run, courses, config.evaluation.window_flights as usize) {
+    let window = config.evaluation.window_flights as usize;
+    if let Err(error) = reports::draw_all(run, courses, window, ideal_walls_passed(config)?) {
         eprintln!("skein: not all plots could be drawn: {error}");
     }
     let ended = outcome??;
@@ -167,7 +174,8 @@ fn report(arguments: &ReportArguments) -> anyhow::Result<Ended> {
     let run = open(&arguments.run)?;
     let config = Config::load(&run.config(), &[])?;
     let courses = load_courses(&config)?;
-    for picture in reports::draw_all(&run, &courses, config.evaluation.window_flights as usize)? {
+    let window = config.evaluation.window_flights as usize;
+    for picture in reports::draw_all(&run, &courses, window, ideal_walls_passed(&config)?)? {
         println!("{}", picture.display());
     }
     Ok(Ended::Finished)

@@ -175,6 +175,16 @@ pub fn load_courses(config: &Config) -> Result<Vec<NamedCourse>, CourseError> {
     config.courses.evaluation.iter().map(load).collect()
 }
 
+/// Walls that an agent which passes every wall of the training course would pass a flight, on average over all start levels.
+///
+/// # Errors
+/// [`CourseError`] names the file, the wall and the key.
+pub fn ideal_walls_passed(config: &Config) -> Result<f64, CourseError> {
+    let walls = Course::load(&config.courses.training)?.levels();
+    // From level l, all but the first l - 1 walls lie ahead.
+    Ok(f64::from(walls) - (f64::from(config.learning.levels) - 1.0) / 2.0)
+}
+
 /// The `[simulator]` section with the defaults of all that was not set: what was flown stays known when the defaults change.
 fn written_out(settings: &SimulatorSettings) -> toml::Table {
     // By way of text: a number of single precision would drag the digits of its double along.

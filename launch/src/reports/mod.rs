@@ -50,11 +50,16 @@ pub enum ReportError {
 
 /// Draws every plot whose input the run left, and returns the pictures. A run that ended early has fewer.
 ///
-/// `courses` are those of the final evaluation; `window` is the number of flights averaged over.
+/// `courses` are those of the final evaluation; `window` is the number of flights averaged over, and `ideal_walls_passed` what a perfect agent would average.
 ///
 /// # Errors
 /// [`ReportError`] names the file that is there but cannot be used, or the picture that cannot be written.
-pub fn draw_all(run: &RunDirectory, courses: &[NamedCourse], window: usize) -> Result<Vec<PathBuf>, ReportError> {
+pub fn draw_all(
+    run: &RunDirectory,
+    courses: &[NamedCourse],
+    window: usize,
+    ideal_walls_passed: f64,
+) -> Result<Vec<PathBuf>, ReportError> {
     let mut pictures = Vec::new();
     let mut picture = |name: &str| {
         let path = run.plots().join(name);
@@ -63,10 +68,8 @@ pub fn draw_all(run: &RunDirectory, courses: &[NamedCourse], window: usize) -> R
     };
     if let Some(path) = existing(run.flights_csv()) {
         let flights = curves::read_flights(&path)?;
-        // An evaluation course stands for the training course here: all start levels in turn leave (n + 1) / 2 walls on average.
-        let walls = courses.first().map_or(0, |course| course.course.walls().len());
         curves::draw_return(&flights, window, &picture("return.png"))?;
-        curves::draw_walls_passed(&flights, window, (walls + 1) as f64 / 2.0, &picture("walls_passed.png"))?;
+        curves::draw_walls_passed(&flights, window, ideal_walls_passed, &picture("walls_passed.png"))?;
     }
     if let Some(path) = existing(run.reconstructions()) {
         reconstructions::draw(&reconstructions::Pairs::read(&path)?, &picture("reconstructions.png"))?;
@@ -121,7 +124,7 @@ mod tests {
         let tensors = [("depth", view.clone()), ("reconstruction", view)];
         fs::write(run.reconstructions(), safetensors::serialize(tensors, None).unwrap()).unwrap();
 
-        let pictures = draw_all(&run, &[training()], 50).unwrap();
+        let pictures = draw_all(&run, &[training()], 50, 3.0).unwrap();
         assert_eq!(pictures.len(), 4);
         for picture in pictures {
             let bytes = fs::read(&picture).unwrap();
@@ -137,8 +140,8 @@ mod tests {
     fn a_run_that_ended_early_has_the_pictures_it_can_have() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
-        assert!(draw_all(&run, &[training()], 50).unwrap().is_empty());
+        assert!(draw_all(&run, &[training()], 50, 3.0).unwrap().is_empty());
         write_flights(&run);
-        assert_eq!(draw_all(&run, &[training()], 50).unwrap().len(), 2);
+        assert_eq!(draw_all(&run, &[training()], 50, 3.0).unwrap().len(), 2);
     }
 }
