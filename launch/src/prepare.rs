@@ -297,8 +297,7 @@ fn copy_courses(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
         source,
     })?;
     let mut copies: BTreeMap<OsString, PathBuf> = BTreeMap::new();
-    let courses = &mut config.courses;
-    for path in courses.evaluation.iter_mut().chain([&mut courses.training]) {
+    for path in config.courses.paths_mut() {
         let stem = CoursesSection::name_of(path);
         let mut name = OsString::from(format!("{stem}.toml"));
         for number in 2.. {
