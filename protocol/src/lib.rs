@@ -8,6 +8,7 @@
 pub mod config;
 pub mod evaluation;
 pub mod failure;
+pub mod fault;
 pub mod ids;
 pub mod logging;
 pub mod progress;
