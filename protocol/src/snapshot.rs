@@ -8,6 +8,7 @@ use std::fs;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use sha2::{Digest, Sha256};
@@ -120,7 +121,7 @@ impl SnapshotLayout {
 }
 
 /// What precedes a snapshot's values in shared memory.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
 #[type_name("skein.SnapshotHeader.v1")]
 pub struct SnapshotHeader {
@@ -299,7 +300,15 @@ impl Snapshot {
             path: path.to_owned(),
             source,
         })?;
-        parse_file(&bytes).map_err(|problem| SnapshotError::Format {
+        Self::parse(&bytes, path)
+    }
+
+    /// Reads a snapshot from the `bytes` of a snapshot file. `path` is named in errors only.
+    ///
+    /// # Errors
+    /// As [`Snapshot::load`].
+    pub fn parse(bytes: &[u8], path: &Path) -> Result<(Self, Config), SnapshotError> {
+        parse_file(bytes).map_err(|problem| SnapshotError::Format {
             path: path.to_owned(),
             problem,
         })

@@ -1,11 +1,12 @@
 //! What an actor tells the learner besides its flights: that it is there, and that it lives.
 
+use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::ids::{ActorId, Incarnation, PolicyVersion, RunId};
 
 /// Sign of life of an actor, sent at its start, at every heartbeat and at its end.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
 #[type_name("skein.StatusRecord.v1")]
 pub struct StatusRecord {

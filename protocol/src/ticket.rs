@@ -3,6 +3,7 @@
 //! A flight is flown only against a ticket, and two actors that hold the same ticket fly the same flight, bit for bit. The learner sends tickets inside
 //! [`ControlRecord`]s, the one fixed-size message that actors listen to.
 
+use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion, RunId};
@@ -62,7 +63,7 @@ pub enum Control {
 }
 
 /// [`Control`] on the wire, addressed to one actor or, for heartbeats and the stop, to all.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
 #[type_name("skein.ControlRecord.v1")]
 pub struct ControlRecord {

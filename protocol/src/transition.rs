@@ -12,6 +12,10 @@ use crate::ids::{ActorId, Incarnation};
 use crate::ticket::Ticket;
 use crate::{ACTION, IMAGE_PIXELS, LATENT};
 
+/// No number of a sound record is larger: rewards end at 4 · 10⁶ by their settings, corridors at 1 km. The learner squares what it learns from, and single
+/// precision ends at 3 · 10³⁸.
+pub const LARGEST_NUMBER: f32 = 1e7;
+
 /// One step of a flight on the wire. Every bit pattern is a valid value of every field's type; [`TransitionRecord::check`] says whether it makes sense.
 #[derive(Debug, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
@@ -187,22 +191,19 @@ impl TransitionRecord {
         if kind != RecordKind::Failed {
             self.check_numbers()?;
         }
-        if kind == RecordKind::Closing && Outcome::from_code(self.outcome).is_none() {
-            return Err(RecordFault::Code {
-                name: "outcome",
-                value: self.outcome,
-            });
+        if kind == RecordKind::Closing {
+            self.check_ending()?;
         }
         Ok(kind)
     }
 
     fn check_numbers(&self) -> Result<(), RecordFault> {
-        let finite = |name, values: &[f32]| {
-            if values.iter().all(|value| value.is_finite()) {
-                Ok(())
-            } else {
-                Err(RecordFault::NotFinite { name })
-            }
+        let usual = -LARGEST_NUMBER..=LARGEST_NUMBER;
+        // A NaN is in no range.
+        let finite = |name, values: &[f32]| match values.iter().find(|value| !usual.contains(value)) {
+            None => Ok(()),
+            Some(value) if value.is_finite() => Err(RecordFault::TooLarge { name, value: *value }),
+            Some(_) => Err(RecordFault::NotFinite { name }),
         };
         finite("position_m", &self.position_m)?;
         finite("orientation", &self.orientation)?;
@@ -225,6 +226,17 @@ impl TransitionRecord {
         }
         Ok(())
     }
+
+    fn check_ending(&self) -> Result<(), RecordFault> {
+        let (name, value) = if Outcome::from_code(self.outcome).is_none() {
+            ("outcome", self.outcome)
+        } else if self.walls_passed > self.course_walls {
+            ("walls_passed", self.walls_passed)
+        } else {
+            return Ok(());
+        };
+        Err(RecordFault::Code { name, value })
+    }
 }
 
 /// Why a record is not believed.
@@ -240,8 +252,8 @@ pub enum RecordFault {
         /// The value it should have.
         expected: u64,
     },
-    /// A field has a value this version does not know.
-    #[error("{name} has the unknown value {value}")]
+    /// A field has a value that no flight gives it.
+    #[error("{name} has the impossible value {value}")]
     Code {
         /// The field.
         name: &'static str,
@@ -253,6 +265,20 @@ pub enum RecordFault {
     NotFinite {
         /// The field.
         name: &'static str,
+    },
+    /// A field holds a number beyond anything that is simulated.
+    #[error("{name} holds {value}, beyond {LARGEST_NUMBER}")]
+    TooLarge {
+        /// The field.
+        name: &'static str,
+        /// The number.
+        value: f32,
+    },
+    /// The flight goes on and on.
+    #[error("the flight has more than the {most} records of transport.max_records_per_flight")]
+    TooLong {
+        /// Records of the longest flight.
+        most: usize,
     },
     /// An action no policy of ours chooses.
     #[error("action {action:?} is outside [-1, 1]")]
@@ -316,8 +342,15 @@ mod tests {
         assert!(check(|r| r.kind = 9).contains("kind"));
         assert!(check(|r| r.kind = RecordKind::Closing.code()).contains("outcome"));
         assert!(check(|r| r.latent[3] = f32::NAN).contains("latent"));
-        assert!(check(|r| r.reward = f32::INFINITY).contains("reward"));
+        assert!(check(|r| r.reward = f32::INFINITY).contains("reward is not finite"));
+        assert!(check(|r| r.velocity_mps[1] = -1e8).contains("velocity_mps holds -100000000"));
         assert!(check(|r| r.action = [0.0, 1.5]).contains("action"));
         assert!(check(|r| r.terminated = 2).contains("terminated"));
+        let closes = |r: &mut TransitionRecord| {
+            r.kind = RecordKind::Closing.code();
+            r.outcome = Outcome::ReachedEnd.code();
+            (r.walls_passed, r.course_walls) = (6, 5);
+        };
+        assert!(check(closes).contains("walls_passed has the impossible value 6"));
     }
 }

@@ -25,6 +25,7 @@ pub struct Assembly {
     incarnation: Incarnation,
     flight: CommittedFlight,
     keep: Keep,
+    longest_records: usize,
 }
 
 /// What a record did to its flight.
@@ -39,8 +40,15 @@ pub enum Assembled {
 }
 
 impl Assembly {
-    /// Nothing of `ticket`'s flight yet.
-    pub fn new(ticket: Ticket, epoch: Epoch, keep: Keep, actor: ActorId, incarnation: Incarnation) -> Self {
+    /// Nothing of `ticket`'s flight yet, which has at most `longest_records`.
+    pub fn new(
+        ticket: Ticket,
+        epoch: Epoch,
+        keep: Keep,
+        longest_records: usize,
+        actor: ActorId,
+        incarnation: Incarnation,
+    ) -> Self {
         let flight = CommittedFlight {
             flight: ticket.flight,
             epoch,
@@ -63,6 +71,7 @@ impl Assembly {
             incarnation,
             flight,
             keep,
+            longest_records,
         }
     }
 
@@ -80,6 +89,10 @@ impl Assembly {
         let kind = record.check(&self.ticket, self.actor, self.incarnation, step)?;
         if kind == RecordKind::Failed {
             return Ok(Assembled::Failed);
+        }
+        if self.flight.observations.len() == self.longest_records {
+            let most = self.longest_records;
+            return Err(RecordFault::TooLong { most });
         }
         self.flight.observations.push(StepObservation {
             latent: record.latent,
@@ -115,7 +128,15 @@ impl Assembly {
         self.flight.outcome = outcome;
         self.flight.walls_passed = record.walls_passed;
         self.flight.course_walls = record.course_walls;
-        let empty = Self::new(self.ticket, self.flight.epoch, self.keep, self.actor, self.incarnation);
+        let (epoch, longest_records) = (self.flight.epoch, self.longest_records);
+        let empty = Self::new(
+            self.ticket,
+            epoch,
+            self.keep,
+            longest_records,
+            self.actor,
+            self.incarnation,
+        );
         Ok(std::mem::replace(self, empty).flight)
     }
 }
@@ -148,7 +169,7 @@ mod tests {
     }
 
     fn assembly(keep: Keep) -> Assembly {
-        Assembly::new(ticket(), Epoch(0), keep, ACTOR, LIFE)
+        Assembly::new(ticket(), Epoch(0), keep, STEPS as usize + 1, ACTOR, LIFE)
     }
 
     /// Record `step`, its image filled with its number.
@@ -188,6 +209,27 @@ mod tests {
             assert_eq!(fault, RecordFault::Mismatch { name, found, expected });
         }
         assert_eq!(assemble(Keep::Latents).policy_version, PolicyVersion(3));
+    }
+
+    #[test]
+    fn a_flight_that_never_ends_is_refused_at_its_limit() {
+        let mut assembly = assembly(Keep::Depth);
+        for step in 0..STEPS {
+            assembly.push(&record(step)).unwrap();
+        }
+        let onward = |step| {
+            let mut record = record(step);
+            record.kind = RecordKind::Step.code();
+            record
+        };
+        assert!(matches!(assembly.push(&onward(STEPS)), Ok(Assembled::Step)));
+        let fault = assembly.push(&onward(STEPS + 1)).unwrap_err();
+        assert_eq!(
+            fault,
+            RecordFault::TooLong {
+                most: STEPS as usize + 1
+            }
+        );
     }
 
     #[test]

@@ -281,7 +281,8 @@ impl Desk {
                 break;
             };
             messages.push(ControlRecord::fly(&order.ticket, id, actor.incarnation));
-            let assembly = Assembly::new(order.ticket, order.epoch, order.keep, id, actor.incarnation);
+            let longest = self.limits.max_records_per_flight;
+            let assembly = Assembly::new(order.ticket, order.epoch, order.keep, longest, id, actor.incarnation);
             actor.tickets.push_back(Issued {
                 order,
                 since: now,

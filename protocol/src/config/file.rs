@@ -103,7 +103,15 @@ impl Config {
             path: path.to_owned(),
             source,
         })?;
-        let mut table: Table = toml::from_str(&text).map_err(|source| ConfigError::Syntax {
+        Self::parse(&text, path, overrides)
+    }
+
+    /// Reads a configuration from the `text` of a configuration file at `path`, as [`Config::load`] does, but for telling which override is to blame.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names file, key, value and remedy.
+    pub fn parse(text: &str, path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let mut table: Table = toml::from_str(text).map_err(|source| ConfigError::Syntax {
             path: path.to_owned(),
             source: Box::new(source),
         })?;

@@ -1,0 +1,13 @@
+//! Tells the linker where libtorch lies at run time, so that tests start without `LD_LIBRARY_PATH`; and the tests what they are built for.
+
+fn main() {
+    println!("cargo:rerun-if-changed=build.rs");
+    println!("cargo:rerun-if-env-changed=DEP_TCH_LIBTORCH_LIB");
+    if let Ok(target) = std::env::var("TARGET") {
+        println!("cargo:rustc-env=SKEIN_TARGET={target}");
+    }
+    // Set by torch-sys for the packages that depend on it directly.
+    if let Ok(libtorch) = std::env::var("DEP_TCH_LIBTORCH_LIB") {
+        println!("cargo:rustc-link-arg=-Wl,-rpath,{libtorch}");
+    }
+}

@@ -1,0 +1,131 @@
+//! Configuration files, the overrides of a command line, and the simulator's section.
+
+use std::path::Path;
+use std::sync::{Arc, LazyLock};
+
+use skein_protocol::config::{Config, ConfigError, culprit};
+use skein_protocol::snapshot::SnapshotLayout;
+use skein_simulator::course::Course;
+use skein_simulator::simulator::{Simulator, SimulatorSettings};
+
+use super::courses::{assert_flyable, fly};
+use super::{Target, shipped, text};
+
+pub(super) const CONFIG: Target = Target {
+    name: "config",
+    reads: "configuration files",
+    longest_bytes: 8192,
+    samples: config_samples,
+    run: |bytes| {
+        if let Some(text) = text(bytes) {
+            check(Config::parse(text, file(), &[]));
+        }
+    },
+};
+
+pub(super) const OVERRIDES: Target = Target {
+    name: "overrides",
+    reads: "--set arguments, one a line",
+    longest_bytes: 4096,
+    samples: override_samples,
+    run: overridden,
+};
+
+pub(super) const SIMULATOR: Target = Target {
+    name: "simulator",
+    reads: "the configuration's [simulator] section, and flies with it",
+    longest_bytes: 4096,
+    samples: simulator_samples,
+    run: simulated,
+};
+
+fn file() -> &'static Path {
+    Path::new("/somewhere/fuzzed.toml")
+}
+
+fn config_samples() -> Vec<Vec<u8>> {
+    let mut samples = [
+        "configs/local.toml",
+        "configs/smoke.toml",
+        "configs/paper.toml",
+        "tests/small.toml",
+    ]
+    .map(shipped)
+    .to_vec();
+    samples.push(Config::default().to_toml().into_bytes());
+    samples.push(Vec::new());
+    samples
+}
+
+/// What is accepted reads back the same; what is refused is refused by its file.
+fn check(read: Result<Config, ConfigError>) {
+    match read {
+        Ok(config) => {
+            let again = Config::parse(&config.to_toml(), file(), &[]).unwrap();
+            // As text: the simulator's section, which this reader passes on, may hold what is not equal to itself.
+            assert_eq!(again.to_toml(), config.to_toml());
+            assert_eq!(again.digest(), config.digest());
+            assert!(SnapshotLayout::of(&config).values() > 0);
+            assert!(!config.transport.heartbeat().is_zero());
+        }
+        Err(error) => {
+            let told = error.to_string();
+            assert!(told.contains("fuzzed.toml") || told.contains("--set"), "{told}");
+        }
+    }
+}
+
+fn override_samples() -> Vec<Vec<u8>> {
+    [
+        "run.seed=7\nrun.device=cuda:1\nsimulator.vehicle.preset=point",
+        "courses.training=a/b.toml\ncourses.evaluation=[\"c.toml\", \"/d.toml\"]\nsac.target_entropy=auto",
+        "learning.observation=latent+velocity\nlearning.warmup_steps=100000\nreplay.capacity=1000",
+        "simulator.generator.shapes=[\"cross\", \"l\"]\ncheckpoints.keep = 3\ntransport.actor_silence_secs=0.5",
+    ]
+    .map(|text| text.as_bytes().to_vec())
+    .to_vec()
+}
+
+fn overridden(bytes: &[u8]) {
+    let Some(text) = text(bytes) else { return };
+    let overrides: Vec<String> = text.split('\n').take(8).map(str::to_owned).collect();
+    let parse = |overrides: &[String]| Config::parse("", file(), overrides);
+    let read = parse(&overrides);
+    if read.is_err() {
+        // The empty file is sound: whatever is wrong, an override brought it about.
+        let told = |overrides: &[String]| parse(overrides).err().map(|error| error.to_string());
+        assert!(culprit(&overrides, told).is_some());
+    }
+    check(read);
+}
+
+fn simulator_samples() -> Vec<Vec<u8>> {
+    let mut samples = vec![toml::to_string(&SimulatorSettings::default()).unwrap().into_bytes()];
+    samples.extend(
+        [
+            "max_steps = 3\n[vehicle]\npreset = \"hummingbird\"\nforward_speed_mps = 10.0\ncontrol_period_secs = 0.01\n",
+            "[vehicle]\npreset = \"point\"\npoint_time_constant_secs = 0.01\nphysics_hz = 10000.0\n",
+            "[camera]\nhorizontal_fov_deg = 150.0\nmount_m = [2.0, -2.0, 2.0]\nmount_pitch_deg = 90.0\n[reward]\ncollision = -1e6\n",
+        ]
+        .map(|text| text.as_bytes().to_vec()),
+    );
+    samples
+}
+
+static TRAINING: LazyLock<Arc<Course>> = LazyLock::new(|| {
+    let text = String::from_utf8(shipped("configs/courses/training.toml")).unwrap();
+    Arc::new(Course::parse(&text, "training.toml").unwrap())
+});
+
+/// Settings that are accepted can be flown with.
+fn simulated(bytes: &[u8]) {
+    let Some(Ok(settings)) = text(bytes).map(toml::from_str::<SimulatorSettings>) else {
+        return;
+    };
+    if let Ok(mut simulator) = Simulator::new(Arc::clone(&TRAINING), &settings) {
+        fly(&mut simulator, &settings, 1);
+    }
+    if let Ok(course) = Course::generate(0, &settings.generator) {
+        assert_flyable(course);
+    }
+}

@@ -1,0 +1,61 @@
+//! What reads bytes from outside, one module a subject.
+
+mod configuration;
+mod courses;
+mod records;
+mod signals;
+mod snapshots;
+
+use crate::allocations;
+
+/// A reader of outside bytes.
+#[derive(Debug)]
+pub struct Target {
+    /// Its name, and that of its folder in the corpus.
+    pub name: &'static str,
+    /// What it reads, for who chooses one.
+    pub reads: &'static str,
+    /// Inputs longer than this show nothing that shorter ones do not.
+    pub longest_bytes: usize,
+    /// Valid inputs, made by the code that writes them or from what is shipped: no format has to be kept in step by hand.
+    pub samples: fn() -> Vec<Vec<u8>>,
+    /// Reads the input; panics when a promise is broken.
+    pub run: fn(&[u8]),
+}
+
+impl Target {
+    /// Reads `bytes`.
+    ///
+    /// # Panics
+    /// When the reader does, breaks a promise, or allocates without bounds.
+    pub fn exercise(&self, bytes: &[u8]) {
+        allocations::forget();
+        (self.run)(bytes);
+        allocations::check();
+    }
+}
+
+/// All of them.
+pub static TARGETS: [Target; 10] = [
+    configuration::CONFIG,
+    configuration::OVERRIDES,
+    configuration::SIMULATOR,
+    courses::FILE,
+    courses::LAYOUT,
+    courses::GENERATOR,
+    records::RECORDS,
+    signals::SIGNALS,
+    snapshots::FILE,
+    snapshots::RECEIVED,
+];
+
+/// A file of the repository, by its path from the root.
+fn shipped(path: &str) -> Vec<u8> {
+    let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
+    std::fs::read(format!("{root}/{path}")).unwrap()
+}
+
+/// The input as text; what is not UTF-8 is refused by whoever opens a file, before any reader of ours sees it.
+fn text(bytes: &[u8]) -> Option<&str> {
+    std::str::from_utf8(bytes).ok()
+}

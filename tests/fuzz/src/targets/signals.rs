@@ -1,0 +1,67 @@
+//! Status and control records, bit for bit: what is believed says the same when it is written again.
+
+use bytemuck::{Pod, Zeroable, bytes_of, pod_read_unaligned};
+use skein_protocol::ids::{ActorId, Incarnation, PolicyVersion, RunId};
+use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
+use skein_protocol::ticket::{Control, ControlRecord};
+
+use super::Target;
+use super::records::sample_ticket;
+
+pub(super) const SIGNALS: Target = Target {
+    name: "signals",
+    reads: "status and control records",
+    longest_bytes: 128,
+    samples: signal_samples,
+    run: |bytes| {
+        status(pod(bytes), run_of(bytes));
+        control(pod(bytes), run_of(bytes));
+    },
+};
+
+fn signal_samples() -> Vec<Vec<u8>> {
+    let status = ActorStatus {
+        actor: ActorId(3),
+        incarnation: Incarnation(7),
+        pid: 4711,
+        state: ActorState::Serving,
+        newest_policy: Some(PolicyVersion(2)),
+        flights_flown: 12,
+    };
+    let run = RunId(1);
+    vec![
+        bytes_of(&StatusRecord::new(run, &status)).to_vec(),
+        bytes_of(&ControlRecord::fly(&sample_ticket(5), ActorId(3), Incarnation(7))).to_vec(),
+        bytes_of(&ControlRecord::heartbeat(run)).to_vec(),
+        bytes_of(&ControlRecord::stop(run)).to_vec(),
+    ]
+}
+
+/// The record that `bytes` are, zeros where they end too early.
+pub(super) fn pod<T: Pod + Zeroable>(bytes: &[u8]) -> T {
+    let mut padded = vec![0; size_of::<T>()];
+    let given = bytes.len().min(padded.len());
+    padded[..given].copy_from_slice(&bytes[..given]);
+    pod_read_unaligned(&padded)
+}
+
+/// Both kinds of records begin with their run: taken from there, it never hides the rest from its reader.
+fn run_of(bytes: &[u8]) -> RunId {
+    RunId(pod(bytes))
+}
+
+fn status(record: StatusRecord, run: RunId) {
+    assert_eq!(record.read(RunId(!run.0)), None);
+    if let Some(status) = record.read(run) {
+        assert_eq!(StatusRecord::new(run, &status).read(run), Some(status));
+    }
+}
+
+fn control(record: ControlRecord, run: RunId) {
+    assert!(record.read(RunId(!run.0)).is_err());
+    if let Ok(Control::Fly(ticket)) = record.read(run) {
+        let again = ControlRecord::fly(&ticket, ActorId(1), Incarnation(2));
+        assert_eq!(again.read(run), Ok(Control::Fly(ticket)));
+        assert!(ticket.start_level > 0);
+    }
+}

@@ -1,0 +1,132 @@
+//! Snapshots, from a file and off the wire. A sound one is 3 MB of parameters; inputs change some of them, the header, and the length.
+
+use std::cell::RefCell;
+use std::path::Path;
+use std::sync::LazyLock;
+
+use bytemuck::{bytes_of, cast_slice};
+use skein_protocol::config::Config;
+use skein_protocol::ids::{PolicyVersion, RunId};
+use skein_protocol::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
+
+use super::Target;
+use super::signals::pod;
+use crate::script::Script;
+
+pub(super) const FILE: Target = Target {
+    name: "snapshot_file",
+    reads: "snapshot files: the safetensors header and metadata, before sound parameters",
+    longest_bytes: 1 << 14,
+    samples: || vec![SOUND.header.clone()],
+    run: file,
+};
+
+pub(super) const RECEIVED: Target = Target {
+    name: "snapshot_received",
+    reads: "snapshots off the wire: header, then changes to a sound one's bytes",
+    longest_bytes: 256,
+    samples: received_samples,
+    run: received,
+};
+
+const RUN: RunId = RunId(1);
+
+/// The file of a small policy's snapshot, cut in two.
+struct Sound {
+    layout: SnapshotLayout,
+    snapshot: Snapshot,
+    /// With its length before it.
+    header: Vec<u8>,
+    values: Vec<u8>,
+}
+
+static SOUND: LazyLock<Sound> = LazyLock::new(|| {
+    let mut config = Config::default();
+    config.sac.hidden_width = 1;
+    let layout = SnapshotLayout::of(&config);
+    let snapshot = Snapshot {
+        version: PolicyVersion(3),
+        values: (0..layout.values()).map(|index| (index as f32).sin()).collect(),
+    };
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("sound.safetensors");
+    snapshot.save(&path, &layout, &config).unwrap();
+    let mut header = std::fs::read(path).unwrap();
+    let values = header.split_off(header.len() - layout.values() * size_of::<f32>());
+    Sound {
+        layout,
+        snapshot,
+        header,
+        values,
+    }
+});
+
+thread_local! {
+    /// A sound snapshot's values after room for a header, so that 3 MB need not be copied for each input.
+    static BUFFER: RefCell<Vec<u8>> = RefCell::new([vec![0; FILE.longest_bytes], SOUND.values.clone()].concat());
+}
+
+/// The input's first eight bytes are the length of the file's header; the sound one's is right if the rest is as long.
+fn file(bytes: &[u8]) {
+    BUFFER.with_borrow_mut(|buffer| {
+        let start = FILE.longest_bytes - bytes.len();
+        buffer[start..FILE.longest_bytes].copy_from_slice(bytes);
+        // A header of the length that it states is the only one that is read at all.
+        if let Some(length) = buffer[start..FILE.longest_bytes].first_chunk_mut::<8>() {
+            *length = (bytes.len() as u64 - 8).to_le_bytes();
+        }
+        for file in [&buffer[start..], bytes] {
+            match Snapshot::parse(file, Path::new("fuzzed.safetensors")) {
+                Ok((snapshot, config)) => check(&snapshot, &SnapshotLayout::of(&config)),
+                Err(error) => assert!(error.to_string().contains("fuzzed.safetensors"), "{error}"),
+            }
+        }
+    });
+}
+
+fn check(snapshot: &Snapshot, layout: &SnapshotLayout) {
+    assert_eq!(snapshot.values.len(), layout.values());
+    assert!(snapshot.values.iter().all(|value| value.is_finite()));
+}
+
+/// A header, whether the checksum is made right, bytes cut off, and triples of a place and what is written there.
+fn received_samples() -> Vec<Vec<u8>> {
+    let header = SOUND.snapshot.header(RUN, &SOUND.layout);
+    let sample = |script: &[u8]| [bytes_of(&header), script].concat();
+    vec![
+        sample(&[]),
+        sample(&[1, 0, 7, 0, 0, 0, 0x80, 0x7f]),
+        sample(&[0, 0, 7, 0, 0, 0, 1, 2]),
+        sample(&[1, 3]),
+    ]
+}
+
+fn received(bytes: &[u8]) {
+    let mut script = Script::new(bytes);
+    let mut header: SnapshotHeader = pod(script.bytes(size_of::<SnapshotHeader>()));
+    let checksum_is_made_right = script.u8() % 2 == 1;
+    BUFFER.with_borrow_mut(|buffer| {
+        let values = &mut buffer[FILE.longest_bytes..];
+        let cut = usize::from(script.u8()).min(values.len());
+        let mut changed = Vec::new();
+        while !script.is_over() {
+            let place = script.u32() as usize % values.len();
+            changed.push((place, values[place]));
+            values[place] = script.u8();
+        }
+        let sent = &values[..values.len() - cut];
+        if checksum_is_made_right {
+            header.checksum = xxhash_rust::xxh3::xxh3_64(sent);
+        }
+        let read = Snapshot::receive(&header, sent, RUN, &SOUND.layout);
+        if let Ok(snapshot) = read {
+            check(&snapshot, &SOUND.layout);
+            assert_eq!(cast_slice::<f32, u8>(&snapshot.values), sent);
+            assert_eq!(snapshot.version.0, header.policy_version);
+        }
+        // Backwards: a place that was changed twice gets its first value back.
+        for (place, value) in changed.into_iter().rev() {
+            values[place] = value;
+        }
+    });
+}

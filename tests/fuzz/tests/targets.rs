@@ -1,0 +1,91 @@
+//! Every target, over its samples, its committed inputs, and what a few seconds of mutation with a fixed seed make of them.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::{Duration, Instant};
+
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use skein_fuzz::mutation::mutate;
+use skein_fuzz::{TARGETS, Target, committed, word_list};
+
+/// Mutations of one target are tried this long...
+const TIME: Duration = Duration::from_millis(1200);
+/// ... or until there were so many: what is reached on a fast machine is reached there every time.
+const MOST: usize = 50_000;
+/// No input may take longer, on however busy a machine.
+const SLOWEST: Duration = Duration::from_secs(10);
+
+/// Reads `bytes`; if that breaks a promise, says how to see it again.
+#[track_caller]
+fn exercise(target: &Target, what: &str, bytes: &[u8]) {
+    let started = Instant::now();
+    if catch_unwind(AssertUnwindSafe(|| target.exercise(bytes))).is_err() {
+        let kept = std::env::temp_dir().join(format!("skein-fuzz-{}-finding", target.name));
+        let written = std::fs::write(&kept, bytes);
+        panic!(
+            "target {}, {what}: the input lies in {} ({written:?})",
+            target.name,
+            kept.display()
+        );
+    }
+    let took = started.elapsed();
+    assert!(
+        took < SLOWEST,
+        "target {}, {what}: took {took:?}: {bytes:?}",
+        target.name
+    );
+}
+
+fn drive(name: &str) {
+    let target = TARGETS.iter().find(|target| target.name == name).unwrap();
+    let samples = (target.samples)();
+    for (number, sample) in samples.iter().enumerate() {
+        exercise(target, &format!("sample {number}"), sample);
+    }
+    let mut inputs = samples.clone();
+    for (file, bytes) in committed(target) {
+        exercise(target, &file, &bytes);
+        inputs.push(bytes);
+    }
+    let words = word_list(&samples);
+    let mut rng = Pcg64Mcg::seed_from_u64(1);
+    let (started, mut tried) = (Instant::now(), 0);
+    for number in 0..MOST {
+        let mut input = inputs[rng.random_range(0..inputs.len())].clone();
+        let other = &inputs[rng.random_range(0..inputs.len())];
+        mutate(&mut input, other, &words, target.longest_bytes, &mut rng);
+        exercise(target, &format!("mutation {number}"), &input);
+        tried = number + 1;
+        if started.elapsed() > TIME {
+            break;
+        }
+    }
+    println!("{tried} mutations of {} inputs", inputs.len());
+}
+
+macro_rules! drive {
+    ($($claim:ident => $target:literal),* $(,)?) => {
+        $(#[test] fn $claim() { drive($target); })*
+
+        #[test]
+        fn every_target_is_driven() {
+            let driven = [$($target),*];
+            assert_eq!(TARGETS.each_ref().map(|target| target.name), driven);
+        }
+    };
+}
+
+drive! {
+    no_configuration_file_panics_and_what_is_accepted_reads_back => "config",
+    no_override_panics_and_what_is_refused_has_a_culprit => "overrides",
+    no_simulator_section_panics_and_what_is_accepted_flies => "simulator",
+    no_course_file_panics_and_what_is_accepted_flies => "course_file",
+    no_geometry_panics_and_what_is_accepted_flies => "course_layout",
+    no_generator_ranges_panic_and_what_is_drawn_flies => "generator",
+    no_records_panic_and_what_is_committed_is_whole_and_finite => "records",
+    no_signal_panics_and_what_is_believed_says_the_same_again => "signals",
+    no_snapshot_file_panics_and_what_is_accepted_is_finite => "snapshot_file",
+    no_received_snapshot_panics_and_what_is_accepted_is_what_was_sent => "snapshot_received",
+}
