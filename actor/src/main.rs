@@ -62,9 +62,13 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
     let told_to_end = end_on_signal()?;
     let directory = RunDirectory::new(&arguments.run);
     let (identity, config) = directory.open()?;
-    let actor = match arguments.id {
-        Some(id) => ActorId(id),
-        None => directory.claim_actor()?,
+    // Whoever gave the number holds the claim to it.
+    let (actor, _claim) = match arguments.id {
+        Some(id) => (ActorId(id), None),
+        None => {
+            let claim = directory.claim_actor()?;
+            (claim.id(), Some(claim))
+        }
     };
     let log = directory.actor_log(actor);
     log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;

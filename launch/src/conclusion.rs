@@ -22,7 +22,7 @@ pub fn conclusion(run: &RunDirectory) -> String {
             ),
         );
     }
-    if let Some(summary) = read::<Summary>(&run.summary_json()) {
+    if let Some(summary) = Summary::of(run) {
         push(&mut text, &sentence(&summary));
     }
     push(&mut text, &format!("{}:", run.root().display()));

@@ -1,6 +1,6 @@
 //! The progress of a run, on a terminal or in a log.
 //!
-//! A terminal gets a bar with two lines of figures beneath that renew themselves; anything else gets a plain line every few seconds. Both go to
+//! A terminal gets a bar with the figures beneath that renew themselves; anything else gets a plain line every few seconds. Both go to
 //! standard error, so that what a run comes to stands alone on standard output.
 
 use std::collections::VecDeque;
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use skein_protocol::progress::{Phase, Progress};
 
-use crate::supervisor::Watcher;
+use crate::supervisor::{Restarts, Watcher};
 
 /// Between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
@@ -62,7 +62,8 @@ impl Default for Display {
 }
 
 impl Watcher for Display {
-    fn progress(&mut self, progress: &Progress) {
+    fn progress(&mut self, progress: &Progress, restarts: Restarts) {
+        let figures = Figures { progress, restarts };
         let left_secs = self.pace.secs_left(progress);
         match &mut self.surface {
             Surface::Terminal(bar) => {
@@ -72,7 +73,8 @@ impl Watcher for Display {
                 };
                 bar.set_length(length);
                 bar.set_position(position);
-                bar.set_message(format!("{}\n{}", Head { progress, left_secs }, Figures(progress)));
+                let figures = wrapped(&figures.to_string(), terminal_columns());
+                bar.set_message(format!("{}\n{figures}", Head { progress, left_secs }));
             }
             Surface::Plain { last } => {
                 let due = last.is_none_or(|(when, phase)| {
@@ -81,7 +83,7 @@ impl Watcher for Display {
                 });
                 if due {
                     *last = Some((Instant::now(), progress.phase));
-                    eprintln!("{} · {}", Head { progress, left_secs }, Figures(progress));
+                    eprintln!("{} · {figures}", Head { progress, left_secs });
                 }
             }
         }
@@ -125,12 +127,15 @@ impl fmt::Display for Head<'_> {
     }
 }
 
-/// The figures that show whether it learns.
-struct Figures<'a>(&'a Progress);
+/// The figures that show whether it learns, and what it has been through.
+struct Figures<'a> {
+    progress: &'a Progress,
+    restarts: Restarts,
+}
 
 impl fmt::Display for Figures<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let progress = self.0;
+        let progress = self.progress;
         write!(
             f,
             "{:.0} steps/s · {:.0} updates/s",
@@ -147,8 +152,41 @@ impl fmt::Display for Figures<'_> {
             }
         }
         let plural = if progress.actors == 1 { "" } else { "s" };
-        write!(f, " · {} actor{plural}", progress.actors)
+        write!(f, " · {} actor{plural}", progress.actors)?;
+        for (who, times) in [("learner", self.restarts.learner), ("actors", self.restarts.actors)] {
+            if times > 0 {
+                write!(f, " · {who} restarted {times}×")?;
+            }
+        }
+        if progress.stalled.is_some() {
+            f.write_str(" · stalled")?;
+        }
+        Ok(())
     }
+}
+
+/// `figures` on as many lines of at most `columns` as they take, parted where one figure ends: the terminal would part them anywhere, and the bar would
+/// not know how many lines to renew.
+fn wrapped(figures: &str, columns: usize) -> String {
+    let mut lines: Vec<String> = Vec::new();
+    for figure in figures.split(" · ") {
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + 3 + figure.chars().count() <= columns => {
+                line.push_str(" · ");
+                line.push_str(figure);
+            }
+            _ => lines.push(figure.to_owned()),
+        }
+    }
+    lines.join("\n")
+}
+
+/// Columns of the terminal on standard error; of a small one when it does not say.
+fn terminal_columns() -> usize {
+    rustix::termios::tcgetwinsize(std::io::stderr()).map_or(80, |size| match size.ws_col {
+        0 => 80,
+        columns => columns.into(),
+    })
 }
 
 /// A duration as `m:ss` or `h:mm:ss`.
@@ -176,6 +214,14 @@ impl Pace {
     /// Seconds until all training flights are flown at the present pace; `None` before there is a pace.
     fn secs_left(&mut self, progress: &Progress) -> Option<f64> {
         let (now_secs, flights) = (progress.elapsed_secs, progress.flights);
+        // A learner that was started again does some work anew, and is ahead of nobody by it.
+        if self
+            .reports
+            .back()
+            .is_some_and(|&(secs, flown)| now_secs < secs || flights < flown)
+        {
+            self.reports.clear();
+        }
         self.reports.push_back((now_secs, flights));
         while self.reports.len() > 2 && self.reports[1].0 < now_secs - PACE_SECS {
             self.reports.pop_front();
@@ -207,6 +253,8 @@ mod tests {
             temperature: Some(0.0512),
             vae_loss: None,
             actors: 1,
+            live_actors: vec![0],
+            stalled: None,
             elapsed_secs,
         }
     }
@@ -220,10 +268,46 @@ mod tests {
                 progress: &progress,
                 left_secs: Some(61.0)
             },
-            Figures(&progress)
+            Figures {
+                progress: &progress,
+                restarts: Restarts { learner: 2, actors: 0 },
+            }
         );
-        let expected = "flight 512/2000 · 1:02:05, 1:01 left · 152 steps/s · 63 updates/s · walls passed 1.23 · temperature 0.051 · 1 actor";
+        let expected = "flight 512/2000 · 1:02:05, 1:01 left · 152 steps/s · 63 updates/s · walls passed 1.23 · temperature 0.051 · 1 actor · learner restarted 2×";
         assert_eq!(line, expected);
+    }
+
+    #[test]
+    fn figures_never_exceed_the_width_of_the_terminal() {
+        let progress = Progress {
+            mean_return: Some(-8.69),
+            vae_loss: Some(150.1),
+            ..progress(3725.0, 512)
+        };
+        let figures = Figures {
+            progress: &progress,
+            restarts: Restarts {
+                learner: 12,
+                actors: 1234,
+            },
+        }
+        .to_string();
+        for columns in 30..200 {
+            let lines = wrapped(&figures, columns);
+            assert!(lines.lines().all(|line| line.chars().count() <= columns), "{lines}");
+            assert_eq!(lines.replace('\n', " · "), figures);
+        }
+        assert!(!wrapped(&figures, figures.chars().count()).contains('\n'));
+    }
+
+    #[test]
+    fn a_learner_that_was_started_again_has_a_pace_of_its_own() {
+        let mut pace = Pace::default();
+        for second in 0..100 {
+            pace.secs_left(&progress(f64::from(second), 100 * second as u64 / 10));
+        }
+        assert_eq!(pace.secs_left(&progress(0.5, 500)), None);
+        assert_eq!(pace.secs_left(&progress(10.5, 600)), Some(140.0));
     }
 
     #[test]

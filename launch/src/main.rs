@@ -3,25 +3,31 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::thread;
+use std::time::Duration;
 
 use anyhow::{Context, bail};
-use clap::{Args, Parser, Subcommand};
+use clap::error::ErrorKind;
+use clap::{Args, CommandFactory, Parser, Subcommand};
 use skein_launch::conclusion::conclusion;
 use skein_launch::display::Display;
 use skein_launch::prepare::{Prepared, ideal_walls_passed, load_courses, prepare};
 use skein_launch::reports;
-use skein_launch::supervisor::{self, Ended, Plan, Programs};
+use skein_launch::resume::resume;
+use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, SupervisorError};
+use skein_protocol::claims::ActorClaim;
 use skein_protocol::config::Config;
 use skein_protocol::failure::with_causes;
-use skein_protocol::ids::ActorId;
 use skein_protocol::run::{RunDirectory, RunError};
 use skein_protocol::services::is_learner_alive;
+use skein_protocol::summary::{Ending, Summary};
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
 /// Status of a process that was interrupted, as shells report it: 128 + SIGINT.
 const INTERRUPTED: u8 = 130;
+/// How long a learner may still be saving whose supervisor was killed, before its run is resumed.
+const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Trains a drone to avoid obstacles from its depth camera.
 #[derive(Parser)]
@@ -44,11 +50,24 @@ enum Command {
 #[derive(Args)]
 struct RunArguments {
     /// What to train, and how.
-    #[arg(long, value_name = "FILE", overrides_with = "config")]
-    config: PathBuf,
+    #[arg(
+        long,
+        value_name = "FILE",
+        overrides_with = "config",
+        required_unless_present = "resume"
+    )]
+    config: Option<PathBuf>,
     /// Where everything goes; must be new or empty.
-    #[arg(long, value_name = "DIR", overrides_with = "run_dir")]
-    run_dir: PathBuf,
+    #[arg(
+        long,
+        value_name = "DIR",
+        overrides_with = "run_dir",
+        required_unless_present = "resume"
+    )]
+    run_dir: Option<PathBuf>,
+    /// Go on with the run in this directory, with the configuration it was started with.
+    #[arg(long, value_name = "DIR")]
+    resume: Option<PathBuf>,
     /// Actors to start [default: number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     actors: Option<u32>,
@@ -74,6 +93,15 @@ struct ReportArguments {
     run: PathBuf,
 }
 
+/// A run that failed, and what is left of it.
+#[derive(Debug, thiserror::Error)]
+#[error("{source}")]
+struct Unfinished {
+    run: RunDirectory,
+    #[source]
+    source: SupervisorError,
+}
+
 fn main() -> ExitCode {
     let outcome = match Cli::parse().command {
         Command::Run(arguments) => run(&arguments),
@@ -85,6 +113,9 @@ fn main() -> ExitCode {
         Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
         Err(error) => {
             eprintln!("skein: {}", with_causes(error.as_ref()));
+            if let Some(Unfinished { run, .. }) = error.downcast_ref() {
+                tell_how_to_go_on(run);
+            }
             ExitCode::FAILURE
         }
     }
@@ -96,33 +127,29 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         Some(actors) => actors as usize,
         None => thread::available_parallelism().map_or(1, Into::into),
     };
-    let prepared = prepare(&arguments.config, &arguments.overrides, &arguments.run_dir, actors)?;
+    let (prepared, _supervisor) = match arguments.task() {
+        Task::New { config, run_dir } => {
+            let prepared = prepare(config, &arguments.overrides, run_dir, actors)?;
+            let claim = prepared.run.claim_supervisor()?;
+            (prepared, claim.context("somebody else supervises this run already")?)
+        }
+        Task::Resume(directory) => resume(directory, actors, PATIENCE)?,
+    };
+    announce(&prepared, actors, arguments);
     let Prepared {
         run,
         identity,
         config,
         courses,
     } = &prepared;
-    eprintln!(
-        "skein: {actors} {}, {} training flights, seed {}",
-        if actors == 1 { "actor" } else { "actors" },
-        config.run.flights,
-        config.run.seed
-    );
-    eprintln!("skein: everything goes to {}", run.root().display());
-    if !config.courses.evaluation.contains(&config.courses.training) {
-        eprintln!(
-            "skein: note: the training course is not among courses.evaluation; the best snapshot is chosen on {}",
-            courses.first().map_or("none", |course| &course.name)
-        );
-    }
 
+    let claims = claim_actors(run, actors)?;
     let plan = Plan {
         run: run.clone(),
         programs,
-        actors: claim_actors(run, actors)?,
+        actors: claims.iter().map(ActorClaim::id).collect(),
         learner_threads: config.run.learner_threads,
-        learner_grace: supervisor::LEARNER_GRACE,
+        deadlines: Deadlines::of(config),
     };
     let mut display = Display::new();
     let outcome = runtime()?.block_on(async {
@@ -137,19 +164,82 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     if let Err(error) = reports::draw_all(run, courses, window, ideal_walls_passed(config)?) {
         eprintln!("skein: not all plots could be drawn: {error}");
     }
-    let ended = outcome??;
+    let ended = outcome?.map_err(|source| Unfinished {
+        run: run.clone(),
+        source,
+    })?;
     print!("{}", conclusion(run));
+    // Whoever told the learner alone to stop has interrupted the run as well.
+    if ended == Ended::Interrupted || Summary::of(run).is_some_and(|summary| summary.ending == Ending::Interrupted) {
+        tell_how_to_go_on(run);
+        return Ok(Ended::Interrupted);
+    }
     Ok(ended)
+}
+
+/// What `skein run` is to do.
+enum Task<'a> {
+    New { config: &'a Path, run_dir: &'a Path },
+    Resume(&'a Path),
+}
+
+impl RunArguments {
+    /// Ends the process with the reason if the arguments contradict each other.
+    fn task(&self) -> Task<'_> {
+        match (&self.resume, &self.config, &self.run_dir) {
+            (None, Some(config), Some(run_dir)) => Task::New { config, run_dir },
+            (Some(directory), None, None) if self.overrides.is_empty() => Task::Resume(directory),
+            _ => Cli::command()
+                .error(
+                    ErrorKind::ArgumentConflict,
+                    "a run is resumed in its own directory, with the configuration it was started with: --config, --run-dir and --set cannot be given with --resume",
+                )
+                .exit(),
+        }
+    }
+}
+
+/// Tells what is about to be done.
+fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
+    let config = &prepared.config;
+    eprintln!(
+        "skein: {actors} {}, {} training flights, seed {}",
+        if actors == 1 { "actor" } else { "actors" },
+        config.run.flights,
+        config.run.seed
+    );
+    let root = prepared.run.root().display();
+    if arguments.resume.is_some() {
+        eprintln!("skein: going on with the run in {root}");
+        return;
+    }
+    eprintln!("skein: everything goes to {root}");
+    if !config.courses.evaluation.contains(&config.courses.training) {
+        eprintln!(
+            "skein: note: the training course is not among courses.evaluation; the best snapshot is chosen on {}",
+            prepared.courses.first().map_or("none", |course| &course.name)
+        );
+    }
+}
+
+/// The last line about a run that is not complete.
+fn tell_how_to_go_on(run: &RunDirectory) {
+    eprintln!(
+        "skein: to go on with it: launch/run_local.sh --resume {}",
+        run.root().display()
+    );
 }
 
 fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let programs = Programs::beside_this()?;
     let run = open(&arguments.run)?;
     let (identity, config) = run.open()?;
-    if !is_learner_alive(&identity)? {
+    // Between two lives of its learner, a run is under way as long as somebody sees to it that there will be another.
+    if run.claim_supervisor()?.is_some() && !is_learner_alive(&identity)? {
         bail!("the run in {} is not under way on this machine", run.root().display());
     }
-    let actors = claim_actors(&run, arguments.count as usize)?;
+    let claims = claim_actors(&run, arguments.count as usize)?;
+    let actors: Vec<_> = claims.iter().map(ActorClaim::id).collect();
     let names: Vec<_> = actors.iter().map(ToString::to_string).collect();
     eprintln!(
         "skein: adding actor {} to {}; Ctrl-C takes them away again",
@@ -161,7 +251,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
         programs,
         actors,
         learner_threads: config.run.learner_threads,
-        learner_grace: supervisor::LEARNER_GRACE,
+        deadlines: Deadlines::of(&config),
     };
     let mut display = Display::new();
     runtime()?.block_on(async {
@@ -189,7 +279,7 @@ fn open(directory: &Path) -> anyhow::Result<RunDirectory> {
     Ok(RunDirectory::new(root))
 }
 
-fn claim_actors(run: &RunDirectory, count: usize) -> Result<Vec<ActorId>, RunError> {
+fn claim_actors(run: &RunDirectory, count: usize) -> Result<Vec<ActorClaim>, RunError> {
     (0..count).map(|_| run.claim_actor()).collect()
 }
 

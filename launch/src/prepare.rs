@@ -209,8 +209,8 @@ fn blame(error: PrepareError, config_file: &Path, overrides: &[String], actors: 
     }
 }
 
-/// Checks everything, and returns the simulator's settings.
-fn check(config_file: &Path, config: &Config, actors: usize) -> Result<SimulatorSettings, PrepareError> {
+/// Checks everything that must hold for `actors` actors to fly for `config`, which was read from `config_file`, and returns the simulator's settings.
+pub(crate) fn check(config_file: &Path, config: &Config, actors: usize) -> Result<SimulatorSettings, PrepareError> {
     let in_file = || config_file.to_owned();
     let settings: SimulatorSettings =
         config
@@ -315,7 +315,7 @@ fn copy_courses(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use serde::Deserialize;
 
     use super::*;
@@ -333,6 +333,11 @@ mod tests {
         let courses = format!("[courses]\ntraining = {course:?}\nevaluation = [{course:?}]\n{text}");
         fs::write(&path, courses).unwrap();
         path
+    }
+
+    /// A run of one course, ready to be started, in a folder of `directory`.
+    pub(crate) fn prepared_run(directory: &Path) -> Prepared {
+        prepare(&config_file(directory, ""), &[], &directory.join("run"), 1).unwrap()
     }
 
     #[test]

@@ -45,6 +45,8 @@ impl Reporter {
             temperature: None,
             vae_loss: None,
             actors: 0,
+            live_actors: Vec::new(),
+            stalled: None,
             elapsed_secs: 0.0,
         }));
         let ended = Arc::new(AtomicBool::new(false));
@@ -82,7 +84,8 @@ fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared) {
         let last = ended.load(Ordering::Relaxed);
         let mut line = progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
         line.elapsed_secs = started.elapsed().as_secs_f64();
-        line.actors = reception.actors.load(Ordering::Relaxed);
+        line.live_actors = reception.live_actors();
+        line.actors = line.live_actors.len();
         marks.push((line.elapsed_secs, line.steps, line.updates));
         let (since, steps, updates) = marks[marks.len().saturating_sub(RATE_INTERVALS + 1)];
         let secs = (line.elapsed_secs - since).max(1e-9);

@@ -5,6 +5,7 @@
 //! run ([`config`]) and the files it leaves ([`run`], [`evaluation`], [`summary`]). It knows neither libtorch nor the physics engine, so that every
 //! process can afford to depend on it.
 
+pub mod claims;
 pub mod config;
 pub mod evaluation;
 pub mod failure;

@@ -33,6 +33,12 @@ pub struct Progress {
     pub vae_loss: Option<f64>,
     /// Actors that gave a sign of life.
     pub actors: usize,
+    /// Their numbers, in ascending order.
+    #[serde(default)]
+    pub live_actors: Vec<u32>,
+    /// Who waits for whom, when nothing has moved for a while.
+    #[serde(default)]
+    pub stalled: Option<String>,
     /// Seconds since the learner started.
     pub elapsed_secs: f64,
 }

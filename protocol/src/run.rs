@@ -1,7 +1,6 @@
 //! The directory of a run: who it is, and where everything in it lies.
 
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -130,27 +129,6 @@ impl RunDirectory {
             return Err(RunError::ConfigChanged { path: self.config() });
         }
         Ok((identity, config))
-    }
-
-    /// Claims the lowest actor id whose log file does not exist yet, by creating that file.
-    ///
-    /// # Errors
-    /// [`RunError::Io`] names the log folder.
-    pub fn claim_actor(&self) -> Result<ActorId, RunError> {
-        for id in 0.. {
-            let path = self.actor_log(ActorId(id));
-            match fs::OpenOptions::new()
-                .write(true)
-                .create_new(true)
-                .open(&path)
-                .and_then(|mut file| file.flush())
-            {
-                Ok(()) => return Ok(ActorId(id)),
-                Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
-                Err(source) => return Err(RunError::Io { path, source }),
-            }
-        }
-        unreachable!("the ids of four thousand million actors are taken")
     }
 }
 
@@ -288,15 +266,6 @@ mod tests {
         fs::rename(&before, &after).unwrap();
         let (_, moved) = RunDirectory::new(&after).open().unwrap();
         assert_eq!(moved.courses.training, after.join("courses/training.toml"));
-    }
-
-    #[test]
-    fn no_two_actors_get_the_same_id() {
-        let directory = tempfile::tempdir().unwrap();
-        let run = RunDirectory::new(directory.path());
-        run.create(&Config::default()).unwrap();
-        assert_eq!(run.claim_actor().unwrap(), ActorId(0));
-        assert_eq!(run.claim_actor().unwrap(), ActorId(1));
     }
 
     #[test]

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{PolicyVersion, RunId};
+use crate::run::RunDirectory;
 
 /// What a run came to.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -43,6 +44,13 @@ pub struct Summary {
     pub wall_secs: f64,
     /// Seconds of the learner's main thread by what it did.
     pub phase_secs: BTreeMap<String, f64>,
+}
+
+impl Summary {
+    /// That of `run`; `None` if it has none, or none that can be read.
+    pub fn of(run: &RunDirectory) -> Option<Self> {
+        serde_json::from_slice(&std::fs::read(run.summary_json()).ok()?).ok()
+    }
 }
 
 /// How a run ended.

@@ -99,12 +99,26 @@ fn no_process_outlives_a_killed_supervisor() {
 }
 
 #[test]
-fn a_learner_that_dies_ends_the_run_as_failed_and_nothing_is_left() {
-    let run = long_run();
+fn a_run_between_two_lives_of_its_learner_stops_in_order() {
+    let mut run = long_run();
     let processes = processes_of(run.directory());
     let learner = processes.iter().find(|process| process.runs("skein-learner")).unwrap();
     learner.signal(Signal::KILL);
+    run.until("the learner was started again", |run| {
+        run.stderr()
+            .contains("the learner was killed by signal 9; it is started again at once")
+            .then_some(())
+    });
+    run.signal(Signal::INT);
     let ended = run.wait();
-    ended.output.assert_refused(&["learner", "killed by signal 9"]);
+    assert_eq!(ended.output.code, Some(INTERRUPTED), "{}", ended.output.stderr);
+    let last = ended.output.stderr.lines().last().unwrap_or_default();
+    assert!(
+        last.ends_with(&format!(
+            "launch/run_local.sh --resume {}",
+            ended.directory.root().display()
+        )),
+        "{last}"
+    );
     ended.assert_nothing_is_left();
 }

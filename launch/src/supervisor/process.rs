@@ -9,9 +9,12 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
 use rustix::process::{Pid, Signal, getppid, kill_process, set_parent_process_death_signal};
-use skein_protocol::failure::EXIT_LEARNER_GONE;
+use skein_protocol::failure::{EXIT_LEARNER_GONE, EXIT_START_AGAIN};
 use tokio::process::{Child, Command};
 use tokio::sync::watch;
+
+/// Status of a Rust program that panicked.
+const PANICKED: i32 = 101;
 
 /// What a process is told.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,28 +27,43 @@ pub(super) enum Order {
     Kill,
 }
 
-/// How a process ended.
+/// How a process ended. Shown as what is said of it: "exited with status 1".
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Exit {
-    /// Status 0.
-    Success,
-    /// [`EXIT_LEARNER_GONE`].
-    LearnerGone,
-    /// Anything else, in words.
-    Failure(String),
+    /// By itself, with this status.
+    Status(i32),
+    /// By this signal.
+    Signal(i32),
+    /// It could not be started again, or not be waited for.
+    Unknown(String),
 }
 
 impl Exit {
+    /// The status of success.
+    pub(super) const SUCCESS: Self = Self::Status(0);
+
     fn of(status: io::Result<ExitStatus>) -> Self {
         match status {
-            Ok(status) if status.success() => Self::Success,
             Ok(status) => match (status.code(), status.signal()) {
-                (Some(code), _) if code == i32::from(EXIT_LEARNER_GONE) => Self::LearnerGone,
-                (Some(code), _) => Self::Failure(format!("exit status {code}")),
-                (None, Some(signal)) => Self::Failure(format!("killed by signal {signal}")),
-                (None, None) => Self::Failure(status.to_string()),
+                (Some(code), _) => Self::Status(code),
+                (None, Some(signal)) => Self::Signal(signal),
+                (None, None) => Self::Unknown(format!("ended with {status}")),
             },
-            Err(error) => Self::Failure(format!("cannot be waited for: {error}")),
+            Err(error) => Self::Unknown(format!("cannot be waited for: {error}")),
+        }
+    }
+
+    /// Whether it ended because it found no learner.
+    pub(super) fn is_for_want_of_a_learner(&self) -> bool {
+        *self == Self::Status(EXIT_LEARNER_GONE.into())
+    }
+
+    /// Whether the same program may do better when it is started again: it was killed, it panicked, or its transport failed. An error that it
+    /// told itself would come again.
+    pub(super) fn may_pass(&self) -> bool {
+        match *self {
+            Self::Status(status) => status == PANICKED || status == i32::from(EXIT_START_AGAIN),
+            Self::Signal(_) | Self::Unknown(_) => true,
         }
     }
 }
@@ -53,9 +71,10 @@ impl Exit {
 impl fmt::Display for Exit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Success => f.write_str("exit status 0"),
-            Self::LearnerGone => write!(f, "exit status {EXIT_LEARNER_GONE}"),
-            Self::Failure(how) => f.write_str(how),
+            Self::Status(PANICKED) => f.write_str("panicked"),
+            Self::Status(status) => write!(f, "exited with status {status}"),
+            Self::Signal(signal) => write!(f, "was killed by signal {signal}"),
+            Self::Unknown(how) => f.write_str(how),
         }
     }
 }

@@ -1,16 +1,15 @@
-//! When an actor that died is started again.
+//! When a process that died is started again, and when it is given up.
+//!
+//! Deaths alone give nobody up: processes may be killed as often as anybody likes. What counts is whether they get anywhere in between.
 
 use std::collections::VecDeque;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-/// Deaths within [`WINDOW`] after which an actor is given up: what kills it will kill it again.
-pub(super) const MAX_DEATHS: usize = 5;
-/// Deaths longer ago than this are forgiven.
-pub(super) const WINDOW: Duration = Duration::from_secs(60);
-/// Pause before the first restart; it doubles with each further death.
-const FIRST_PAUSE: Duration = Duration::from_millis(250);
+use tokio::time::Instant;
 
-/// What follows an actor's death.
+use super::work::Work;
+
+/// What follows a death.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Verdict {
     /// Start it again after this pause.
@@ -19,21 +18,93 @@ pub(super) enum Verdict {
     GiveUp,
 }
 
-/// The recent deaths of one actor.
+/// The deaths of an actor.
 #[derive(Debug, Default)]
-pub(super) struct Restarts {
-    deaths: VecDeque<Instant>,
+pub(super) struct ActorDeaths {
+    recent: VecDeque<Instant>,
+    in_vain: usize,
 }
 
-impl Restarts {
+impl ActorDeaths {
+    /// Lives in vain, one after the other, after which an actor is given up: what kills it will kill it again.
+    pub(super) const MAX_IN_VAIN: usize = 5;
+    /// Deaths longer ago than this no longer lengthen the pause.
+    const WINDOW: Duration = Duration::from_secs(60);
+    /// Pause before the first restart; it doubles with each further death within the window, up to the longest.
+    const FIRST_PAUSE: Duration = Duration::from_millis(250);
+    const LONGEST_PAUSE: Duration = Duration::from_secs(8);
+
     /// Notes a death at `now` and decides what follows.
-    pub(super) fn died(&mut self, now: Instant) -> Verdict {
-        self.deaths.retain(|&death| now.duration_since(death) < WINDOW);
-        self.deaths.push_back(now);
-        if self.deaths.len() >= MAX_DEATHS {
-            Verdict::GiveUp
-        } else {
-            Verdict::RestartAfter(FIRST_PAUSE * (1 << (self.deaths.len() - 1)))
+    pub(super) fn died(&mut self, now: Instant, life: Life) -> Verdict {
+        self.recent.retain(|&death| now.duration_since(death) < Self::WINDOW);
+        self.recent.push_back(now);
+        self.in_vain = match life {
+            Life::Served => 0,
+            Life::Interrupted => self.in_vain,
+            Life::InVain => self.in_vain + 1,
+        };
+        if self.in_vain >= Self::MAX_IN_VAIN {
+            return Verdict::GiveUp;
+        }
+        let doublings = u32::try_from(self.recent.len() - 1).unwrap_or(u32::MAX);
+        let pause = Self::FIRST_PAUSE.saturating_mul(2_u32.saturating_pow(doublings));
+        Verdict::RestartAfter(pause.min(Self::LONGEST_PAUSE))
+    }
+}
+
+/// What an actor's life was good for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Life {
+    /// The learner heard of it, and the run got on meanwhile.
+    Served,
+    /// There was no learner to serve: it says nothing about the actor.
+    Interrupted,
+    /// Neither.
+    InVain,
+}
+
+/// The deaths of the learner.
+#[derive(Debug)]
+pub(super) struct LearnerDeaths {
+    first_pause: Duration,
+    furthest: Option<Work>,
+    since_progress: u32,
+}
+
+impl LearnerDeaths {
+    /// Deaths after which the run fails, if none of these lives got further than one before it. Not fewer, because a learner that is killed before it
+    /// has written a checkpoint gets no further by no fault of its own.
+    pub(super) const MAX_WITHOUT_PROGRESS: u32 = 10;
+    /// The longest pause, in first pauses.
+    const LONGEST_PAUSE: u32 = 8;
+
+    /// No deaths so far. There is no pause after the first, `first_pause` after the second, then they double.
+    pub(super) fn new(first_pause: Duration) -> Self {
+        Self {
+            first_pause,
+            furthest: None,
+            since_progress: 0,
+        }
+    }
+
+    /// Notes how far the run has come. Only what no life before has reached is progress: the rest is done over.
+    pub(super) fn reached(&mut self, work: Work) {
+        if self.furthest.is_none_or(|furthest| work > furthest) {
+            // The first report of all shows where the run began, not that it gets on.
+            if self.furthest.is_some() {
+                self.since_progress = 0;
+            }
+            self.furthest = Some(work);
+        }
+    }
+
+    /// Notes a death and decides what follows.
+    pub(super) fn died(&mut self) -> Verdict {
+        self.since_progress += 1;
+        match self.since_progress {
+            Self::MAX_WITHOUT_PROGRESS.. => Verdict::GiveUp,
+            1 => Verdict::RestartAfter(Duration::ZERO),
+            deaths => Verdict::RestartAfter(self.first_pause * (1 << (deaths - 2)).min(Self::LONGEST_PAUSE)),
         }
     }
 }
@@ -44,20 +115,63 @@ mod tests {
 
     #[test]
     fn pauses_double_until_the_actor_is_given_up() {
-        let (mut restarts, start) = (Restarts::default(), Instant::now());
+        let (mut deaths, start) = (ActorDeaths::default(), Instant::now());
         let verdicts: Vec<_> = (0..5)
-            .map(|second| restarts.died(start + Duration::from_secs(second)))
+            .map(|second| deaths.died(start + Duration::from_secs(second), Life::InVain))
             .collect();
-        let pause = |factor| Verdict::RestartAfter(FIRST_PAUSE * factor);
+        let pause = |factor| Verdict::RestartAfter(ActorDeaths::FIRST_PAUSE * factor);
         assert_eq!(verdicts, [pause(1), pause(2), pause(4), pause(8), Verdict::GiveUp]);
     }
 
     #[test]
-    fn an_actor_that_dies_rarely_is_always_restarted() {
-        let (mut restarts, start) = (Restarts::default(), Instant::now());
-        for minute in 0..100 {
-            let verdict = restarts.died(start + Duration::from_secs(61 * minute));
-            assert_eq!(verdict, Verdict::RestartAfter(FIRST_PAUSE));
+    fn an_actor_that_serves_between_its_deaths_is_started_again_for_ever() {
+        let (mut deaths, start) = (ActorDeaths::default(), Instant::now());
+        for second in 0..1000 {
+            let life = if second % 4 == 0 { Life::Served } else { Life::InVain };
+            let verdict = deaths.died(start + Duration::from_secs(second), life);
+            assert_ne!(verdict, Verdict::GiveUp);
         }
+        let verdict = deaths.died(start + Duration::from_secs(1000), Life::Served);
+        assert_eq!(verdict, Verdict::RestartAfter(ActorDeaths::LONGEST_PAUSE));
+        let verdict = deaths.died(start + Duration::from_secs(1061), Life::Served);
+        assert_eq!(verdict, Verdict::RestartAfter(ActorDeaths::FIRST_PAUSE));
+    }
+
+    #[test]
+    fn an_actor_is_not_blamed_for_a_learner_that_is_not_there() {
+        let (mut deaths, now) = (ActorDeaths::default(), Instant::now());
+        for _ in 0..100 {
+            assert_ne!(deaths.died(now, Life::Interrupted), Verdict::GiveUp);
+        }
+    }
+
+    #[test]
+    fn a_learner_is_started_again_at_once_and_then_after_pauses() {
+        let mut deaths = LearnerDeaths::new(Duration::from_secs(1));
+        let secs: Vec<_> = std::iter::from_fn(|| match deaths.died() {
+            Verdict::RestartAfter(pause) => Some(pause.as_secs()),
+            Verdict::GiveUp => None,
+        })
+        .collect();
+        assert_eq!(secs, [0, 1, 2, 4, 8, 8, 8, 8, 8]);
+    }
+
+    #[test]
+    fn only_what_no_life_before_reached_is_progress() {
+        let mut deaths = LearnerDeaths::new(Duration::from_secs(1));
+        deaths.reached(Work::test(0));
+        for life in 0..1000 {
+            deaths.reached(Work::test(life));
+            deaths.reached(Work::test(life + 1));
+            assert_eq!(deaths.died(), Verdict::RestartAfter(Duration::ZERO));
+        }
+        // It dies at the same place again and again, having done the same work each time.
+        let again: Vec<_> = (0..LearnerDeaths::MAX_WITHOUT_PROGRESS - 1)
+            .map(|_| {
+                (990..=1000).for_each(|updates| deaths.reached(Work::test(updates)));
+                deaths.died()
+            })
+            .collect();
+        assert_eq!(again.last(), Some(&Verdict::GiveUp));
     }
 }

@@ -1,27 +1,8 @@
-//! How far a stop has come, and whether the learner still gets somewhere.
+//! How far a stop has come.
 
 use std::time::Duration;
 
-use skein_protocol::progress::Progress;
 use tokio::time::Instant;
-
-/// What the learner has done so far, as far as its reports show it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Work {
-    flights: u64,
-    updates: u64,
-    vae_updates: u64,
-}
-
-impl Work {
-    pub(super) fn of(progress: &Progress) -> Self {
-        Self {
-            flights: progress.flights,
-            updates: progress.updates,
-            vae_updates: progress.vae_updates,
-        }
-    }
-}
 
 /// How far a stop has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

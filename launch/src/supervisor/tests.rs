@@ -7,18 +7,22 @@ use std::path::Path;
 use tempfile::TempDir;
 use tokio::sync::mpsc;
 
+use super::dismissal::ACTOR_GRACE;
 use super::*;
+use skein_protocol::config::Config;
 
 /// What was shown to the user.
 #[derive(Default)]
 struct Seen {
     flights: Vec<u64>,
     warnings: String,
+    restarts: Restarts,
 }
 
 impl Watcher for Seen {
-    fn progress(&mut self, progress: &Progress) {
+    fn progress(&mut self, progress: &Progress, restarts: Restarts) {
         self.flights.push(progress.flights);
+        self.restarts = restarts;
     }
 
     fn warn(&mut self, text: &str) {
@@ -27,8 +31,8 @@ impl Watcher for Seen {
     }
 }
 
-/// A shell function that reports so many updates.
-const REPORT: &str = r#"report() { echo '{"phase":"flying","flights":7,"total_flights":9,"evaluation_flights":[0,0],"steps":1,"updates":'$1',"vae_updates":0,"steps_per_sec":1.0,"updates_per_sec":0.0,"walls_passed":null,"mean_return":null,"temperature":null,"vae_loss":null,"actors":1,"elapsed_secs":1.0}'; }"#;
+/// A shell function that reports so many updates, and these actors, both of them unless told otherwise.
+const REPORT: &str = r#"report() { echo '{"phase":"flying","flights":7,"total_flights":9,"evaluation_flights":[0,0],"steps":1,"updates":'$1',"vae_updates":0,"steps_per_sec":1.0,"updates_per_sec":0.0,"walls_passed":null,"mean_return":null,"temperature":null,"vae_loss":null,"actors":2,"live_actors":'${2:-[0,1]}',"elapsed_secs":1.0}'; }"#;
 
 /// An actor that flies until the learner's script says stop.
 const FAITHFUL_ACTOR: &str = "while [ ! -e $dir/stop ]; do sleep 0.02; done";
@@ -66,7 +70,7 @@ impl Stage {
             programs,
             actors: vec![ActorId(0), ActorId(1)],
             learner_threads: 1,
-            learner_grace: LEARNER_GRACE,
+            deadlines: Deadlines::of(&Config::default()),
         };
         Self { directory, plan }
     }
@@ -148,14 +152,188 @@ fn a_dead_actor_is_started_again() {
     assert_eq!(result.unwrap(), Ended::Finished);
     assert!(
         seen.warnings
-            .contains("actor 1 ended with killed by signal 9; it is started again"),
+            .contains("actor 1 was killed by signal 9; it is started again"),
+        "{}",
+        seen.warnings
+    );
+}
+
+/// A learner that lives as `first` once, then runs to its end.
+fn first_life(first: &str) -> String {
+    format!("report 1; if mkdir $dir/died 2>/dev/null; then {first}; fi; report 2; touch $dir/stop")
+}
+
+#[test]
+fn a_learner_that_dies_is_started_again_and_its_actors_stay() {
+    for (death, told) in [
+        (
+            "kill -9 $$",
+            "the learner was killed by signal 9; it is started again at once",
+        ),
+        ("exit 101", "the learner panicked; it is started again at once"),
+        (
+            "exit 4",
+            "the learner exited with status 4; it is started again at once",
+        ),
+    ] {
+        let stage = Stage::new(&first_life(&format!("sleep 0.1; {death}")), FAITHFUL_ACTOR);
+        fs::create_dir_all(stage.plan.run.checkpoints().join("flight-40")).unwrap();
+        fs::create_dir(stage.plan.run.checkpoints().join(".writing")).unwrap();
+        let (result, seen) = stage.run(never);
+        assert_eq!(result.unwrap(), Ended::Finished);
+        assert_eq!(
+            seen.warnings,
+            format!("{told}, from its checkpoint after flight 40\n"),
+            "{death}"
+        );
+        assert_eq!(seen.restarts, Restarts { learner: 1, actors: 0 });
+        assert_eq!(stage.processes(), 4, "two learners, two actors");
+    }
+}
+
+#[test]
+fn a_learner_that_never_gets_further_fails_the_run() {
+    let mut stage = Stage::new("report 1; echo 'always here' >&2; kill -9 $$", FAITHFUL_ACTOR);
+    stage.plan.deadlines.learner_pause = Duration::from_millis(10);
+    let (result, seen) = stage.run(never);
+    let error = result.unwrap_err().to_string();
+    assert!(
+        error.contains("died 10 times without getting any further") && error.contains("always here"),
+        "{error}"
+    );
+    assert_eq!((seen.restarts.learner, stage.processes()), (9, 12));
+}
+
+#[test]
+fn a_frozen_learner_is_killed_and_started_again() {
+    for first in ["kill -STOP $$", "trap '' TERM; while :; do sleep 0.02; done"] {
+        let mut stage = Stage::new(&first_life(first), FAITHFUL_ACTOR);
+        stage.plan.deadlines.learner_silence = Duration::from_millis(300);
+        let (result, seen) = stage.run(never);
+        assert_eq!(result.unwrap(), Ended::Finished);
+        assert!(
+            seen.warnings.contains("has not reported for 0 s: it is killed"),
+            "{}",
+            seen.warnings
+        );
+        assert_eq!(seen.restarts.learner, 1);
+    }
+}
+
+#[test]
+fn a_learner_that_hangs_before_its_first_report_is_started_again() {
+    let hangs_once = "if mkdir $dir/died 2>/dev/null; then kill -STOP $$; fi; report 2; touch $dir/stop";
+    let mut stage = Stage::new(hangs_once, FAITHFUL_ACTOR);
+    stage.plan.deadlines.learner_start = Duration::from_millis(300);
+    let (result, seen) = stage.run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert_eq!(seen.restarts.learner, 1);
+}
+
+#[test]
+fn actors_that_left_for_want_of_a_learner_come_back_with_it() {
+    // The first life of the actors ends with that of the learner, which takes a while to come back.
+    let actor = format!(
+        "while [ ! -e $dir/died ]; do sleep 0.02; done; if mkdir $dir/left-$id 2>/dev/null; then exit 3; fi; touch $dir/back-$id; {FAITHFUL_ACTOR}"
+    );
+    let learner =
+        "if mkdir $dir/died 2>/dev/null; then rmdir $dir/died; report 1; sleep 0.2; mkdir $dir/died; kill -9 $$; fi
+        while [ ! -e $dir/left-0 ] || [ ! -e $dir/left-1 ]; do sleep 0.02; done; sleep 0.2; report 1
+        while [ ! -e $dir/back-0 ] || [ ! -e $dir/back-1 ]; do sleep 0.02; done; touch $dir/stop";
+    let (result, seen) = Stage::new(learner, &actor).run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert!(
+        seen.warnings.contains("actor 0 heard nothing of the learner and left"),
         "{}",
         seen.warnings
     );
 }
 
 #[test]
-fn a_learner_that_dies_ends_the_run_and_its_last_words_are_told() {
+fn a_dead_learner_is_not_started_again_during_a_stop() {
+    let dies_when_told = "trap 'kill -9 $$' TERM; report 0; while :; do sleep 0.02; done";
+    let stage = Stage::new(dies_when_told, FAITHFUL_ACTOR);
+    let pids = stage.plan.run.root().join("pids");
+    let (result, _) = stage.run(|interrupts| interrupt_when_all_fly(pids, interrupts));
+    let error = result.unwrap_err().to_string();
+    assert!(error.contains("was killed by signal 9"), "{error}");
+    assert_eq!(stage.processes(), 3);
+}
+
+#[test]
+fn an_interruption_between_two_lives_of_the_learner_ends_the_run() {
+    let stage = Stage::new("report 1; kill -9 $$", FAITHFUL_ACTOR);
+    let pids = stage.plan.run.root().join("pids");
+    let begun = std::time::Instant::now();
+    let (result, _) = stage.run(|interrupts| async move {
+        // Two lives, two actors; the third life begins after a pause of a second.
+        until(|| fs::read_to_string(&pids).is_ok_and(|pids| pids.lines().count() == 4)).await;
+        tokio::time::sleep(Duration::from_millis(500)).await;
+        interrupts.send(()).await.unwrap();
+        interrupts.send(()).await.unwrap();
+        interrupts.send(()).await.unwrap();
+    });
+    assert_eq!(result.unwrap(), Ended::Interrupted);
+    assert!(begun.elapsed() < ACTOR_GRACE, "took {:?}", begun.elapsed());
+}
+
+#[test]
+fn an_interruption_before_the_learner_knows_of_signals_ends_the_run_in_order() {
+    let stage = Stage::new("exec sleep 60", FAITHFUL_ACTOR);
+    let pids = stage.plan.run.root().join("pids");
+    let (result, _) = stage.run(|interrupts| async move {
+        until(|| pids.exists()).await;
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        interrupts.send(()).await.unwrap();
+    });
+    assert_eq!(result.unwrap(), Ended::Interrupted);
+}
+
+#[test]
+fn an_actor_that_the_learner_has_not_heard_of_for_long_is_killed_and_started_again() {
+    let actor = format!(
+        "if mkdir $dir/frozen-$id 2>/dev/null; then kill -STOP $$; fi; touch $dir/second-life-$id; {FAITHFUL_ACTOR}"
+    );
+    let learner = "while [ ! -e $dir/second-life-0 ] || [ ! -e $dir/second-life-1 ]; do report 1 []; sleep 0.05; done; report 1; touch $dir/stop";
+    let mut stage = Stage::new(learner, &actor);
+    stage.plan.deadlines.actor_silence = Duration::from_millis(400);
+    let (result, seen) = stage.run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert!(
+        seen.warnings
+            .contains("actor 1 is there, but the learner has not heard of it"),
+        "{}",
+        seen.warnings
+    );
+    assert_eq!(seen.restarts.actors, 2);
+}
+
+#[test]
+fn actors_that_are_of_use_are_started_again_as_often_as_they_die() {
+    // Five deaths of one actor while the run gets on: one that is of no use is given up after as many.
+    let actor = format!("if [ $id = 0 ]; then sleep 0.1; kill -9 $$; fi; {FAITHFUL_ACTOR}");
+    let learner =
+        "n=0; while [ $(wc -l < $dir/pids) -lt 8 ]; do n=$((n+1)); report $n; sleep 0.05; done; touch $dir/stop";
+    let stage = Stage::new(learner, &actor);
+    let (result, seen) = stage.run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert!(
+        stage.processes() >= 8 && !seen.warnings.contains("given up"),
+        "{}",
+        seen.warnings
+    );
+}
+
+#[test]
+fn a_stall_is_told_once() {
+    let learner = r#"report 1; for i in 1 2 3; do report 1 '[0,1],"stalled":"the learner waits for a disk"'; done; report 2; touch $dir/stop"#;
+    let (result, seen) = Stage::new(learner, FAITHFUL_ACTOR).run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert_eq!(seen.warnings, "nothing moves: the learner waits for a disk\n");
+}
+
+#[test]
+fn a_learner_that_fails_ends_the_run_and_its_last_words_are_told() {
     let stage = Stage::new(
         "report 0; echo 'no such device' >&2; exit 3",
         "while :; do sleep 0.02; done",
@@ -163,7 +341,7 @@ fn a_learner_that_dies_ends_the_run_and_its_last_words_are_told() {
     let (result, _) = stage.run(never);
     let error = result.unwrap_err().to_string();
     assert!(
-        error.contains("exit status 3") && error.contains("learner.log"),
+        error.contains("exited with status 3") && error.contains("learner.log"),
         "{error}"
     );
     assert!(error.contains("no such device"), "{error}");
@@ -260,7 +438,7 @@ fn slow_to_stop(report: &str) -> Stage {
         while [ $n -lt 10 ]; do n=$((n+1)); {report}; sleep 0.1; done; touch $dir/saved $dir/stop"
     );
     let mut stage = Stage::new(&learner, FAITHFUL_ACTOR);
-    stage.plan.learner_grace = Duration::from_millis(500);
+    stage.plan.deadlines.learner_stop = Duration::from_millis(500);
     stage
 }
 

@@ -102,9 +102,9 @@ impl Desk {
         }
     }
 
-    /// Actors that live.
-    pub fn actors(&self) -> usize {
-        self.actors.len()
+    /// Actors that live, in ascending order.
+    pub fn actors(&self) -> impl Iterator<Item = ActorId> {
+        self.actors.keys().copied()
     }
 
     /// What went wrong so far.

@@ -4,7 +4,7 @@
 //! one. While the training thread updates the networks, records are taken in, tickets handed out and signs of life given here.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender, TryRecvError};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::thread::{self, JoinHandle};
@@ -39,8 +39,8 @@ pub struct Reception {
 /// What the receiving thread tells at any time.
 #[derive(Debug, Default)]
 pub struct Shared {
-    /// Actors that live.
-    pub actors: AtomicUsize,
+    /// Actors that live, in ascending order.
+    live_actors: RwLock<Vec<u32>>,
     /// Tickets issued again.
     pub reissued: AtomicU64,
     /// Records refused.
@@ -166,6 +166,11 @@ impl Reception {
 }
 
 impl Shared {
+    /// The numbers of the actors that live, in ascending order.
+    pub fn live_actors(&self) -> Vec<u32> {
+        self.live_actors.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
     fn failed(&self) -> ReceptionError {
         let failure = self.failure.read().unwrap_or_else(PoisonError::into_inner);
         ReceptionError::Failed(
@@ -182,7 +187,10 @@ impl Shared {
 
     fn update(&self, desk: &Desk) {
         let Faults { reissued, refused } = desk.faults();
-        self.actors.store(desk.actors(), Ordering::Relaxed);
+        let mut live = self.live_actors.write().unwrap_or_else(PoisonError::into_inner);
+        if !desk.actors().map(|actor| actor.0).eq(live.iter().copied()) {
+            *live = desk.actors().map(|actor| actor.0).collect();
+        }
         self.reissued.store(reissued, Ordering::Relaxed);
         self.refused.store(refused, Ordering::Relaxed);
     }

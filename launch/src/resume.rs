@@ -1,0 +1,156 @@
+//! What must hold for a run to be gone on with, and who may do it.
+
+use std::path::{Path, PathBuf};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use skein_protocol::claims::SupervisorClaim;
+use skein_protocol::run::{RunDirectory, RunError};
+use skein_protocol::services::{ServiceError, is_learner_alive};
+use skein_protocol::summary::{Ending, Summary};
+
+use crate::prepare::{PrepareError, Prepared, check, load_courses};
+
+/// Between two looks whether an earlier learner is gone.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// Why a run cannot be gone on with.
+#[derive(Debug, thiserror::Error)]
+pub enum ResumeError {
+    /// There is no run in the directory.
+    #[error(
+        "{} is not the directory of a run, it holds no {}: give the one that the run's first lines named",
+        directory.display(),
+        missing.display()
+    )]
+    NotARun {
+        /// The directory.
+        directory: PathBuf,
+        /// What it should hold.
+        missing: PathBuf,
+    },
+    /// All of it is done.
+    #[error(
+        "the run in {} is complete, all {flights} flights of it: there is nothing to go on with; start a new one for more",
+        directory.display()
+    )]
+    Complete {
+        /// Its directory.
+        directory: PathBuf,
+        /// Its training flights.
+        flights: u64,
+    },
+    /// Somebody is at it.
+    #[error(
+        "the run in {} is under way: give it more actors with launch/attach_actor.sh --run {}, or stop it first",
+        .0.display(),
+        .0.display()
+    )]
+    UnderWay(PathBuf),
+    /// It is of another version, was changed, or cannot be started on this machine.
+    #[error(transparent)]
+    Prepare(#[from] PrepareError),
+    /// Its files cannot be used.
+    #[error(transparent)]
+    Run(#[from] RunError),
+    /// Its services cannot be looked at.
+    #[error(transparent)]
+    Service(#[from] ServiceError),
+}
+
+/// Checks that the run in `directory` can be gone on with by `actors` actors, and claims it. A learner that its supervisor left behind is given `patience`
+/// to save what it learned.
+///
+/// # Errors
+/// [`ResumeError`]; nothing was changed then.
+pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Prepared, SupervisorClaim), ResumeError> {
+    let not_a_run = |missing: &Path| ResumeError::NotARun {
+        directory: directory.to_owned(),
+        missing: missing.to_owned(),
+    };
+    let run = RunDirectory::new(directory.canonicalize().map_err(|_| not_a_run(directory))?);
+    if !run.identity().is_file() {
+        return Err(not_a_run(Path::new("run.json")));
+    }
+    let (identity, config) = run.open()?;
+    let claim = run
+        .claim_supervisor()?
+        .ok_or_else(|| ResumeError::UnderWay(run.root().to_owned()))?;
+    let deadline = Instant::now() + patience;
+    while is_learner_alive(&identity)? {
+        if Instant::now() > deadline {
+            return Err(ResumeError::UnderWay(run.root().to_owned()));
+        }
+        sleep(LOOK);
+    }
+    if let Some(summary) = Summary::of(&run)
+        && summary.ending == Ending::Completed
+    {
+        return Err(ResumeError::Complete {
+            directory: run.root().to_owned(),
+            flights: summary.flights,
+        });
+    }
+    check(&run.config(), &config, actors)?;
+    let courses = load_courses(&config).map_err(PrepareError::from)?;
+    Ok((
+        Prepared {
+            run,
+            identity,
+            config,
+            courses,
+        },
+        claim,
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use skein_protocol::config::Config;
+
+    use super::*;
+    use crate::prepare::tests::prepared_run;
+
+    fn refusal(directory: &Path) -> String {
+        resume(directory, 1, Duration::ZERO).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn an_unfinished_run_can_be_gone_on_with_by_one_supervisor() {
+        let directory = tempfile::tempdir().unwrap();
+        let prepared = prepared_run(directory.path());
+        let (resumed, claim) = resume(prepared.run.root(), 3, Duration::ZERO).unwrap();
+        assert_eq!(
+            (&resumed.identity, &resumed.config, &resumed.courses),
+            (&prepared.identity, &prepared.config, &prepared.courses)
+        );
+        assert!(refusal(prepared.run.root()).contains("is under way"));
+        drop(claim);
+        assert!(resume(prepared.run.root(), 1, Duration::ZERO).is_ok());
+    }
+
+    #[test]
+    fn what_is_no_run_is_refused_with_what_to_give_instead() {
+        let directory = tempfile::tempdir().unwrap();
+        for path in [directory.path(), Path::new("/nowhere")] {
+            let error = refusal(path);
+            assert!(error.contains("not the directory of a run"), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_changed_run_and_too_many_actors_are_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = prepared_run(directory.path()).run;
+        let actors = Config::default().transport.max_actors + 1;
+        let error = resume(run.root(), actors, Duration::ZERO).unwrap_err().to_string();
+        assert!(error.contains("max_actors"), "{error}");
+        let text = fs::read_to_string(run.config())
+            .unwrap()
+            .replace("seed = 1", "seed = 2");
+        fs::write(run.config(), text).unwrap();
+        assert!(refusal(run.root()).contains("was changed"));
+    }
+}

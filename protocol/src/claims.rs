@@ -1,0 +1,97 @@
+//! Who may be what in a run's directory: held by locks that end with the process that holds them.
+//!
+//! A lock is never in the way of the dead: the kernel frees it however its process ended. Files that are locked stay; only the lock counts.
+
+use std::fs::{File, OpenOptions};
+use std::path::PathBuf;
+
+use rustix::fs::{FlockOperation, flock};
+use rustix::io::Errno;
+
+use crate::ids::ActorId;
+use crate::run::{RunDirectory, RunError};
+
+/// An actor's number, which nobody else has while this is alive: a lock on the actor's log.
+#[derive(Debug)]
+pub struct ActorClaim {
+    id: ActorId,
+    _lock: File,
+}
+
+impl ActorClaim {
+    /// The number.
+    pub fn id(&self) -> ActorId {
+        self.id
+    }
+}
+
+/// That this process supervises a run, which no other does while this is alive: a lock on the run's directory itself.
+#[derive(Debug)]
+pub struct SupervisorClaim {
+    _lock: File,
+}
+
+impl RunDirectory {
+    /// Claims the lowest number that no actor of this run has at present. Logs are appended to, so that a number whose actor is gone can be used again.
+    ///
+    /// # Errors
+    /// [`RunError::Io`] names the log that cannot be written.
+    pub fn claim_actor(&self) -> Result<ActorClaim, RunError> {
+        for id in (0..).map(ActorId) {
+            let path = self.actor_log(id);
+            let log = OpenOptions::new().create(true).append(true).open(&path);
+            if let Some(lock) = locked(path, log)? {
+                return Ok(ActorClaim { id, _lock: lock });
+            }
+        }
+        unreachable!("the numbers of four thousand million actors are taken")
+    }
+
+    /// Claims to be this run's supervisor; `None` when it has one.
+    ///
+    /// # Errors
+    /// [`RunError::Io`] when the directory cannot be opened or locked.
+    pub fn claim_supervisor(&self) -> Result<Option<SupervisorClaim>, RunError> {
+        let path = self.root().to_owned();
+        let directory = File::open(&path);
+        Ok(locked(path, directory)?.map(|lock| SupervisorClaim { _lock: lock }))
+    }
+}
+
+/// `file`, locked; `None` when somebody else has locked it.
+fn locked(path: PathBuf, file: std::io::Result<File>) -> Result<Option<File>, RunError> {
+    let outcome = file.and_then(|file| match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Ok(Some(file)),
+        Err(Errno::WOULDBLOCK) => Ok(None),
+        Err(error) => Err(error.into()),
+    });
+    outcome.map_err(|source| RunError::Io { path, source })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    #[test]
+    fn a_number_is_free_again_when_its_actor_is_gone() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        run.create(&Config::default()).unwrap();
+        let claims = [(); 3].map(|()| run.claim_actor().unwrap());
+        assert_eq!([0, 1, 2].map(ActorId), claims.each_ref().map(ActorClaim::id));
+        let [first, _second, _third] = claims;
+        drop(first);
+        assert_eq!(run.claim_actor().unwrap().id(), ActorId(0));
+    }
+
+    #[test]
+    fn a_run_has_one_supervisor_at_a_time() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let claim = run.claim_supervisor().unwrap();
+        assert!(claim.is_some() && run.claim_supervisor().unwrap().is_none());
+        drop(claim);
+        assert!(run.claim_supervisor().unwrap().is_some());
+    }
+}
