@@ -6,6 +6,7 @@
 
 pub mod conclusion;
 pub mod display;
+pub mod inspection;
 pub mod prepare;
 pub mod reports;
 pub mod resume;

@@ -1,0 +1,291 @@
+//! What is done to a run, and when: drawn from a seed before the run starts, so that the same seed disturbs in the same way.
+//!
+//! Moments are given in training flights, not in seconds, so that a plan fits a run whatever machine it is on. Some disturbances follow another
+//! within moments, to meet a run that is just getting up again.
+
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use serde::Serialize;
+
+/// A disturbance.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(tag = "what", rename_all = "snake_case")]
+pub(crate) enum Disturbance {
+    /// SIGKILL to an actor. `choice` says which of those that live.
+    KillActor { choice: u32 },
+    /// SIGSTOP to an actor, and SIGCONT after `secs`.
+    FreezeActor { choice: u32, secs: f64 },
+    /// SIGKILL to the learner.
+    KillLearner,
+    /// SIGSTOP to the learner, and SIGCONT after `secs`.
+    FreezeLearner { secs: f64 },
+    /// SIGKILL to the supervisor, and to whatever `reach` says; the run is resumed after `pause_secs` with so many actors.
+    KillSupervisor { reach: Reach, pause_secs: f64, actors: u32 },
+    /// `skein attach` with so many actors.
+    Attach { count: u32 },
+    /// Ends one of those that attached actors, with all it attached.
+    Detach { choice: u32, manner: Manner },
+}
+
+/// Who else dies with the supervisor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Reach {
+    /// Nobody: the others are orphaned.
+    Alone,
+    /// All processes of the run at once, as when the power is cut.
+    Everybody,
+}
+
+/// How attached actors are taken away.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Manner {
+    /// SIGINT, as Ctrl-C.
+    Interrupt,
+    /// SIGKILL.
+    Kill,
+}
+
+/// When something is due.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum When {
+    /// Once so many training flights were learned from for the first time, and then this share of the time an epoch takes.
+    Flight { flight: u64, share: f64 },
+    /// So long after the disturbance before it.
+    After { secs: f64 },
+}
+
+/// A disturbance and its moment.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub(crate) struct Planned {
+    pub(crate) when: When,
+    #[serde(flatten)]
+    pub(crate) what: Disturbance,
+}
+
+/// How often each thing is to be done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Wanted {
+    pub(crate) actor_kills: u32,
+    pub(crate) learner_kills: u32,
+    pub(crate) supervisor_kills: u32,
+    pub(crate) freezes: u32,
+    pub(crate) attachments: u32,
+}
+
+/// The run that is to be disturbed.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Subject {
+    pub(crate) flights: u64,
+    pub(crate) flights_per_epoch: u64,
+    pub(crate) actors: u32,
+    pub(crate) actor_silence_secs: f64,
+    pub(crate) learner_silence_secs: f64,
+}
+
+/// Nothing is planned for later than this share of the run: what is late must still find it running.
+const LAST: f64 = 0.9;
+/// Share of the kills that follow the kill of a learner or supervisor within moments.
+const AFTERSHOCKS: f64 = 0.3;
+/// Longest time between a kill and its aftershock: a start takes about as long.
+const AFTERSHOCK_SECS: f64 = 2.0;
+/// Every so many freezes is the learner's.
+const LEARNER_FREEZES: u32 = 6;
+
+impl Wanted {
+    /// A plan for `subject`: all that is wanted, in the order in which it is due.
+    pub(crate) fn plan(self, subject: &Subject, seed: u64) -> Vec<Planned> {
+        let mut draw = Draw {
+            subject: *subject,
+            generator: Pcg64Mcg::seed_from_u64(seed),
+        };
+        let mut shocks = Vec::new();
+        shocks.extend((0..self.learner_kills).map(|_| Disturbance::KillLearner));
+        shocks.extend((0..self.supervisor_kills).map(|number| draw.supervisor_kill(number)));
+        shocks.extend((0..self.freezes).map(|number| draw.freeze(number)));
+        let mut kills: Vec<_> = (0..self.actor_kills).map(|_| draw.actor_kill()).collect();
+
+        let mut moments: Vec<(u64, f64, Disturbance, Vec<Planned>)> = Vec::new();
+        for what in shocks {
+            let mut after = Vec::new();
+            let gets_up_again = matches!(what, Disturbance::KillLearner | Disturbance::KillSupervisor { .. });
+            if gets_up_again
+                && draw.generator.random_bool(AFTERSHOCKS)
+                && let Some(what) = kills.pop()
+            {
+                let secs = draw.generator.random_range(0.0..AFTERSHOCK_SECS);
+                after.push(Planned {
+                    when: When::After { secs },
+                    what,
+                });
+            }
+            let (flight, share) = draw.moment();
+            moments.push((flight, share, what, after));
+        }
+        for what in kills {
+            let (flight, share) = draw.moment();
+            moments.push((flight, share, what, Vec::new()));
+        }
+        for _ in 0..self.attachments {
+            let [(one, one_share), (other, other_share)] = [draw.moment(), draw.moment()];
+            let (first, last) = if (one, one_share) < (other, other_share) {
+                ((one, one_share), (other, other_share))
+            } else {
+                ((other, other_share), (one, one_share))
+            };
+            let count = draw.generator.random_range(1..=2);
+            moments.push((first.0, first.1, Disturbance::Attach { count }, Vec::new()));
+            moments.push((last.0, last.1, draw.detachment(), Vec::new()));
+        }
+        moments.sort_by(|one, other| {
+            (one.0, one.1)
+                .partial_cmp(&(other.0, other.1))
+                .expect("shares are numbers")
+        });
+        let in_order = moments.into_iter().flat_map(|(flight, share, what, after)| {
+            let when = When::Flight { flight, share };
+            std::iter::once(Planned { when, what }).chain(after)
+        });
+        in_order.collect()
+    }
+}
+
+/// Draws what is done.
+struct Draw {
+    subject: Subject,
+    generator: Pcg64Mcg,
+}
+
+impl Draw {
+    fn moment(&mut self) -> (u64, f64) {
+        let Subject {
+            flights,
+            flights_per_epoch,
+            ..
+        } = self.subject;
+        let last = (flights as f64 * LAST) as u64 / flights_per_epoch;
+        let epoch = self.generator.random_range(0..=last);
+        (epoch * flights_per_epoch, self.generator.random_range(0.0..1.0))
+    }
+
+    fn actor_kill(&mut self) -> Disturbance {
+        Disturbance::KillActor {
+            choice: self.generator.random(),
+        }
+    }
+
+    fn supervisor_kill(&mut self, number: u32) -> Disturbance {
+        Disturbance::KillSupervisor {
+            reach: if number.is_multiple_of(2) {
+                Reach::Alone
+            } else {
+                Reach::Everybody
+            },
+            pause_secs: self.generator.random_range(0.0..3.0),
+            actors: self.generator.random_range(1..=self.subject.actors + 2),
+        }
+    }
+
+    /// Half of them shorter than the silence that the peer puts up with, half of them longer.
+    fn freeze(&mut self, number: u32) -> Disturbance {
+        let learner = number % LEARNER_FREEZES == LEARNER_FREEZES - 1;
+        let silence_secs = if learner {
+            self.subject.learner_silence_secs
+        } else {
+            self.subject.actor_silence_secs
+        };
+        let factor = if number.is_multiple_of(2) {
+            self.generator.random_range(0.02..0.8)
+        } else {
+            self.generator.random_range(1.1..1.6)
+        };
+        let secs = silence_secs * factor;
+        if learner {
+            Disturbance::FreezeLearner { secs }
+        } else {
+            let choice = self.generator.random();
+            Disturbance::FreezeActor { choice, secs }
+        }
+    }
+
+    fn detachment(&mut self) -> Disturbance {
+        Disturbance::Detach {
+            choice: self.generator.random(),
+            manner: if self.generator.random_bool(0.5) {
+                Manner::Interrupt
+            } else {
+                Manner::Kill
+            },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SUBJECT: Subject = Subject {
+        flights: 300,
+        flights_per_epoch: 10,
+        actors: 4,
+        actor_silence_secs: 5.0,
+        learner_silence_secs: 30.0,
+    };
+    const WANTED: Wanted = Wanted {
+        actor_kills: 50,
+        learner_kills: 5,
+        supervisor_kills: 2,
+        freezes: 6,
+        attachments: 3,
+    };
+
+    #[test]
+    fn a_plan_holds_all_that_is_wanted_and_depends_on_the_seed_alone() {
+        let plan = WANTED.plan(&SUBJECT, 7);
+        let count = |is: fn(&Disturbance) -> bool| plan.iter().filter(|planned| is(&planned.what)).count();
+        assert_eq!(count(|what| matches!(what, Disturbance::KillActor { .. })), 50);
+        assert_eq!(count(|what| matches!(what, Disturbance::KillLearner)), 5);
+        assert_eq!(count(|what| matches!(what, Disturbance::KillSupervisor { .. })), 2);
+        assert_eq!(count(|what| matches!(what, Disturbance::FreezeActor { .. })), 5);
+        assert_eq!(count(|what| matches!(what, Disturbance::FreezeLearner { .. })), 1);
+        assert_eq!(count(|what| matches!(what, Disturbance::Attach { .. })), 3);
+        assert_eq!(plan, WANTED.plan(&SUBJECT, 7));
+        assert_ne!(plan, WANTED.plan(&SUBJECT, 8));
+    }
+
+    #[test]
+    fn moments_come_in_order_and_before_the_end() {
+        let flights: Vec<_> = (0..20)
+            .flat_map(|seed| WANTED.plan(&SUBJECT, seed))
+            .filter_map(|planned| match planned.when {
+                When::Flight { flight, .. } => Some(flight),
+                When::After { .. } => None,
+            })
+            .collect();
+        assert!(flights.iter().all(|&flight| flight <= 270 && flight % 10 == 0));
+        let one = WANTED.plan(&SUBJECT, 1);
+        assert!(matches!(one[0].when, When::Flight { .. }), "an aftershock of nothing");
+        let mut last = (0, 0.0);
+        for planned in &one {
+            if let When::Flight { flight, share } = planned.when {
+                assert!((flight, share) >= last);
+                last = (flight, share);
+            }
+        }
+    }
+
+    #[test]
+    fn actors_are_frozen_for_less_and_for_more_than_is_put_up_with() {
+        let frozen: Vec<_> = WANTED
+            .plan(&SUBJECT, 3)
+            .into_iter()
+            .filter_map(|planned| match planned.what {
+                Disturbance::FreezeActor { secs, .. } => Some(secs),
+                _ => None,
+            })
+            .collect();
+        assert!(frozen.iter().any(|&secs| secs < 5.0) && frozen.iter().any(|&secs| secs > 5.0));
+    }
+}

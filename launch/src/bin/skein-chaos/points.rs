@@ -1,0 +1,97 @@
+//! Arms one fault point after the other while a run goes on.
+
+use std::fs;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result};
+use serde_json::json;
+use skein_protocol::fault::FaultPoint;
+
+use crate::storm::{Script, Storm};
+
+/// After so long the next point is armed as well: some are passed seldom, and the last ones only at the end.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// The fault points, in the order in which they are armed.
+#[derive(Debug)]
+pub(crate) struct Points {
+    folder: PathBuf,
+    total_flights: u64,
+    to_arm: Vec<FaultPoint>,
+    armed: Vec<(FaultPoint, Instant)>,
+    fired: Vec<FaultPoint>,
+    /// Flights learned from at the least since a point fired, until there are more again.
+    recovering_from: Option<u64>,
+}
+
+impl Points {
+    /// All of them, to be armed in `folder`, over a run of so many flights.
+    ///
+    /// # Errors
+    /// When the folder cannot be made.
+    pub(crate) fn new(folder: PathBuf, total_flights: u64) -> Result<Self> {
+        fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+        Ok(Self {
+            folder,
+            total_flights,
+            to_arm: FaultPoint::ALL.iter().rev().copied().collect(),
+            armed: Vec::new(),
+            fired: Vec::new(),
+            recovering_from: None,
+        })
+    }
+
+    /// Where somebody died.
+    pub(crate) fn fired(&self) -> &[FaultPoint] {
+        &self.fired
+    }
+
+    /// Where nobody did.
+    pub(crate) fn unfired(&self) -> Vec<FaultPoint> {
+        let unfired = |point: &&FaultPoint| !self.fired.contains(point);
+        FaultPoint::ALL.iter().filter(unfired).copied().collect()
+    }
+
+    fn note_fired(&mut self, storm: &mut Storm<'_>) -> Result<()> {
+        let folder = &self.folder;
+        let (armed, fired): (Vec<_>, Vec<_>) = std::mem::take(&mut self.armed)
+            .into_iter()
+            .partition(|(point, _)| folder.join(point.name()).exists());
+        self.armed = armed;
+        for (point, _) in fired {
+            storm.note("fired", &json!({ "point": point.name() }))?;
+            self.fired.push(point);
+            self.recovering_from = Some(storm.flights());
+        }
+        Ok(())
+    }
+
+    /// Whether the run has learned again since the last point fired. What comes later than its last flight, nobody can wait for.
+    fn has_recovered(&mut self, storm: &Storm<'_>) -> bool {
+        let flights = storm.flights();
+        if let Some(lowest) = self.recovering_from {
+            self.recovering_from = (flights <= lowest && flights < self.total_flights).then_some(flights.min(lowest));
+        }
+        self.recovering_from.is_none()
+    }
+}
+
+impl Script for Points {
+    fn step(&mut self, storm: &mut Storm<'_>) -> Result<()> {
+        self.note_fired(storm)?;
+        let recovered = self.has_recovered(storm);
+        let patient = self.armed.iter().any(|(_, armed)| armed.elapsed() < PATIENCE);
+        let at_the_end = storm.flights() >= self.total_flights;
+        if recovered
+            && (!patient || at_the_end)
+            && let Some(point) = self.to_arm.pop()
+        {
+            let path = self.folder.join(point.name());
+            fs::write(&path, "").with_context(|| format!("cannot arm {}", path.display()))?;
+            storm.note("armed", &json!({ "point": point.name() }))?;
+            self.armed.push((point, Instant::now()));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,50 @@
+//! The flight recorder: everything that was done to a run, as one JSON object a line, so that a failure can be studied.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::Path;
+use std::time::Instant;
+
+use serde::Serialize;
+use serde_json::{Map, Value};
+
+/// Writes what happens as it happens.
+#[derive(Debug)]
+pub(crate) struct Recorder {
+    file: File,
+    started: Instant,
+}
+
+impl Recorder {
+    /// A recording in a new file.
+    ///
+    /// # Errors
+    /// When it cannot be created.
+    pub(crate) fn create(path: &Path) -> io::Result<Self> {
+        Ok(Self {
+            file: File::create(path)?,
+            started: Instant::now(),
+        })
+    }
+
+    /// Notes what happened: seconds since the start, flights learned from by then, `event`, and the fields of `details`.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub(crate) fn note(&mut self, flights: u64, event: &str, details: &impl Serialize) -> io::Result<()> {
+        let mut line = Map::new();
+        let secs = (self.started.elapsed().as_secs_f64() * 1000.0).round() / 1000.0;
+        line.insert("secs".to_owned(), secs.into());
+        line.insert("flights".to_owned(), flights.into());
+        line.insert("event".to_owned(), event.into());
+        match serde_json::to_value(details)? {
+            Value::Object(fields) => line.extend(fields),
+            Value::Null => {}
+            other => {
+                line.insert("details".to_owned(), other);
+            }
+        }
+        // One write a line, and nothing kept back: the recording is whole when this program is killed as well.
+        self.file.write_all(format!("{}\n", Value::Object(line)).as_bytes())
+    }
+}

@@ -1,0 +1,482 @@
+//! A run that is disturbed while it goes on.
+//!
+//! What is done to it is a [`Script`]'s business. Here is what every script needs: the hand that kills, freezes and attaches, and the eye on
+//! supervisor, crews and flights, so that what happens by itself is told from what was done.
+
+use std::collections::BTreeMap;
+use std::process::{Child, ExitStatus};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::json;
+use skein_launch::inspection::{Process, Role};
+
+use crate::plan::{Disturbance, Manner, Reach};
+use crate::recorder::Recorder;
+use crate::stage::{FlightCount, LOOK, Stage, wait};
+
+/// Without a new flight for so long, a run is stuck: the longest pause of a sound one is its evaluation.
+const STUCK: Duration = Duration::from_secs(300);
+/// How long a killed run's processes may keep it from being resumed: a learner that was orphaned ends its epoch and saves.
+const RESUME: Duration = Duration::from_secs(120);
+/// Between two attempts to resume.
+const RESUME_PAUSE: Duration = Duration::from_millis(500);
+/// How long those that attached actors may outlive the run.
+const CREW_GRACE: Duration = Duration::from_secs(40);
+
+/// What is done to a run.
+pub(crate) trait Script {
+    /// Called every few milliseconds while the run is under way.
+    ///
+    /// # Errors
+    /// Whatever makes it pointless to go on.
+    fn step(&mut self, storm: &mut Storm<'_>) -> Result<()>;
+}
+
+/// How an attempt to disturb ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Attempt {
+    /// It is done.
+    Done,
+    /// Nobody was there to do it to.
+    NobodyThere,
+}
+
+/// A run under way, and what was done to it.
+#[derive(Debug)]
+pub(crate) struct Storm<'a> {
+    stage: &'a Stage,
+    supervisor: Supervisor,
+    crews: Vec<Child>,
+    frozen: Vec<(Process, Instant)>,
+    count: FlightCount,
+    flights: u64,
+    highest: u64,
+    moved: Instant,
+    spared: Spared,
+    recorder: Recorder,
+    tally: BTreeMap<&'static str, u32>,
+}
+
+/// Who is never a victim.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Spared {
+    /// Nobody is safe.
+    Nobody,
+    /// The actor that was started first.
+    ElderActor,
+}
+
+/// Who supervises the run.
+#[derive(Debug)]
+enum Supervisor {
+    /// A process of ours.
+    Running { child: Child, told_to_stop: Told },
+    /// Nobody, until it is resumed.
+    Killed {
+        resume_at: Instant,
+        give_up_at: Instant,
+        actors: u32,
+    },
+    /// Was started again, and may find that the orphans of the one before are still ending.
+    Resuming {
+        child: Child,
+        give_up_at: Instant,
+        actors: u32,
+    },
+    /// Nobody any more: the run has ended.
+    Ended,
+}
+
+/// Whether a supervisor was interrupted from here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Told {
+    Nothing,
+    ToStop,
+}
+
+/// Status of a process that was interrupted, as shells report it: 128 + SIGINT.
+const INTERRUPTED: i32 = 130;
+
+impl<'a> Storm<'a> {
+    /// Over the run that `supervisor` has just been started for.
+    pub(crate) fn new(stage: &'a Stage, supervisor: Child, recorder: Recorder, spared: Spared) -> Self {
+        Self {
+            stage,
+            supervisor: Supervisor::Running {
+                child: supervisor,
+                told_to_stop: Told::Nothing,
+            },
+            crews: Vec::new(),
+            frozen: Vec::new(),
+            count: FlightCount::of(&stage.run),
+            flights: 0,
+            highest: 0,
+            moved: Instant::now(),
+            spared,
+            recorder,
+            tally: BTreeMap::new(),
+        }
+    }
+
+    /// Lets `script` disturb the run until it ends. Nobody is left frozen.
+    ///
+    /// # Errors
+    /// When the run fails or gets stuck, or the script gives up; the run is killed then.
+    pub(crate) fn rage(&mut self, script: &mut impl Script) -> Result<()> {
+        let outcome = self.rage_on(script);
+        self.thaw(Thaw::All);
+        if let Err(error) = &outcome {
+            let processes: Vec<_> = self
+                .stage
+                .processes()
+                .iter()
+                .map(|process| process.command.join(" "))
+                .collect();
+            self.note(
+                "failed",
+                &json!({ "error": format!("{error:#}"), "processes": processes }),
+            )?;
+            self.stage.clear();
+        }
+        self.reap_crews(Instant::now() + CREW_GRACE)?;
+        outcome
+    }
+
+    fn rage_on(&mut self, script: &mut impl Script) -> Result<()> {
+        loop {
+            self.thaw(Thaw::Due);
+            self.watch_flights();
+            self.reap_crews(Instant::now())?;
+            self.watch_supervisor()?;
+            if matches!(self.supervisor, Supervisor::Ended) {
+                return Ok(());
+            }
+            if self.moved.elapsed() > STUCK {
+                bail!(
+                    "nothing was learned from for {} s, after {} flights; the last that was said:\n{}",
+                    STUCK.as_secs(),
+                    self.flights,
+                    self.stage.last_words()
+                );
+            }
+            script.step(self)?;
+            sleep(LOOK);
+        }
+    }
+
+    /// Does `what`, if there is somebody to do it to.
+    ///
+    /// # Errors
+    /// When a program cannot be started or the recording not be written.
+    pub(crate) fn disturb(&mut self, what: Disturbance) -> Result<Attempt> {
+        let victims = match what {
+            Disturbance::KillActor { choice } => self.strike(Role::Actor, choice, Signal::KILL),
+            Disturbance::FreezeActor { choice, secs } => self.freeze(Role::Actor, choice, secs),
+            Disturbance::KillLearner => self.strike(Role::Learner, 0, Signal::KILL),
+            Disturbance::FreezeLearner { secs } => self.freeze(Role::Learner, 0, secs),
+            Disturbance::KillSupervisor {
+                reach,
+                pause_secs,
+                actors,
+            } => self.kill_supervisor(reach, pause_secs, actors)?,
+            Disturbance::Attach { count } => self.attach(count)?,
+            Disturbance::Detach { choice, manner } => self.detach(choice, manner),
+        };
+        if victims.is_empty() {
+            return Ok(Attempt::NobodyThere);
+        }
+        self.note("disturbed", &json!({ "disturbance": what, "pids": victims }))?;
+        *self.tally.entry(name(&what)).or_default() += 1;
+        Ok(Attempt::Done)
+    }
+
+    /// The process of `role` that `choice` means, of those that live and are not frozen.
+    fn choose(&self, role: Role, choice: u32) -> Option<Process> {
+        let spared = usize::from(self.spared == Spared::ElderActor && role == Role::Actor);
+        let candidates: Vec<_> = self
+            .stage
+            .processes()
+            .into_iter()
+            .filter(|process| process.role() == role)
+            .skip(spared)
+            .filter(|process| self.frozen.iter().all(|(frozen, _)| frozen != process))
+            .collect();
+        candidates.get(choice as usize % candidates.len().max(1)).cloned()
+    }
+
+    fn strike(&self, role: Role, choice: u32, signal: Signal) -> Vec<i32> {
+        let victim = self.choose(role, choice);
+        victim.iter().for_each(|process| process.signal(signal));
+        victim.iter().map(pid).collect()
+    }
+
+    fn freeze(&mut self, role: Role, choice: u32, secs: f64) -> Vec<i32> {
+        let Some(victim) = self.choose(role, choice) else {
+            return Vec::new();
+        };
+        victim.signal(Signal::STOP);
+        let victims = vec![pid(&victim)];
+        self.frozen
+            .push((victim, Instant::now() + Duration::from_secs_f64(secs)));
+        victims
+    }
+
+    fn thaw(&mut self, which: Thaw) {
+        let now = Instant::now();
+        self.frozen.retain(|(process, until)| {
+            let frozen = which == Thaw::Due && now < *until;
+            if !frozen {
+                process.signal(Signal::CONT);
+            }
+            frozen
+        });
+    }
+
+    fn kill_supervisor(&mut self, reach: Reach, pause_secs: f64, actors: u32) -> Result<Vec<i32>> {
+        let Supervisor::Running { child, .. } = &mut self.supervisor else {
+            return Ok(Vec::new());
+        };
+        let mut victims = vec![child.id().cast_signed()];
+        child.kill().context("cannot kill the supervisor")?;
+        child.wait().context("cannot wait for the supervisor")?;
+        if reach == Reach::Everybody {
+            for process in self.stage.processes() {
+                process.signal(Signal::KILL);
+                victims.push(pid(&process));
+            }
+        }
+        let now = Instant::now();
+        self.supervisor = Supervisor::Killed {
+            resume_at: now + Duration::from_secs_f64(pause_secs),
+            give_up_at: now + RESUME,
+            actors,
+        };
+        Ok(victims)
+    }
+
+    fn attach(&mut self, count: u32) -> Result<Vec<i32>> {
+        if !matches!(self.supervisor, Supervisor::Running { .. }) || self.choose(Role::Learner, 0).is_none() {
+            return Ok(Vec::new());
+        }
+        let crew = self.stage.attach(count)?;
+        let pids = vec![crew.id().cast_signed()];
+        self.crews.push(crew);
+        Ok(pids)
+    }
+
+    fn detach(&mut self, choice: u32, manner: Manner) -> Vec<i32> {
+        let signal = match manner {
+            Manner::Interrupt => Signal::INT,
+            Manner::Kill => Signal::KILL,
+        };
+        self.strike(Role::Crew, choice, signal)
+    }
+
+    /// Ends the run in order.
+    ///
+    /// # Errors
+    /// When the supervisor is not there to be told.
+    pub(crate) fn interrupt(&mut self) -> Result<()> {
+        let Supervisor::Running { child, told_to_stop } = &mut self.supervisor else {
+            bail!("there is no supervisor to be told to stop");
+        };
+        *told_to_stop = Told::ToStop;
+        let pid = Pid::from_raw(child.id().cast_signed()).context("a process has a number")?;
+        kill_process(pid, Signal::INT).context("cannot interrupt the supervisor")?;
+        self.note("interrupted", &())
+    }
+
+    fn watch_flights(&mut self) {
+        let flights = self.count.now();
+        if flights != self.flights {
+            self.flights = flights;
+            self.highest = self.highest.max(flights);
+            self.moved = Instant::now();
+        }
+    }
+
+    /// Learned from at present.
+    pub(crate) fn flights(&self) -> u64 {
+        self.flights
+    }
+
+    /// Learned from at any time.
+    pub(crate) fn highest(&self) -> u64 {
+        self.highest
+    }
+
+    /// Since the number of flights has changed.
+    pub(crate) fn since_moved(&self) -> Duration {
+        self.moved.elapsed()
+    }
+
+    /// Crews that were attached and have not ended.
+    pub(crate) fn crews(&self) -> usize {
+        self.crews.len()
+    }
+
+    /// The run's processes, oldest first.
+    pub(crate) fn processes(&self) -> Vec<Process> {
+        self.stage.processes()
+    }
+
+    fn watch_supervisor(&mut self) -> Result<()> {
+        self.supervisor = match std::mem::replace(&mut self.supervisor, Supervisor::Ended) {
+            Supervisor::Ended => Supervisor::Ended,
+            Supervisor::Running {
+                mut child,
+                told_to_stop,
+            } => match child.try_wait()? {
+                None => Supervisor::Running { child, told_to_stop },
+                Some(status) => {
+                    self.ended(status, told_to_stop)?;
+                    Supervisor::Ended
+                }
+            },
+            Supervisor::Killed {
+                resume_at,
+                give_up_at,
+                actors,
+            } => {
+                if Instant::now() < resume_at {
+                    Supervisor::Killed {
+                        resume_at,
+                        give_up_at,
+                        actors,
+                    }
+                } else {
+                    let child = self.stage.resume(actors)?;
+                    Supervisor::Resuming {
+                        child,
+                        give_up_at,
+                        actors,
+                    }
+                }
+            }
+            Supervisor::Resuming {
+                child,
+                give_up_at,
+                actors,
+            } => self.watch_resumption(child, give_up_at, actors)?,
+        };
+        Ok(())
+    }
+
+    fn watch_resumption(&mut self, mut child: Child, give_up_at: Instant, actors: u32) -> Result<Supervisor> {
+        let Some(status) = child.try_wait()? else {
+            // It starts actors once its learner has reported: then nothing of the former life is in its way any more.
+            let accepted = self
+                .stage
+                .processes()
+                .iter()
+                .any(|process| process.role() == Role::Actor && process.parent() == Some(child.id()));
+            return Ok(if accepted {
+                self.note("resumed", &json!({ "pid": child.id(), "actors": actors }))?;
+                Supervisor::Running {
+                    child,
+                    told_to_stop: Told::Nothing,
+                }
+            } else {
+                Supervisor::Resuming {
+                    child,
+                    give_up_at,
+                    actors,
+                }
+            });
+        };
+        if status.success() || self.stage.is_complete() {
+            self.note("ended", &json!({ "status": status.to_string() }))?;
+            return Ok(Supervisor::Ended);
+        }
+        let said = self.stage.last_words();
+        let said = said.lines().last().unwrap_or_default();
+        if Instant::now() > give_up_at {
+            bail!("the run cannot be resumed: {said}");
+        }
+        self.note("not resumed yet", &json!({ "said": said }))?;
+        Ok(Supervisor::Killed {
+            resume_at: Instant::now() + RESUME_PAUSE,
+            give_up_at,
+            actors,
+        })
+    }
+
+    fn ended(&mut self, status: ExitStatus, told: Told) -> Result<()> {
+        self.note("ended", &json!({ "status": status.to_string() }))?;
+        match (status.code(), told) {
+            (Some(0), _) | (Some(INTERRUPTED), Told::ToStop) => Ok(()),
+            _ => bail!(
+                "the run ended with {status} after {} flights; the last that was said:\n{}",
+                self.flights,
+                self.stage.last_words()
+            ),
+        }
+    }
+
+    /// Waits for those that attached actors, until `deadline`.
+    fn reap_crews(&mut self, deadline: Instant) -> Result<()> {
+        let mut ended = Vec::new();
+        let mut there = Vec::new();
+        for mut crew in std::mem::take(&mut self.crews) {
+            match wait(&mut crew, deadline)? {
+                Some(status) => ended.push((crew.id(), status.to_string())),
+                None => there.push(crew),
+            }
+        }
+        self.crews = there;
+        for (pid, status) in ended {
+            self.note("crew ended", &json!({ "pid": pid, "status": status }))?;
+        }
+        Ok(())
+    }
+
+    /// How often each thing was done.
+    pub(crate) fn tally(&self) -> &BTreeMap<&'static str, u32> {
+        &self.tally
+    }
+
+    /// Writes `event` into the recording.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub(crate) fn note(&mut self, event: &str, details: &impl serde::Serialize) -> Result<()> {
+        self.recorder
+            .note(self.flights, event, details)
+            .context("cannot write the recording")
+    }
+}
+
+/// Who is woken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Thaw {
+    /// Those whose time has come.
+    Due,
+    /// Everybody.
+    All,
+}
+
+fn pid(process: &Process) -> i32 {
+    process.pid.as_raw_nonzero().get()
+}
+
+/// What a disturbance is called in the table.
+fn name(what: &Disturbance) -> &'static str {
+    match what {
+        Disturbance::KillActor { .. } => "actors killed",
+        Disturbance::FreezeActor { .. } => "actors frozen",
+        Disturbance::KillLearner => "learners killed",
+        Disturbance::FreezeLearner { .. } => "learners frozen",
+        Disturbance::KillSupervisor {
+            reach: Reach::Alone, ..
+        } => "supervisors killed",
+        Disturbance::KillSupervisor {
+            reach: Reach::Everybody,
+            ..
+        } => "power cuts",
+        Disturbance::Attach { .. } => "crews attached",
+        Disturbance::Detach { .. } => "crews taken away",
+    }
+}
