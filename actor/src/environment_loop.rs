@@ -44,6 +44,11 @@ impl Pilot {
         }
     }
 
+    /// Signs records as `incarnation` from now on.
+    pub fn begin_life(&mut self, incarnation: Incarnation) {
+        self.incarnation = incarnation;
+    }
+
     /// Flies `ticket` with `network` from take-off to its end: each step a record into `link`, and a closing one at last.
     ///
     /// # Errors

@@ -4,7 +4,6 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::Context;
 use clap::Parser;
@@ -12,21 +11,18 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use skein_actor::agent::Agent;
 use skein_actor::courses::{Courses, Simulators};
 use skein_actor::environment_loop::Pilot;
-use skein_actor::service::{Ending, LearnerLine, serve};
-use skein_actor::weights::Weights;
+use skein_actor::service::{Ending, Service};
 use skein_protocol::failure::{EXIT_LEARNER_GONE, with_causes};
 use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::logging::{LogFormat, log_to_file};
-use skein_protocol::run::RunDirectory;
-use skein_protocol::services::{ActorPorts, JoinError};
-use skein_protocol::snapshot::SnapshotLayout;
+use skein_protocol::run::{Presence, RunDirectory};
 use tracing::{error, info};
 
 /// Flies for a run, beside its learner and other actors, until the run is over.
 ///
-/// Actors come and go as they like: what is learned does not depend on them. The log goes to logs/actor-ID.log in the run's directory (RUST_LOG says what is
-/// logged, SKEIN_LOG_FORMAT=json how). Exit status: 0 when the run is over or on SIGTERM or SIGINT, 1 on an error, 3 when there is no learner or it has
-/// been silent for transport.learner_silence_secs.
+/// Actors come and go as they like: what is learned does not depend on them. One whose learner dies waits for the learner's next life. The log goes to
+/// logs/actor-ID.log in the run's directory (RUST_LOG says what is logged, SKEIN_LOG_FORMAT=json how). Exit status: 0 when the run is over or on SIGTERM
+/// or SIGINT, 1 on an error, 3 when no learner gave a sign of life for transport.learner_silence_secs.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
@@ -42,18 +38,16 @@ fn main() -> ExitCode {
     match run(&Arguments::parse()) {
         Ok(Ending::Stopped | Ending::Signalled) => ExitCode::SUCCESS,
         Ok(Ending::LearnerSilent) => {
-            eprintln!("skein-actor: nothing was heard of the learner for transport.learner_silence_secs; leaving");
+            eprintln!(
+                "skein-actor: no learner of this run gave a sign of life for transport.learner_silence_secs; leaving"
+            );
             ExitCode::from(EXIT_LEARNER_GONE)
         }
         Err(error) => {
-            let exit_code = match error.downcast_ref() {
-                Some(JoinError::NoLearner { .. }) => ExitCode::from(EXIT_LEARNER_GONE),
-                _ => ExitCode::FAILURE,
-            };
             let error = with_causes(error.as_ref());
             error!(error, "actor failed");
             eprintln!("skein-actor: {error}");
-            exit_code
+            ExitCode::FAILURE
         }
     }
 }
@@ -73,14 +67,17 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
     let log = directory.actor_log(actor);
     log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
 
-    let incarnation = incarnation();
-    info!(%actor, %incarnation, pid = std::process::id(), run = %identity.run, "actor started");
+    info!(%actor, pid = std::process::id(), run = %identity.run, "actor started");
+    let _presence = Presence::enter(&identity)?;
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config)?));
-    let mut pilot = Pilot::new(actor, incarnation, simulators, Agent::new(config.learning.observation));
-    let ports = ActorPorts::open(&identity, &config)?;
-    let weights = Weights::new(SnapshotLayout::of(&config));
-    let mut line = LearnerLine::new(ports, actor, incarnation, weights, &config.transport, &told_to_end);
-    Ok(serve(&mut pilot, &mut line)?)
+    // Each learner that is joined gives it an incarnation.
+    let mut pilot = Pilot::new(
+        actor,
+        Incarnation(0),
+        simulators,
+        Agent::new(config.learning.observation),
+    );
+    Ok(Service::new(&identity, &config, actor, &told_to_end).serve(&mut pilot)?)
 }
 
 /// A flag that the first SIGTERM or SIGINT sets; a second one ends the process on the spot.
@@ -93,10 +90,4 @@ fn end_on_signal() -> anyhow::Result<Arc<AtomicBool>> {
             .context("cannot listen for SIGTERM and SIGINT")?;
     }
     Ok(told_to_end)
-}
-
-/// A number no earlier life of this actor had.
-fn incarnation() -> Incarnation {
-    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH);
-    Incarnation(since_epoch.map_or(0, |elapsed| elapsed.as_nanos() as u64))
 }

@@ -10,7 +10,7 @@ use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
 use skein_actor::inference::Network;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion};
-use skein_protocol::run::RunDirectory;
+use skein_protocol::run::{LearnerSeat, RunDirectory};
 use skein_protocol::services::{ActorPorts, LearnerPorts, LoanedTransition, ServiceError};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
@@ -81,8 +81,9 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
     config.courses.evaluation = vec![configs.into()];
     run.create(&config).unwrap();
     let (identity, config) = run.open().unwrap();
-    let learner = LearnerPorts::open(&identity, &config).unwrap();
-    let actor = ActorPorts::open(&identity, &config).unwrap();
+    let seat = LearnerSeat::take(&run, &identity).unwrap();
+    let learner = LearnerPorts::open(&identity, seat.life(), &config).unwrap();
+    let actor = ActorPorts::join(&identity, &config).unwrap();
     learner.maintain().unwrap();
 
     let layout = SnapshotLayout::of(&config);
@@ -118,7 +119,6 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
     while let Some(record) = learner.receive_transition().unwrap() {
         received.push(Place::of(record.depth.as_ptr()));
     }
-    identity.remove_transport();
     flown.unwrap();
     assert!(received.len() > 3);
     assert_eq!(watched.loaned, watched.sent);

@@ -17,8 +17,7 @@ use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, Superviso
 use skein_protocol::claims::ActorClaim;
 use skein_protocol::config::Config;
 use skein_protocol::failure::with_causes;
-use skein_protocol::run::{RunDirectory, RunError};
-use skein_protocol::services::is_learner_alive;
+use skein_protocol::run::{Presence, RunDirectory, RunError, sweep_leftovers};
 use skein_protocol::summary::{Ending, Summary};
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
@@ -127,6 +126,7 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         Some(actors) => actors as usize,
         None => thread::available_parallelism().map_or(1, Into::into),
     };
+    sweep();
     let (prepared, _supervisor) = match arguments.task() {
         Task::New { config, run_dir } => {
             let prepared = prepare(config, &arguments.overrides, run_dir, actors)?;
@@ -151,13 +151,15 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         learner_threads: config.run.learner_threads,
         deadlines: Deadlines::of(config),
     };
+    let presence = Presence::enter(identity)?;
     let mut display = Display::new();
     let outcome = runtime()?.block_on(async {
         let mut interrupts = interrupts()?;
         anyhow::Ok(supervisor::run(&plan, &mut interrupts, &mut display).await)
     });
     display.finish();
-    identity.remove_transport();
+    drop(presence);
+    sweep();
 
     // Plots are a service: a run that failed may have left something worth looking at, and one that succeeded has, plots or not.
     let window = config.evaluation.window_flights as usize;
@@ -235,7 +237,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let run = open(&arguments.run)?;
     let (identity, config) = run.open()?;
     // Between two lives of its learner, a run is under way as long as somebody sees to it that there will be another.
-    if run.claim_supervisor()?.is_some() && !is_learner_alive(&identity)? {
+    if run.claim_supervisor()?.is_some() && !identity.is_learner_alive()? {
         bail!("the run in {} is not under way on this machine", run.root().display());
     }
     let claims = claim_actors(&run, arguments.count as usize)?;
@@ -269,6 +271,13 @@ fn report(arguments: &ReportArguments) -> anyhow::Result<Ended> {
         println!("{}", picture.display());
     }
     Ok(Ended::Finished)
+}
+
+/// Removes what runs of this user left whose processes were all killed.
+fn sweep() {
+    for failure in sweep_leftovers().failures {
+        eprintln!("skein: not removed: {failure}");
+    }
 }
 
 /// The run in `directory`, by its absolute path: processes of a run compare paths.

@@ -5,8 +5,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use skein_protocol::claims::SupervisorClaim;
-use skein_protocol::run::{RunDirectory, RunError};
-use skein_protocol::services::{ServiceError, is_learner_alive};
+use skein_protocol::run::{PlaceError, RunDirectory, RunError};
 use skein_protocol::summary::{Ending, Summary};
 
 use crate::prepare::{PrepareError, Prepared, check, load_courses};
@@ -53,9 +52,9 @@ pub enum ResumeError {
     /// Its files cannot be used.
     #[error(transparent)]
     Run(#[from] RunError),
-    /// Its services cannot be looked at.
+    /// Its transport cannot be looked at: it is another user's.
     #[error(transparent)]
-    Service(#[from] ServiceError),
+    Place(#[from] PlaceError),
 }
 
 /// Checks that the run in `directory` can be gone on with by `actors` actors, and claims it. A learner that its supervisor left behind is given `patience`
@@ -77,7 +76,7 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
         .claim_supervisor()?
         .ok_or_else(|| ResumeError::UnderWay(run.root().to_owned()))?;
     let deadline = Instant::now() + patience;
-    while is_learner_alive(&identity)? {
+    while identity.is_learner_alive()? {
         if Instant::now() > deadline {
             return Err(ResumeError::UnderWay(run.root().to_owned()));
         }

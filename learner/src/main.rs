@@ -10,7 +10,7 @@ use clap::Parser;
 use skein_learner::training;
 use skein_protocol::failure::with_causes;
 use skein_protocol::logging::{LogFormat, log_to_file};
-use skein_protocol::run::RunDirectory;
+use skein_protocol::run::{LearnerSeat, RunDirectory};
 use tokio::signal::unix::{SignalKind, signal};
 
 /// The learner of a run: hands out tickets, trains on the flights that come back, publishes snapshots. Started by run_local.sh.
@@ -39,11 +39,13 @@ fn main() -> ExitCode {
 fn run(arguments: &Arguments) -> Result<()> {
     let directory = RunDirectory::new(&arguments.run);
     let (identity, config) = directory.open()?;
+    // Before anything of the run is touched, the log included: there may be another learner.
+    let seat = LearnerSeat::take(&directory, &identity)?;
     let log = directory.learner_log();
     log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
-    tracing::info!(run = %identity.run, seed = config.run.seed, device = %config.run.device, "learner starts");
+    tracing::info!(run = %identity.run, life = %seat.life(), seed = config.run.seed, device = %config.run.device, "learner starts");
     let stop = stop_on_signals().context("cannot listen to signals")?;
-    let summary = training::run(&directory, &identity, &config, &stop)?;
+    let summary = training::run(&directory, &identity, seat.life(), &config, &stop)?;
     let path = directory.summary_json();
     let json = serde_json::to_string_pretty(&summary).context("cannot write the summary")?;
     std::fs::write(&path, json).with_context(|| format!("cannot write {}", path.display()))?;

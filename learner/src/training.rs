@@ -10,7 +10,7 @@ use std::time::Instant;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::Phase;
-use skein_protocol::run::{RunDirectory, RunIdentity};
+use skein_protocol::run::{Life, RunDirectory, RunIdentity};
 use skein_protocol::snapshot::{Snapshot, SnapshotError, SnapshotLayout};
 use skein_protocol::summary::{Ending, Summary};
 
@@ -77,18 +77,19 @@ struct Training<'a> {
     best: Option<BestSnapshot>,
 }
 
-/// Trains the run in `directory` to its end, or until `stop` is set; returns what it came to.
+/// Trains the run in `directory` to its end, in this `life` of its learner, or until `stop` is set; returns what it came to.
 ///
 /// # Errors
 /// [`TrainingError`]; what was learned until the last checkpoint is on disk.
 pub fn run(
     directory: &RunDirectory,
     identity: &RunIdentity,
+    life: Life,
     config: &Config,
     stop: &AtomicBool,
 ) -> Result<Summary, TrainingError> {
     let started = Instant::now();
-    let mut training = Training::new(directory, identity, config, stop)?;
+    let mut training = Training::new(directory, identity, life, config, stop)?;
     let ending = match training.learn().and_then(|()| training.evaluate_best()) {
         Ok(()) => Ending::Completed,
         Err(TrainingError::Reception(ReceptionError::Stopped)) => Ending::Interrupted,
@@ -104,6 +105,7 @@ impl<'a> Training<'a> {
     fn new(
         directory: &'a RunDirectory,
         identity: &'a RunIdentity,
+        life: Life,
         config: &'a Config,
         stop: &'a AtomicBool,
     ) -> Result<Self, TrainingError> {
@@ -113,7 +115,7 @@ impl<'a> Training<'a> {
             identity.config_digest,
             config.checkpoints.keep,
         );
-        let reception = Reception::start(identity, config)?;
+        let reception = Reception::start(identity, life, config)?;
         Ok(Self {
             config,
             identity,

@@ -59,14 +59,14 @@ pub fn leftovers(run: &RunDirectory) -> Vec<String> {
         .collect();
     // Without an identity, nothing was started that could have left anything else.
     if let Ok((identity, _)) = run.open() {
+        let prefix = identity.shared_memory_prefix();
         let shared = fs::read_dir("/dev/shm").unwrap().filter_map(|entry| {
             let name = entry.ok()?.file_name().to_str()?.to_owned();
-            name.starts_with(&identity.transport_prefix)
-                .then(|| format!("/dev/shm/{name}"))
+            name.starts_with(&prefix).then(|| format!("/dev/shm/{name}"))
         });
         found.extend(shared);
-        if identity.transport_root.exists() {
-            found.push(identity.transport_root.display().to_string());
+        if identity.transport_folder().exists() {
+            found.push(identity.transport_folder().display().to_string());
         }
     }
     found

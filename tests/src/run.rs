@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 use serde::de::DeserializeOwned;
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::run::RunDirectory;
+use skein_protocol::run::{RunDirectory, sweep_leftovers};
 use skein_protocol::summary::Summary;
 use tempfile::TempDir;
 
@@ -255,9 +255,7 @@ impl Drop for Running {
         for attached in &mut self.attached {
             let _ = attached.wait();
         }
-        if let Ok((identity, _)) = self.directory.open() {
-            identity.remove_transport();
-        }
+        sweep_leftovers();
     }
 }
 

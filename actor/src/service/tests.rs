@@ -1,10 +1,11 @@
+use std::sync::Arc;
 use std::thread::JoinHandle;
 
-use skein_protocol::config::Config;
 use skein_protocol::ids::{Attempt, FlightId, PolicyVersion};
-use skein_protocol::run::{RunDirectory, RunIdentity};
+use skein_protocol::run::{LearnerSeat, Presence, RunDirectory};
 use skein_protocol::services::LearnerPorts;
 use skein_protocol::snapshot::SnapshotLayout;
+use skein_protocol::status::ActorStatus;
 use skein_protocol::ticket::{ControlRecord, CourseChoice, Exploration};
 use skein_protocol::transition::{Outcome, RecordKind};
 
@@ -14,17 +15,16 @@ use crate::courses::{Courses, Simulators};
 use crate::testing::{config, random_snapshot};
 
 const ACTOR: ActorId = ActorId(0);
-const LIFE: Incarnation = Incarnation(77);
 const PATIENCE: Duration = Duration::from_secs(20);
 
 /// A run with a learner of the test's own and one actor on a thread.
 struct Run {
-    learner: LearnerPorts,
+    learner: Option<(LearnerPorts, LearnerSeat)>,
     told_to_end: Arc<AtomicBool>,
-    actor: Option<JoinHandle<Ending>>,
+    actor: Option<JoinHandle<Result<Ending, JoinError>>>,
     identity: RunIdentity,
     config: Config,
-    _directory: tempfile::TempDir,
+    directory: tempfile::TempDir,
 }
 
 impl Run {
@@ -36,28 +36,35 @@ impl Run {
         config.transport.learner_silence_secs = learner_silence_secs;
         run.create(&config).unwrap();
         let (identity, config) = run.open().unwrap();
-        let learner = LearnerPorts::open(&identity, &config).unwrap();
         let told_to_end = Arc::new(AtomicBool::new(false));
-        let actor = {
-            let (identity, config, told_to_end) = (identity.clone(), config.clone(), Arc::clone(&told_to_end));
-            std::thread::spawn(move || {
-                let courses = Arc::new(Courses::of_run(&config).unwrap());
-                let agent = Agent::new(config.learning.observation);
-                let mut pilot = Pilot::new(ACTOR, LIFE, Simulators::new(courses), agent);
-                let ports = ActorPorts::open(&identity, &config).unwrap();
-                let weights = Weights::new(SnapshotLayout::of(&config));
-                let mut line = LearnerLine::new(ports, ACTOR, LIFE, weights, &config.transport, &told_to_end);
-                serve(&mut pilot, &mut line).unwrap()
-            })
+        let mut started = Self {
+            learner: None,
+            told_to_end: Arc::clone(&told_to_end),
+            actor: None,
+            identity: identity.clone(),
+            config: config.clone(),
+            directory,
         };
-        Self {
-            learner,
-            told_to_end,
-            actor: Some(actor),
-            identity,
-            config,
-            _directory: directory,
-        }
+        started.begin_life();
+        started.actor = Some(std::thread::spawn(move || {
+            let _presence = Presence::enter(&identity).unwrap();
+            let courses = Arc::new(Courses::of_run(&config).unwrap());
+            let agent = Agent::new(config.learning.observation);
+            let mut pilot = Pilot::new(ACTOR, Incarnation(0), Simulators::new(courses), agent);
+            Service::new(&identity, &config, ACTOR, &told_to_end).serve(&mut pilot)
+        }));
+        started
+    }
+
+    fn begin_life(&mut self) {
+        let directory = RunDirectory::new(self.directory.path());
+        let seat = LearnerSeat::take(&directory, &self.identity).unwrap();
+        let ports = LearnerPorts::open(&self.identity, seat.life(), &self.config).unwrap();
+        self.learner = Some((ports, seat));
+    }
+
+    fn learner(&self) -> &LearnerPorts {
+        &self.learner.as_ref().unwrap().0
     }
 
     fn ticket(&self, version: u64) -> Ticket {
@@ -74,39 +81,44 @@ impl Run {
     }
 
     fn publish(&self, version: u64) {
-        self.learner
+        self.learner()
             .publish(&random_snapshot(&SnapshotLayout::of(&self.config), version))
             .unwrap();
-        self.learner.wake_actors().unwrap();
+        self.learner().wake_actors().unwrap();
     }
 
     fn say(&self, record: ControlRecord) {
-        self.learner.send_control(record).unwrap();
-        self.learner.wake_actors().unwrap();
+        self.learner().send_control(record).unwrap();
+        self.learner().wake_actors().unwrap();
     }
 
     /// Looks for something until it is there.
     fn until<T>(&self, what: &str, mut look: impl FnMut() -> Option<T>) -> T {
         let start = Instant::now();
         loop {
-            self.learner.maintain().unwrap();
+            self.learner().maintain().unwrap();
             if let Some(found) = look() {
                 return found;
             }
             assert!(start.elapsed() < PATIENCE, "waited too long for {what}");
-            self.learner.wait(Duration::from_millis(20)).unwrap();
+            self.learner().wait(Duration::from_millis(20)).unwrap();
         }
     }
 
     fn until_status(&self, what: &str, holds: impl Fn(&ActorStatus) -> bool) -> ActorStatus {
         self.until(what, || {
-            let status = self.learner.receive_status().unwrap()?.read(self.identity.run)?;
+            let status = self.learner().receive_status().unwrap()?.read(self.identity.run)?;
             holds(&status).then_some(status)
         })
     }
 
+    fn joined(&self) -> Incarnation {
+        self.until_status("an actor", |status| status.state == ActorState::Serving)
+            .incarnation
+    }
+
     fn ending(&mut self) -> Ending {
-        self.actor.take().unwrap().join().unwrap()
+        self.actor.take().unwrap().join().unwrap().unwrap()
     }
 }
 
@@ -116,55 +128,54 @@ impl Drop for Run {
         if let Some(actor) = self.actor.take() {
             let _ = actor.join();
         }
-        self.identity.remove_transport();
     }
 }
 
 #[test]
 fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
     let mut run = Run::start(30.0);
-    run.until_status("an actor", |status| status.actor == ACTOR && status.incarnation == LIFE);
+    let incarnation = run.joined();
     run.publish(1);
     let ticket = run.ticket(1);
     // For another life of this actor: not to be flown.
-    run.say(ControlRecord::fly(
-        &Ticket {
-            flight: FlightId(99),
-            ..ticket
-        },
-        ACTOR,
-        Incarnation(1),
-    ));
-    run.say(ControlRecord::fly(&ticket, ACTOR, LIFE));
+    let other = Ticket {
+        flight: FlightId(99),
+        ..ticket
+    };
+    run.say(ControlRecord::fly(&other, ACTOR, Incarnation(1)));
+    run.say(ControlRecord::fly(&ticket, ACTOR, incarnation));
     for step in 0.. {
-        let record = run.until("a record", || run.learner.receive_transition().unwrap());
-        if record.check(&ticket, ACTOR, LIFE, step) == Ok(RecordKind::Closing) {
+        let record = run.until("a record", || run.learner().receive_transition().unwrap());
+        if record.check(&ticket, ACTOR, incarnation, step) == Ok(RecordKind::Closing) {
             assert!(step > 3 && Outcome::from_code(record.outcome).is_some());
             break;
         }
-        assert_eq!(record.check(&ticket, ACTOR, LIFE, step), Ok(RecordKind::Step));
+        assert_eq!(record.check(&ticket, ACTOR, incarnation, step), Ok(RecordKind::Step));
     }
     run.say(ControlRecord::stop(run.identity.run));
     let last = run.until_status("the last word", |status| status.state == ActorState::Leaving);
     assert_eq!((last.flights_flown, last.newest_policy), (1, Some(PolicyVersion(1))));
     assert_eq!(run.ending(), Ending::Stopped);
-    assert!(run.learner.receive_transition().unwrap().is_none());
+    assert!(run.learner().receive_transition().unwrap().is_none());
 }
 
 #[test]
 fn a_ticket_waits_for_its_snapshot_and_no_other_is_flown_in_its_stead() {
     let run = Run::start(30.0);
-    run.until_status("an actor", |_| true);
+    let incarnation = run.joined();
     run.publish(1);
-    run.say(ControlRecord::fly(&run.ticket(2), ACTOR, LIFE));
+    run.say(ControlRecord::fly(&run.ticket(2), ACTOR, incarnation));
     run.until_status("the first snapshot", |status| {
         status.newest_policy == Some(PolicyVersion(1))
     });
     run.until_status("a sign of life later", |_| true);
-    assert!(run.learner.receive_transition().unwrap().is_none());
+    assert!(run.learner().receive_transition().unwrap().is_none());
     run.publish(2);
-    let record = run.until("a record", || run.learner.receive_transition().unwrap());
-    assert_eq!(record.check(&run.ticket(2), ACTOR, LIFE, 0), Ok(RecordKind::Step));
+    let record = run.until("a record", || run.learner().receive_transition().unwrap());
+    assert_eq!(
+        record.check(&run.ticket(2), ACTOR, incarnation, 0),
+        Ok(RecordKind::Step)
+    );
 }
 
 #[test]
@@ -174,16 +185,69 @@ fn a_learner_silent_for_too_long_is_left() {
 }
 
 #[test]
+fn a_learner_that_is_gone_for_too_long_is_not_waited_for() {
+    let mut run = Run::start(1.0);
+    run.joined();
+    run.learner = None;
+    assert_eq!(run.ending(), Ending::LearnerSilent);
+    assert!(
+        !run.identity.transport_folder().exists(),
+        "the last one to go removes it"
+    );
+}
+
+#[test]
+fn an_actor_without_a_learner_ends_at_a_signal() {
+    let mut run = Run::start(30.0);
+    run.joined();
+    run.learner = None;
+    std::thread::sleep(3 * SEEK_INTERVAL);
+    run.told_to_end.store(true, Ordering::Relaxed);
+    let told = Instant::now();
+    assert_eq!(run.ending(), Ending::Signalled);
+    assert!(told.elapsed() < Duration::from_secs(2));
+}
+
+#[test]
 fn heartbeats_keep_an_actor_and_a_signal_ends_it() {
     let mut run = Run::start(0.5);
-    run.until_status("an actor", |_| true);
+    run.joined();
     let start = Instant::now();
     while start.elapsed() < Duration::from_millis(1200) {
-        run.learner.maintain().unwrap();
+        run.learner().maintain().unwrap();
         run.say(ControlRecord::heartbeat(run.identity.run));
         std::thread::sleep(Duration::from_millis(50));
     }
     assert!(!run.actor.as_ref().unwrap().is_finished());
     run.told_to_end.store(true, Ordering::Relaxed);
     assert_eq!(run.ending(), Ending::Signalled);
+}
+
+#[test]
+fn an_actor_joins_the_learners_next_life_with_nothing_of_the_former_one() {
+    let mut run = Run::start(30.0);
+    let former = run.joined();
+    // Waits for a snapshot that never comes, and would be flown in the next life if it were taken along.
+    run.say(ControlRecord::fly(&run.ticket(2), ACTOR, former));
+    run.publish(1);
+    run.until_status("the first snapshot", |status| {
+        status.newest_policy == Some(PolicyVersion(1))
+    });
+    run.learner = None;
+    run.begin_life();
+    let status = run.until_status("the actor in the next life", |_| true);
+    assert!(status.incarnation > former);
+    assert_eq!(status.newest_policy, None);
+    run.publish(2);
+    run.until_status("the second snapshot", |status| {
+        status.newest_policy == Some(PolicyVersion(2))
+    });
+    run.until_status("a sign of life later", |_| true);
+    assert!(run.learner().receive_transition().unwrap().is_none());
+    run.say(ControlRecord::fly(&run.ticket(2), ACTOR, status.incarnation));
+    let record = run.until("a record", || run.learner().receive_transition().unwrap());
+    assert_eq!(
+        record.check(&run.ticket(2), ACTOR, status.incarnation, 0),
+        Ok(RecordKind::Step)
+    );
 }

@@ -6,3 +6,4 @@
 pub mod assembly;
 pub mod desk;
 pub mod reception;
+mod server;

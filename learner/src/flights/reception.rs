@@ -3,28 +3,31 @@
 //! The training thread speaks to it through [`Reception`]: it orders batches of flights, publishes snapshots, and takes flights out of a [`Batch`] one by
 //! one. While the training thread updates the networks, records are taken in, tickets handed out and signs of life given here.
 
-use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender, TryRecvError};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use skein_protocol::config::Config;
+use skein_protocol::failure::with_causes;
 use skein_protocol::ids::Epoch;
-use skein_protocol::run::RunIdentity;
-use skein_protocol::services::{LearnerPorts, LearnerWaker, ServiceError};
+use skein_protocol::run::{Life, RunIdentity};
+use skein_protocol::services::{LearnerPorts, LearnerWaker};
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::ticket::{ControlRecord, Ticket};
+use skein_protocol::ticket::Ticket;
 
 use super::assembly::Keep;
-use super::desk::{Desk, Faults, Order, Place};
+use super::desk::{Desk, Faults, HopelessFlight};
+use super::server::Server;
 use crate::flight::CommittedFlight;
 
+/// How long the services may take to be opened.
+const OPENING_PATIENCE: Duration = Duration::from_secs(30);
+/// How long the receiving thread may take to end once it is told to.
+const ENDING_PATIENCE: Duration = Duration::from_secs(5);
 /// How often a waiting training thread looks whether it should stop.
 const STOP_CHECK: Duration = Duration::from_millis(100);
-/// Records taken in before anything else gets its turn.
-const RECORDS_AT_ONCE: usize = 1024;
 
 /// The training thread's end.
 #[derive(Debug)]
@@ -46,7 +49,7 @@ pub struct Shared {
     /// Records refused.
     pub refused: AtomicU64,
     /// Why the receiving thread ended before it was told to.
-    failure: RwLock<Option<String>>,
+    failure: RwLock<Option<ReceptionError>>,
 }
 
 /// Flights ordered together, to be taken out in order.
@@ -63,13 +66,23 @@ pub enum ReceptionError {
     /// The run was told to stop.
     #[error("told to stop")]
     Stopped,
-    /// The receiving thread ended.
-    #[error("{0}")]
-    Failed(String),
+    /// A flight cannot be flown, by whomever and however often.
+    #[error(transparent)]
+    Hopeless(#[from] HopelessFlight),
+    /// The transport does not work any more. Nothing that was computed is at fault: a new life of the learner has a new transport.
+    #[error("the transport failed: {0}")]
+    Transport(String),
 }
 
+impl ReceptionError {
+    fn transport(error: &(dyn std::error::Error + 'static)) -> Self {
+        Self::Transport(with_causes(error))
+    }
+}
+
+/// What the training thread wants.
 #[derive(Debug)]
-enum Command {
+pub(super) enum Command {
     Publish(Snapshot),
     Fly {
         batch: u64,
@@ -82,26 +95,24 @@ enum Command {
 }
 
 impl Reception {
-    /// Starts the receiving thread and returns once actors can attach.
+    /// Starts the receiving thread and returns once actors can attach to this `life` of the learner.
     ///
     /// # Errors
-    /// [`ReceptionError::Failed`] when the services cannot be opened.
-    pub fn start(identity: &RunIdentity, config: &Config) -> Result<Self, ReceptionError> {
-        let failed = |error: &dyn std::error::Error| ReceptionError::Failed(error.to_string());
+    /// [`ReceptionError::Transport`] when the services cannot be opened.
+    pub fn start(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, ReceptionError> {
         let (commands, inbox) = mpsc::channel();
         let (ready, is_ready) = mpsc::channel();
         let shared = Arc::new(Shared::default());
         let (thread_identity, thread_config, thread_shared) = (identity.clone(), config.clone(), shared.clone());
         let thread = thread::Builder::new()
             .name("reception".to_owned())
-            .spawn(move || serve(&thread_identity, &thread_config, &inbox, &thread_shared, &ready))
-            .map_err(|error| failed(&error))?;
-        match is_ready.recv() {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => return Err(failed(&error)),
-            Err(error) => return Err(failed(&error)),
+            .spawn(move || serve(&thread_identity, life, &thread_config, &inbox, &thread_shared, &ready))
+            .map_err(|error| ReceptionError::transport(&error))?;
+        match is_ready.recv_timeout(OPENING_PATIENCE) {
+            Ok(opened) => opened?,
+            Err(error) => return Err(ReceptionError::transport(&error)),
         }
-        let waker = LearnerWaker::open(identity, config).map_err(|error| failed(&error))?;
+        let waker = LearnerWaker::open(identity, life, config).map_err(|error| ReceptionError::transport(&error))?;
         Ok(Self {
             commands,
             waker,
@@ -119,7 +130,7 @@ impl Reception {
     /// Publishes `snapshot` to all actors, those still to come included.
     ///
     /// # Errors
-    /// [`ReceptionError::Failed`] when the receiving thread has ended.
+    /// [`ReceptionError`] when the receiving thread has ended.
     pub fn publish(&self, snapshot: Snapshot) -> Result<(), ReceptionError> {
         self.send(Command::Publish(snapshot))
     }
@@ -127,7 +138,7 @@ impl Reception {
     /// Orders flights; they are flown after those ordered before, and delivered in the order of `tickets`.
     ///
     /// # Errors
-    /// [`ReceptionError::Failed`] when the receiving thread has ended.
+    /// [`ReceptionError`] when the receiving thread has ended.
     pub fn fly(&mut self, epoch: Epoch, keep: Keep, tickets: Vec<Ticket>) -> Result<Batch, ReceptionError> {
         let (deliver, flights) = mpsc::channel();
         let remaining = tickets.len();
@@ -149,19 +160,29 @@ impl Reception {
 
     /// Tells all actors to stop, and ends the receiving thread.
     pub fn finish(mut self) {
-        if self.send(Command::Finish).is_ok()
-            && let Some(thread) = self.thread.take()
-            && thread.join().is_err()
-        {
+        if self.send(Command::Finish).is_err() {
+            return;
+        }
+        let Some(thread) = self.thread.take() else { return };
+        let deadline = Instant::now() + ENDING_PATIENCE;
+        while !thread.is_finished() && Instant::now() < deadline {
+            thread::sleep(Duration::from_millis(5));
+        }
+        if !thread.is_finished() {
+            // It ends with the process.
+            tracing::error!("the receiving thread does not end");
+        } else if thread.join().is_err() {
             tracing::error!("the receiving thread panicked");
         }
     }
 
     fn send(&self, command: Command) -> Result<(), ReceptionError> {
         self.commands.send(command).map_err(|_| self.shared.failed())?;
-        self.waker
-            .wake()
-            .map_err(|error| ReceptionError::Failed(error.to_string()))
+        if let Err(error) = self.waker.wake() {
+            // It looks by itself at every heartbeat.
+            tracing::debug!(%error, "receiving thread not woken");
+        }
+        Ok(())
     }
 }
 
@@ -171,21 +192,20 @@ impl Shared {
         self.live_actors.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
+    /// Why the receiving thread has ended. A panic leaves no word, and comes from a transport that is out of order: nothing else there may panic.
     fn failed(&self) -> ReceptionError {
         let failure = self.failure.read().unwrap_or_else(PoisonError::into_inner);
-        ReceptionError::Failed(
-            failure
-                .clone()
-                .unwrap_or_else(|| "the receiving thread has ended".to_owned()),
-        )
+        failure
+            .clone()
+            .unwrap_or_else(|| ReceptionError::Transport("the receiving thread has ended".to_owned()))
     }
 
-    fn fail(&self, error: &dyn std::error::Error) {
+    fn fail(&self, error: ReceptionError) {
         tracing::error!(%error, "receiving thread failed");
-        *self.failure.write().unwrap_or_else(PoisonError::into_inner) = Some(error.to_string());
+        *self.failure.write().unwrap_or_else(PoisonError::into_inner) = Some(error);
     }
 
-    fn update(&self, desk: &Desk) {
+    pub(super) fn update(&self, desk: &Desk) {
         let Faults { reissued, refused } = desk.faults();
         let mut live = self.live_actors.write().unwrap_or_else(PoisonError::into_inner);
         if !desk.actors().map(|actor| actor.0).eq(live.iter().copied()) {
@@ -227,178 +247,23 @@ impl Batch {
 /// The receiving thread.
 fn serve(
     identity: &RunIdentity,
+    life: Life,
     config: &Config,
     inbox: &Receiver<Command>,
     shared: &Shared,
-    ready: &Sender<Result<(), ServiceError>>,
+    ready: &Sender<Result<(), ReceptionError>>,
 ) {
-    let ports = match LearnerPorts::open(identity, config) {
+    let ports = match LearnerPorts::open(identity, life, config) {
         Ok(ports) => ports,
         Err(error) => {
             // The starter waits for exactly this word; if it is gone, nobody needs it.
-            let _ = ready.send(Err(error));
+            let _ = ready.send(Err(ReceptionError::transport(&error)));
             return;
         }
     };
     let _ = ready.send(Ok(()));
-    let mut server = Server {
-        identity,
-        desk: Desk::new(&config.transport),
-        deliveries: BTreeMap::new(),
-        ports,
-        heartbeat: config.transport.heartbeat(),
-        last_heartbeat: None,
-    };
-    if let Err(error) = server.run(inbox, shared) {
-        shared.fail(error.as_ref());
+    if let Err(error) = Server::new(identity, config, ports).run(inbox, shared) {
+        shared.fail(error);
     }
     // Whoever waits is told by its channel's end.
-}
-
-struct Server<'a> {
-    identity: &'a RunIdentity,
-    desk: Desk,
-    deliveries: BTreeMap<u64, Delivery>,
-    ports: LearnerPorts,
-    heartbeat: Duration,
-    last_heartbeat: Option<Instant>,
-}
-
-/// Flights of one batch that wait for an earlier one.
-struct Delivery {
-    next: usize,
-    count: usize,
-    early: BTreeMap<usize, CommittedFlight>,
-    to: Sender<CommittedFlight>,
-}
-
-type ServerError = Box<dyn std::error::Error + Send + Sync>;
-
-impl Server<'_> {
-    fn run(&mut self, inbox: &Receiver<Command>, shared: &Shared) -> Result<(), ServerError> {
-        loop {
-            if !self.take_commands(inbox)? {
-                return self.say_stop();
-            }
-            let now = Instant::now();
-            self.take_status(now)?;
-            let more = self.take_records(now)?;
-            self.desk.on_time(now);
-            self.hand_out(now)?;
-            self.give_sign_of_life(now)?;
-            shared.update(&self.desk);
-            if !more {
-                self.ports.wait(self.heartbeat)?;
-            }
-        }
-    }
-
-    /// Carries out what the training thread wants; false when that is the end.
-    fn take_commands(&mut self, inbox: &Receiver<Command>) -> Result<bool, ServiceError> {
-        loop {
-            match inbox.try_recv() {
-                Ok(Command::Publish(snapshot)) => {
-                    self.ports.publish(&snapshot)?;
-                    self.ports.wake_actors()?;
-                }
-                Ok(Command::Fly {
-                    batch,
-                    epoch,
-                    keep,
-                    tickets,
-                    deliver,
-                }) => {
-                    let count = tickets.len();
-                    self.deliveries.insert(
-                        batch,
-                        Delivery {
-                            next: 0,
-                            count,
-                            early: BTreeMap::new(),
-                            to: deliver,
-                        },
-                    );
-                    for (index, ticket) in tickets.into_iter().enumerate() {
-                        self.desk.order(Order {
-                            ticket,
-                            epoch,
-                            keep,
-                            place: Place { batch, index },
-                        });
-                    }
-                }
-                Ok(Command::Finish) | Err(TryRecvError::Disconnected) => return Ok(false),
-                Err(TryRecvError::Empty) => return Ok(true),
-            }
-        }
-    }
-
-    fn take_status(&mut self, now: Instant) -> Result<(), ServiceError> {
-        while let Some(record) = self.ports.receive_status()? {
-            match record.read(self.identity.run) {
-                Some(status) => self.desk.on_status(&status, now),
-                None => tracing::warn!(?record, "status record refused"),
-            }
-        }
-        Ok(())
-    }
-
-    /// Takes records in; whether there may be more.
-    fn take_records(&mut self, now: Instant) -> Result<bool, ServerError> {
-        for _ in 0..RECORDS_AT_ONCE {
-            let Some(record) = self.ports.receive_transition()? else {
-                return Ok(false);
-            };
-            if let Some((place, flight)) = self.desk.on_record(&record, now)? {
-                self.deliver(place, flight);
-                self.hand_out(now)?;
-            }
-        }
-        Ok(true)
-    }
-
-    /// Passes on what is next in its batch, and keeps what is early.
-    fn deliver(&mut self, place: Place, flight: CommittedFlight) {
-        let Some(delivery) = self.deliveries.get_mut(&place.batch) else {
-            return;
-        };
-        delivery.early.insert(place.index, flight);
-        while let Some(flight) = delivery.early.remove(&delivery.next) {
-            delivery.next += 1;
-            // A training thread that no longer waits has been told to stop.
-            let _ = delivery.to.send(flight);
-        }
-        if delivery.next == delivery.count {
-            self.deliveries.remove(&place.batch);
-        }
-    }
-
-    fn hand_out(&mut self, now: Instant) -> Result<(), ServiceError> {
-        let tickets = self.desk.issue(now);
-        if tickets.is_empty() {
-            return Ok(());
-        }
-        for ticket in tickets {
-            self.ports.send_control(ticket)?;
-        }
-        self.ports.wake_actors()
-    }
-
-    fn give_sign_of_life(&mut self, now: Instant) -> Result<(), ServiceError> {
-        if self
-            .last_heartbeat
-            .is_some_and(|last| now.duration_since(last) < self.heartbeat)
-        {
-            return Ok(());
-        }
-        self.last_heartbeat = Some(now);
-        self.ports.maintain()?;
-        self.ports.send_control(ControlRecord::heartbeat(self.identity.run))
-    }
-
-    fn say_stop(&self) -> Result<(), ServerError> {
-        self.ports.send_control(ControlRecord::stop(self.identity.run))?;
-        self.ports.wake_actors()?;
-        Ok(())
-    }
 }

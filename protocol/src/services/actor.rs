@@ -10,12 +10,12 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 
-use super::joining::{JOIN_PATIENCE, JoinError, join_learner};
+use super::joining::{JoinError, learner_of};
 use super::opening::{Manner, Opener};
-use super::{Ipc, ServiceError, failed, wait};
+use super::{Ipc, ServiceError, failed, node, wait};
 use crate::config::Config;
 use crate::ids::RunId;
-use crate::run::RunIdentity;
+use crate::run::{Life, RunIdentity};
 use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 use crate::status::StatusRecord;
 use crate::ticket::ControlRecord;
@@ -29,6 +29,7 @@ const LOANED_RECORDS: usize = 2;
 #[derive(Debug)]
 pub struct ActorPorts {
     run: RunId,
+    life: Life,
     layout: SnapshotLayout,
     transitions: Publisher<Ipc, TransitionRecord, ()>,
     status: Publisher<Ipc, StatusRecord, ()>,
@@ -41,19 +42,21 @@ pub struct ActorPorts {
 }
 
 impl ActorPorts {
-    /// Opens an actor's ends of every service, on the thread that will use them. Waits a while for a learner that is starting.
+    /// Joins the learner that lives now: opens an actor's ends of every service, on the thread that will use them. Waits for nothing.
     ///
     /// # Errors
-    /// [`JoinError::NoLearner`] when none came; nothing is left of the attempt then. [`JoinError::Service`] says which service and what differs.
-    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
-        Self::open_within(JOIN_PATIENCE, identity, config)
+    /// [`JoinError::NoLearner`] when there is none to join at this moment; [`JoinError::Difference`] when this process and the learner's do not fit.
+    pub fn join(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
+        let life = learner_of(identity, config)?.life;
+        Ok(Self::open(identity, life, config)?)
     }
 
-    pub(super) fn open_within(patience: Duration, identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
-        let node = join_learner(identity, "actor", patience)?;
-        let open = Opener::new(&node, Manner::joining(patience), identity, config)?;
+    fn open(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, ServiceError> {
+        let node = node(identity, life, "actor")?;
+        let open = Opener::new(&node, Manner::Join, identity, config)?;
         Ok(Self {
             run: identity.run,
+            life,
             layout: SnapshotLayout::of(config),
             transitions: open
                 .transitions(config)?
@@ -96,6 +99,11 @@ impl ActorPorts {
     /// The run.
     pub fn run(&self) -> RunId {
         self.run
+    }
+
+    /// The life of the learner that was joined.
+    pub fn life(&self) -> Life {
+        self.life
     }
 
     /// Waits until the learner has something to say, `timeout` has passed, or a signal has come.

@@ -10,12 +10,13 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 
-use super::joining::{JOIN_PATIENCE, JoinError, LEARNER, join_learner};
+use super::joining::JoinError;
 use super::opening::{Manner, Opener};
 use super::{Ipc, ServiceError, failed, node, wait};
 use crate::config::Config;
+use crate::fault::{FaultPoint, pass};
 use crate::ids::RunId;
-use crate::run::RunIdentity;
+use crate::run::{Announcement, Life, RunIdentity};
 use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 use crate::status::StatusRecord;
 use crate::ticket::ControlRecord;
@@ -49,12 +50,23 @@ pub struct LearnerWaker {
 }
 
 impl LearnerPorts {
-    /// Opens the learner's ends of every service, on the thread that will use them.
+    /// Opens the learner's ends of every service for its new `life`, on the thread that will use them, and announces it. For who holds the
+    /// [`LearnerSeat`](crate::run::LearnerSeat).
     ///
     /// # Errors
-    /// [`ServiceError`] says which service and what differs; a second learner of one run is refused.
-    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, ServiceError> {
-        let node = node(identity, LEARNER)?;
+    /// [`JoinError`] says which service and why.
+    pub fn open(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, JoinError> {
+        let ports = Self::create(identity, life, config)?;
+        pass(FaultPoint::LearnerStarted);
+        identity.announce(&Announcement::new(identity, life, config))?;
+        Ok(ports)
+    }
+
+    fn create(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, ServiceError> {
+        let node = node(identity, life, "learner")?;
+        identity
+            .close_to_others(life)
+            .map_err(failed("all", "closing shared memory to other users"))?;
         let open = Opener::new(&node, Manner::Create, identity, config)?;
         let layout = SnapshotLayout::of(config);
         let weights_factory = open.weights()?;
@@ -148,11 +160,9 @@ impl LearnerPorts {
             .loan_slice_uninit(bytes.len())
             .map_err(failed("weights", "loaning"))?;
         *sample.user_header_mut() = snapshot.header(self.run, &self.layout);
-        sample
-            .write_from_slice(bytes)
-            .send()
-            .map(drop)
-            .map_err(failed("weights", "sending"))
+        let sample = sample.write_from_slice(bytes);
+        pass(FaultPoint::LearnerPublishing);
+        sample.send().map(drop).map_err(failed("weights", "sending"))
     }
 
     /// Wakes all actors that wait.
@@ -189,13 +199,13 @@ impl LearnerPorts {
 }
 
 impl LearnerWaker {
-    /// Opens the waker, on the thread that will use it.
+    /// Opens the waker, on the thread that will use it, once the receiving thread has opened its ends.
     ///
     /// # Errors
-    /// [`JoinError`] says what differs, or that the receiving thread has not opened its ends.
-    pub fn open(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
-        let node = join_learner(identity, "learner-waker", JOIN_PATIENCE)?;
-        let open = Opener::new(&node, Manner::joining(JOIN_PATIENCE), identity, config)?;
+    /// [`ServiceError`] says which service and why.
+    pub fn open(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, ServiceError> {
+        let node = node(identity, life, "learner-waker")?;
+        let open = Opener::new(&node, Manner::Join, identity, config)?;
         let wake_learner = open
             .event("wake-learner", open.actors, 1)?
             .notifier_builder()

@@ -2,17 +2,17 @@
 //!
 //! | service | pattern | from → to | carries |
 //! |---|---|---|---|
-//! | `transitions` | publish-subscribe | actors → learner | [`TransitionRecord`](crate::transition::TransitionRecord), rendered into the loaned sample |
-//! | `status` | publish-subscribe | actors → learner | [`StatusRecord`](crate::status::StatusRecord) |
-//! | `control` | publish-subscribe | learner → actors | [`ControlRecord`](crate::ticket::ControlRecord): tickets, signs of life, the stop |
-//! | `weights` | publish-subscribe | learner → actors | snapshots' bytes behind a [`SnapshotHeader`](crate::snapshot::SnapshotHeader) |
+//! | `transitions` | publish-subscribe | actors → learner | [`TransitionRecord`], rendered into the loaned sample |
+//! | `status` | publish-subscribe | actors → learner | [`StatusRecord`] |
+//! | `control` | publish-subscribe | learner → actors | [`ControlRecord`]: tickets, signs of life, the stop |
+//! | `weights` | publish-subscribe | learner → actors | snapshots' bytes behind a [`SnapshotHeader`] |
 //! | `wake-learner`, `wake-actors` | event | both | that there is something to read |
 //!
 //! Nothing here blocks and nothing here is trusted to arrive: iceoryx2 loses samples silently when a peer dies or has not connected yet. Tickets bound
 //! what is in flight, so no buffer can overflow but that of a process that was stopped, which misses what does not fit; a flight with a hole is discarded
 //! and its ticket issued again; every wait has a deadline.
 //!
-//! Only the learner creates services; everybody else joins those that are there, so that an actor of a run that is over leaves nothing behind.
+//! Each life of a learner has services of its own, see [`Life`]. Only the learner creates them; everybody else joins those that it has announced.
 //!
 //! Services carry protocol version, run, configuration and snapshot layout as attributes: a process that differs in one of them is refused on opening.
 
@@ -24,6 +24,7 @@ mod opening;
 mod tests;
 
 use std::fmt::Debug;
+use std::os::unix::ffi::OsStrExt;
 use std::time::Duration;
 
 use iceoryx2::config::Config as IceoryxConfig;
@@ -31,10 +32,14 @@ use iceoryx2::node::Node;
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::prelude::*;
 
-use crate::run::RunIdentity;
+use crate::run::{Life, RunIdentity};
+use crate::snapshot::SnapshotHeader;
+use crate::status::StatusRecord;
+use crate::ticket::ControlRecord;
+use crate::transition::TransitionRecord;
 
 pub use actor::{ActorPorts, LoanedTransition};
-pub use joining::{JoinError, is_learner_alive};
+pub use joining::JoinError;
 pub use learner::{LearnerPorts, LearnerWaker, ReceivedTransition};
 
 type Ipc = ipc::Service;
@@ -57,11 +62,9 @@ pub struct ServiceError {
 }
 
 impl ServiceError {
-    /// Whether waiting may help: the learner has not created the service yet, or its predecessor's is being removed.
-    fn may_pass(&self) -> bool {
-        ["DoesNotExist", "HangsInCreation", "IsMarkedForDestruction"]
-            .iter()
-            .any(|cause| self.cause.contains(cause))
+    /// Whether trying again cannot help, with this learner or its next life: the two programs differ.
+    fn is_final(&self) -> bool {
+        self.cause.contains("Incompatible")
     }
 }
 
@@ -73,7 +76,7 @@ fn failed<E: Debug>(service: &'static str, operation: &'static str) -> impl FnOn
         } else if cause.contains("DoesNotExist") {
             "; the learner of this run has not opened it, or is gone"
         } else if cause.contains("ExceedsMax") {
-            "; no slot is free: raise transport.max_actors, or end the other learner of this run"
+            "; no slot is free: raise transport.max_actors"
         } else if cause.contains("InsufficientPermissions") {
             "; the run belongs to another user"
         } else {
@@ -88,22 +91,37 @@ fn failed<E: Debug>(service: &'static str, operation: &'static str) -> impl FnOn
     }
 }
 
-/// iceoryx2's settings for one run. Called before anything else of iceoryx2 is.
-fn transport_config(identity: &RunIdentity) -> Result<IceoryxConfig, ServiceError> {
+/// iceoryx2's settings for one life of a run's learner. Called before anything else of iceoryx2 is.
+fn transport_config(identity: &RunIdentity, life: Life) -> Result<IceoryxConfig, ServiceError> {
     // Everything iceoryx2 would print goes wrong again, with our words, in the errors returned here.
     set_log_level(LogLevel::Fatal);
     let mut config = IceoryxConfig::default();
-    let root = identity.transport_root.to_string_lossy();
+    let root = identity.life_folder(life);
     config
         .global
-        .set_root_path(&Path::new(root.as_bytes()).map_err(failed("all", "setting the root path"))?);
+        .set_root_path(&Path::new(root.as_os_str().as_bytes()).map_err(failed("all", "setting the root path"))?);
     config.global.prefix =
-        FileName::new(identity.transport_prefix.as_bytes()).map_err(failed("all", "setting the prefix"))?;
+        FileName::new(identity.life_prefix(life).as_bytes()).map_err(failed("all", "setting the prefix"))?;
+    // The learner alone cleans up after the dead, at its heartbeats. Of an actor that is killed while it does, iceoryx2 could not tell whether it still
+    // does, and nobody would go on with it.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
     Ok(config)
 }
 
-fn node(identity: &RunIdentity, name: &str) -> Result<Node<Ipc>, ServiceError> {
-    let config = transport_config(identity)?;
+/// What the records that cross the transport look like; equal in processes that can read each other's.
+pub(crate) fn record_layout() -> String {
+    format!(
+        "transition {} control {} status {} snapshot header {}",
+        size_of::<TransitionRecord>(),
+        size_of::<ControlRecord>(),
+        size_of::<StatusRecord>(),
+        size_of::<SnapshotHeader>(),
+    )
+}
+
+fn node(identity: &RunIdentity, life: Life, name: &str) -> Result<Node<Ipc>, ServiceError> {
+    let config = transport_config(identity, life)?;
     NodeBuilder::new()
         .name(&NodeName::new(name).map_err(failed("all", "naming the node"))?)
         .signal_handling_mode(SignalHandlingMode::Disabled)

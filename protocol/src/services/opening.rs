@@ -1,14 +1,9 @@
 //! Opening services: every name and every limit.
 
-use std::fmt::Debug;
-use std::thread::sleep;
-use std::time::{Duration, Instant};
-
 use iceoryx2::node::Node;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::event;
 
-use super::joining::JOIN_INTERVAL;
 use super::{Ipc, ServiceError, failed};
 use crate::PROTOCOL_VERSION;
 use crate::config::Config;
@@ -25,18 +20,10 @@ pub(super) const SNAPSHOT_HISTORY: usize = 4;
 /// How services come to be.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Manner {
-    /// They are created unless they are there.
+    /// The learner creates them.
     Create,
-    /// They are created by the learner, until the deadline.
-    Join { deadline: Instant },
-}
-
-impl Manner {
-    pub(super) fn joining(patience: Duration) -> Self {
-        Self::Join {
-            deadline: Instant::now() + patience,
-        }
-    }
+    /// Others find them there.
+    Join,
 }
 
 /// Opens services of one run with the limits its configuration asks for.
@@ -54,25 +41,11 @@ macro_rules! opened {
             Manner::Create => $builder
                 .open_or_create_with_attributes(&$opener.attributes)
                 .map_err(failed($service, "opening")),
-            Manner::Join { deadline } => join(deadline, $service, || {
-                $builder.open_with_attributes(&$opener.attributes)
-            }),
+            Manner::Join => $builder
+                .open_with_attributes(&$opener.attributes)
+                .map_err(failed($service, "opening")),
         }
     };
-}
-
-/// Tries to open a service until it is there and complete, or the deadline has passed.
-fn join<S, E: Debug>(
-    deadline: Instant,
-    service: &'static str,
-    open: impl Fn() -> Result<S, E>,
-) -> Result<S, ServiceError> {
-    loop {
-        match open().map_err(failed(service, "opening")) {
-            Err(error) if error.may_pass() && Instant::now() < deadline => sleep(JOIN_INTERVAL),
-            settled => return settled,
-        }
-    }
 }
 
 impl<'a> Opener<'a> {

@@ -1,19 +1,20 @@
 //! The services as two processes would use them, over real shared memory.
 
-use std::thread::sleep;
+use std::os::unix::fs::PermissionsExt;
 use std::time::Duration;
 
-use super::joining::JOIN_INTERVAL;
+use super::opening::{Manner, Opener};
 use super::*;
 use crate::config::Config;
 use crate::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion, RunId};
-use crate::run::RunDirectory;
+use crate::run::{LearnerSeat, RunDirectory};
 use crate::snapshot::{Snapshot, SnapshotLayout};
 use crate::ticket::{CourseChoice, Exploration, Ticket};
 
 struct Run {
     identity: RunIdentity,
     config: Config,
+    seat: LearnerSeat,
     _directory: tempfile::TempDir,
 }
 
@@ -27,24 +28,19 @@ impl Run {
         run.create(&config).unwrap();
         let (identity, config) = run.open().unwrap();
         Self {
+            seat: LearnerSeat::take(&run, &identity).unwrap(),
             identity,
             config,
             _directory: directory,
         }
     }
 
-    fn learner(&self) -> Result<LearnerPorts, ServiceError> {
-        LearnerPorts::open(&self.identity, &self.config)
+    fn learner(&self) -> Result<LearnerPorts, JoinError> {
+        LearnerPorts::open(&self.identity, self.seat.life(), &self.config)
     }
 
     fn actor(&self) -> Result<ActorPorts, JoinError> {
-        ActorPorts::open(&self.identity, &self.config)
-    }
-}
-
-impl Drop for Run {
-    fn drop(&mut self) {
-        self.identity.remove_transport();
+        ActorPorts::join(&self.identity, &self.config)
     }
 }
 
@@ -158,54 +154,71 @@ fn a_process_that_was_stopped_and_continued_goes_on() {
 }
 
 #[test]
-fn a_second_learner_is_refused() {
-    let run = Run::new();
-    let _first = run.learner().unwrap();
-    let refusal = run.learner().unwrap_err().to_string();
-    assert!(refusal.contains("the other learner of this run"), "{refusal}");
-}
-
-#[test]
 fn an_actor_of_another_configuration_is_refused() {
     let mut run = Run::new();
     let _learner = run.learner().unwrap();
     run.identity.config_digest ^= 1;
-    let refusal = run.actor().unwrap_err().to_string();
+    let refusal = run.actor().unwrap_err();
+    assert!(refusal.is_final());
+    assert!(refusal.to_string().contains("differ in configuration"), "{refusal}");
+}
+
+#[test]
+fn services_refuse_what_the_announcement_let_through() {
+    let mut run = Run::new();
+    let _learner = run.learner().unwrap();
+    run.identity.config_digest ^= 1;
+    let node = node(&run.identity, run.seat.life(), "actor").unwrap();
+    let open = Opener::new(&node, Manner::Join, &run.identity, &run.config).unwrap();
+    let refusal = open.status().unwrap_err();
+    assert!(refusal.is_final());
     assert!(
-        refusal.contains("differ in program version or configuration"),
+        refusal
+            .to_string()
+            .contains("differ in program version or configuration"),
         "{refusal}"
     );
 }
 
 #[test]
-fn an_actor_waits_for_the_learner() {
+fn there_is_nobody_to_join_before_the_services_are_open_and_after_the_learner_is_gone() {
     let run = Run::new();
-    let (identity, config) = (run.identity.clone(), run.config.clone());
-    let actor = std::thread::spawn(move || ActorPorts::open(&identity, &config).map(drop));
-    sleep(3 * JOIN_INTERVAL);
-    assert!(!actor.is_finished(), "the actor did not wait");
-    let _learner = run.learner().unwrap();
-    actor.join().unwrap().unwrap();
-}
-
-#[test]
-fn an_actor_of_a_run_that_is_over_leaves_nothing_behind() {
-    let run = Run::new();
-    drop(run.learner().unwrap());
-    run.identity.remove_transport();
-    assert!(!is_learner_alive(&run.identity).unwrap());
-    let refusal = ActorPorts::open_within(2 * JOIN_INTERVAL, &run.identity, &run.config).unwrap_err();
-    assert!(matches!(refusal, JoinError::NoLearner { .. }), "{refusal}");
-    assert!(!run.identity.transport_root.exists());
-}
-
-#[test]
-fn a_transport_folder_alone_is_no_learner() {
-    let run = Run::new();
+    let nobody = || matches!(run.actor(), Err(JoinError::NoLearner(_)));
+    assert!(run.identity.is_learner_alive().unwrap());
+    assert!(nobody());
     let learner = run.learner().unwrap();
-    let _waker = LearnerWaker::open(&run.identity, &run.config).unwrap();
-    assert!(is_learner_alive(&run.identity).unwrap());
-    drop(learner);
-    assert!(run.identity.transport_root.exists());
-    assert!(!is_learner_alive(&run.identity).unwrap());
+    assert_eq!(run.actor().unwrap().life(), run.seat.life());
+    let Run {
+        identity, config, seat, ..
+    } = run;
+    drop((learner, seat));
+    assert!(!identity.is_learner_alive().unwrap());
+    assert!(matches!(
+        ActorPorts::join(&identity, &config),
+        Err(JoinError::NoLearner(_))
+    ));
+    assert!(!identity.transport_folder().exists());
+}
+
+#[test]
+fn everything_of_a_run_is_its_users_alone() {
+    let run = Run::new();
+    let (_learner, _actor) = (run.learner().unwrap(), run.actor().unwrap());
+    let prefix = run.identity.life_prefix(run.seat.life());
+    let is_ours = |entry: &std::fs::DirEntry| entry.file_name().to_string_lossy().starts_with(&prefix);
+    let segments: Vec<_> = std::fs::read_dir("/dev/shm")
+        .unwrap()
+        .map(Result::unwrap)
+        .filter(is_ours)
+        .map(|entry| entry.path())
+        .collect();
+    assert!(segments.len() > 10, "{segments:?}");
+    let folders = [
+        run.identity.transport_folder(),
+        run.identity.life_folder(run.seat.life()),
+    ];
+    for path in segments.iter().chain(&folders) {
+        let about = std::fs::metadata(path).unwrap();
+        assert_eq!(about.permissions().mode() & 0o077, 0, "{}", path.display());
+    }
 }

@@ -1,14 +1,24 @@
-//! The directory of a run: who it is, and where everything in it lies.
+//! A run on this machine: who it is, where everything in its directory lies, who of it lives, and what it leaves in shared memory.
+
+mod identity;
+mod place;
+mod presence;
+mod seat;
+mod sweep;
 
 use std::fs;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Path, PathBuf};
-use std::time::{SystemTime, UNIX_EPOCH};
-
-use serde::{Deserialize, Serialize};
 
 use crate::PROTOCOL_VERSION;
 use crate::config::{Config, ConfigError};
-use crate::ids::{ActorId, RunId};
+use crate::ids::ActorId;
+
+pub use identity::{Announcement, Difference, Life, RunIdentity};
+pub use place::PlaceError;
+pub use presence::Presence;
+pub use seat::{LearnerSeat, SeatError};
+pub use sweep::{Swept, sweep_leftovers};
 
 /// Paths within a run's directory.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -42,6 +52,8 @@ impl RunDirectory {
         courses => "courses",
         /// One log file a process.
         logs => "logs",
+        /// Locked by the learner while it lives, see [`LearnerSeat`].
+        learner_lock => "learner.lock",
         /// One row per committed training flight.
         flights_csv => "flights.csv",
         /// TensorBoard event files.
@@ -76,12 +88,19 @@ impl RunDirectory {
         self.logs().join(format!("actor-{actor}.log"))
     }
 
-    /// Creates the directory with its folders and writes the resolved configuration and a new identity.
+    /// Creates the directory with its folders, for this user alone, and writes the resolved configuration and a new identity.
     ///
     /// # Errors
     /// [`RunError`] names the path.
     pub fn create(&self, config: &Config) -> Result<RunIdentity, RunError> {
         let io = |path: PathBuf| move |source| RunError::Io { path, source };
+        fs::DirBuilder::new()
+            .recursive(true)
+            .mode(0o700)
+            .create(&self.root)
+            // One that was there before may be open to others.
+            .and_then(|()| fs::set_permissions(&self.root, fs::Permissions::from_mode(0o700)))
+            .map_err(io(self.root.clone()))?;
         for folder in [
             self.logs(),
             self.tensorboard(),
@@ -126,68 +145,13 @@ impl RunDirectory {
         }
         let config = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
         if config.digest() != identity.config_digest {
-            return Err(RunError::ConfigChanged { path: self.config() });
+            return Err(RunError::ConfigChanged {
+                path: self.config(),
+                expected: identity.config_digest,
+                found: config.digest(),
+            });
         }
         Ok((identity, config))
-    }
-}
-
-/// Who a run is: what its processes need to find each other, and nobody else.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RunIdentity {
-    /// [`PROTOCOL_VERSION`] of the program that started it.
-    pub protocol_version: u32,
-    /// The run.
-    pub run: RunId,
-    /// [`Config::digest`].
-    pub config_digest: u64,
-    /// Where iceoryx2 keeps this run's services; short, because a listener's socket below it may have no more than 108 characters.
-    pub transport_root: PathBuf,
-    /// First characters of every shared-memory segment of this run.
-    pub transport_prefix: String,
-}
-
-impl RunIdentity {
-    fn new(config: &Config) -> Self {
-        let nanos = SystemTime::now()
-            .duration_since(UNIX_EPOCH)
-            .map_or(0, |elapsed| elapsed.as_nanos() as u64);
-        let run = nanos ^ u64::from(std::process::id()).rotate_left(48);
-        Self {
-            protocol_version: PROTOCOL_VERSION,
-            run: RunId(run),
-            config_digest: config.digest(),
-            transport_root: PathBuf::from(format!("/tmp/skein-{run:016x}")),
-            transport_prefix: format!("skein_{run:016x}_"),
-        }
-    }
-
-    /// Removes what a run's processes may have left in shared memory and in the transport's folder. Only for when all of them are gone.
-    pub fn remove_transport(&self) {
-        let leftovers = fs::read_dir("/dev/shm")
-            .into_iter()
-            .flatten()
-            .flatten()
-            .filter(|entry| {
-                entry
-                    .file_name()
-                    .to_str()
-                    .is_some_and(|name| name.starts_with(&self.transport_prefix))
-            });
-        for entry in leftovers {
-            remove(entry.path(), fs::remove_file);
-        }
-        remove(self.transport_root.clone(), fs::remove_dir_all);
-    }
-}
-
-fn remove(path: PathBuf, how: fn(PathBuf) -> std::io::Result<()>) {
-    match how(path.clone()) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            tracing::warn!(path = %path.display(), %error, "leftover not removed");
-        }
-        _ => {}
     }
 }
 
@@ -221,10 +185,14 @@ pub enum RunError {
         found: u32,
     },
     /// The configuration is not the one the run was started with.
-    #[error("{} was changed since the run was started; start a new run for another configuration", path.display())]
+    #[error("{} was changed since the run was started: its digest is {found:016x} where {expected:016x} is expected; start a new run for another configuration", path.display())]
     ConfigChanged {
         /// The configuration file.
         path: PathBuf,
+        /// [`Config::digest`] of the run.
+        expected: u64,
+        /// That of the file.
+        found: u64,
     },
     /// The configuration cannot be used.
     #[error(transparent)]
@@ -269,7 +237,14 @@ mod tests {
     }
 
     #[test]
-    fn the_transport_root_leaves_room_for_socket_names() {
-        assert!(RunIdentity::new(&Config::default()).transport_root.as_os_str().len() <= 66);
+    fn a_run_directory_is_for_its_owner_alone() {
+        let parent = tempfile::tempdir().unwrap();
+        let (new, open) = (parent.path().join("new"), parent.path().join("open"));
+        fs::create_dir(&open).unwrap();
+        fs::set_permissions(&open, fs::Permissions::from_mode(0o755)).unwrap();
+        for root in [new, open] {
+            RunDirectory::new(&root).create(&Config::default()).unwrap();
+            assert_eq!(fs::metadata(&root).unwrap().permissions().mode() & 0o777, 0o700);
+        }
     }
 }

@@ -1,0 +1,244 @@
+//! The line from an actor to the learner that it has joined.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use skein_protocol::fault::{FaultPoint, pass};
+use skein_protocol::ids::{ActorId, Incarnation};
+use skein_protocol::run::RunIdentity;
+use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
+use skein_protocol::snapshot::SnapshotLayout;
+use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
+use skein_protocol::ticket::{Control, Ticket};
+use skein_protocol::transition::RecordKind;
+use tracing::{debug, warn};
+
+use super::{Ending, Parting, Service};
+use crate::environment_loop::{Directive, RecordLink};
+use crate::inference::Network;
+use crate::weights::Weights;
+
+/// The actor's end of the line to the learner: hears tickets, snapshots and the stop, sends records and signs of life.
+pub(super) struct LearnerLine<'a> {
+    ports: ActorPorts,
+    identity: &'a RunIdentity,
+    actor: ActorId,
+    incarnation: Incarnation,
+    weights: Weights,
+    tickets: VecDeque<QueuedTicket>,
+    limits: Limits,
+    told_to_end: &'a AtomicBool,
+    /// What was found out and ends this line.
+    parting: Option<Parting>,
+    last_sign: Instant,
+    last_said: Instant,
+    pub(super) flights_flown: u64,
+}
+
+struct QueuedTicket {
+    arrived: Instant,
+    ticket: Ticket,
+}
+
+/// Deadlines and limits, from the `[transport]` section.
+struct Limits {
+    heartbeat: Duration,
+    ticket_life: Duration,
+    actor_silence: Duration,
+    learner_silence: Duration,
+    tickets: usize,
+}
+
+impl<'a> LearnerLine<'a> {
+    /// A line over `ports`, for the present incarnation of `service`. It begins with nothing: what an earlier life knew is not taken over.
+    pub(super) fn new(service: &Service<'a>, ports: ActorPorts) -> Self {
+        let transport = &service.config.transport;
+        Self {
+            ports,
+            identity: service.identity,
+            actor: service.actor,
+            incarnation: service.incarnation,
+            weights: Weights::new(SnapshotLayout::of(service.config)),
+            tickets: VecDeque::new(),
+            limits: Limits {
+                heartbeat: transport.heartbeat(),
+                ticket_life: Duration::from_secs_f64(transport.flight_deadline_secs),
+                actor_silence: Duration::from_secs_f64(transport.actor_silence_secs),
+                learner_silence: Duration::from_secs_f64(transport.learner_silence_secs),
+                tickets: transport.tickets_per_actor,
+            },
+            told_to_end: service.told_to_end,
+            parting: None,
+            last_sign: service.last_sign,
+            last_said: Instant::now(),
+            flights_flown: 0,
+        }
+    }
+
+    /// When the learner last gave a sign of life.
+    pub(super) fn last_sign(&self) -> Instant {
+        self.last_sign
+    }
+
+    /// Why to let go of the learner, if there is a reason.
+    pub(super) fn parting(&self) -> Option<Parting> {
+        if self.parting.is_some() {
+            self.parting
+        } else if self.told_to_end.load(Ordering::Relaxed) {
+            Some(Parting::Leave(Ending::Signalled))
+        } else if self.last_sign.elapsed() > self.limits.learner_silence {
+            Some(Parting::Leave(Ending::LearnerSilent))
+        } else {
+            None
+        }
+    }
+
+    /// Hears everything there is to hear, and gives a sign of life when one is due.
+    pub(super) fn listen(&mut self) -> Result<(), ServiceError> {
+        self.listen_for_control()?;
+        while let Some(received) = self.ports.receive_snapshot()? {
+            match received {
+                Ok(snapshot) => {
+                    debug!(version = %snapshot.version, "snapshot received");
+                    self.weights.insert(snapshot);
+                }
+                Err(error) => warn!(%error, "snapshot refused"),
+            }
+        }
+        let life = self.limits.ticket_life;
+        self.tickets.retain(|queued| {
+            let alive = queued.arrived.elapsed() < life;
+            if !alive {
+                warn!(flight = %queued.ticket.flight, policy = %queued.ticket.policy_version, "ticket expired");
+            }
+            alive
+        });
+        Ok(())
+    }
+
+    fn listen_for_control(&mut self) -> Result<(), ServiceError> {
+        while let Some(record) = self.ports.receive_control()? {
+            match record.read(self.ports.run()) {
+                Ok(said) => {
+                    self.last_sign = Instant::now();
+                    if record.is_for(self.actor, self.incarnation) {
+                        self.obey(said);
+                    }
+                }
+                Err(fault) => warn!(%fault, "control record refused"),
+            }
+        }
+        let unsaid = self.last_said.elapsed();
+        if unsaid > self.limits.actor_silence {
+            self.parting.get_or_insert(Parting::Overslept);
+        } else if unsaid >= self.limits.heartbeat {
+            self.look_at_learner();
+            self.ports.maintain()?;
+            self.report(ActorState::Serving)?;
+        }
+        Ok(())
+    }
+
+    /// Whether the learner that was joined is still the one that lives: a dead one falls silent too, but this is known at once.
+    fn look_at_learner(&mut self) {
+        match self.identity.present_life() {
+            Ok(Some(present)) if present.life == self.ports.life() => {}
+            Ok(_) => {
+                self.parting.get_or_insert(Parting::LearnerGone);
+            }
+            Err(error) => debug!(%error, "cannot look for the learner"),
+        }
+    }
+
+    fn obey(&mut self, said: Control) {
+        match said {
+            Control::Heartbeat => {}
+            Control::Stop => self.parting = Some(Parting::Leave(Ending::Stopped)),
+            Control::Fly(ticket) => {
+                // A flight issued again replaces its earlier ticket.
+                self.tickets.retain(|queued| queued.ticket.flight != ticket.flight);
+                if self.tickets.len() >= self.limits.tickets {
+                    warn!(flight = %ticket.flight, limit = self.limits.tickets, "more tickets than agreed; the oldest is dropped");
+                    self.tickets.pop_front();
+                }
+                self.tickets.push_back(QueuedTicket {
+                    arrived: Instant::now(),
+                    ticket,
+                });
+            }
+        }
+    }
+
+    /// The first ticket whose snapshot is here.
+    pub(super) fn take_ticket(&mut self) -> Option<(Ticket, Arc<Network>)> {
+        let ready = self
+            .tickets
+            .iter()
+            .position(|queued| self.weights.holds(queued.ticket.policy_version))?;
+        let ticket = self.tickets.remove(ready)?.ticket;
+        let network = self.weights.network(ticket.policy_version)?;
+        Some((ticket, network))
+    }
+
+    /// Waits for the learner, not longer than until the next sign of life.
+    pub(super) fn wait(&self) {
+        if let Err(error) = self
+            .ports
+            .wait(self.limits.heartbeat.saturating_sub(self.last_said.elapsed()))
+        {
+            // Anything lasting shows as silence, so there is no hurry.
+            debug!(%error, "cannot wait for the learner");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    pub(super) fn report(&mut self, state: ActorState) -> Result<(), ServiceError> {
+        self.last_said = Instant::now();
+        let status = ActorStatus {
+            actor: self.actor,
+            incarnation: self.incarnation,
+            pid: std::process::id(),
+            state,
+            newest_policy: self.weights.newest(),
+            flights_flown: self.flights_flown,
+        };
+        self.ports.send_status(StatusRecord::new(self.ports.run(), &status))?;
+        self.wake_learner()
+    }
+
+    pub(super) fn wake_learner(&self) -> Result<(), ServiceError> {
+        self.ports.wake_learner()
+    }
+}
+
+impl RecordLink for LearnerLine<'_> {
+    type Loan = LoanedTransition;
+    type Error = ServiceError;
+
+    fn loan(&mut self) -> Result<LoanedTransition, ServiceError> {
+        self.ports.loan_transition()
+    }
+
+    fn send(&mut self, record: LoanedTransition) -> Result<(), ServiceError> {
+        let (step, kind) = (record.step, record.kind);
+        pass(FaultPoint::ActorBeforeSend);
+        self.ports.send_transition(record)?;
+        if kind == RecordKind::Closing.code() {
+            pass(FaultPoint::ActorAfterLastRecord);
+        } else if step == 2 {
+            pass(FaultPoint::ActorMidFlight);
+        }
+        Ok(())
+    }
+
+    fn directive(&mut self) -> Result<Directive, ServiceError> {
+        self.listen_for_control()?;
+        Ok(if self.parting().is_some() {
+            Directive::Abandon
+        } else {
+            Directive::Continue
+        })
+    }
+}

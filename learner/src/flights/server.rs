@@ -1,0 +1,271 @@
+//! What the receiving thread does: round after round, it takes in what actors send and hands out what the training thread orders.
+//!
+//! Actors die at any moment, in the middle of whatever they do to shared memory. So no failure of a service ends a round, let alone the thread: what
+//! cannot be received is not there, what cannot be sent is tried again in the next round, and at every heartbeat the dead are cleaned up after. Only
+//! a transport that fails in every round for [`TRANSPORT_PATIENCE`] is given up.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::mpsc::{Receiver, Sender, TryRecvError};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use skein_protocol::config::Config;
+use skein_protocol::fault::{FaultPoint, pass};
+use skein_protocol::ids::RunId;
+use skein_protocol::run::RunIdentity;
+use skein_protocol::services::{LearnerPorts, ServiceError};
+use skein_protocol::snapshot::Snapshot;
+use skein_protocol::ticket::ControlRecord;
+
+use super::desk::{Desk, HopelessFlight, Order, Place};
+use super::reception::{Command, ReceptionError, Shared};
+use crate::flight::CommittedFlight;
+
+/// How long every round may meet a failure before the transport is given up.
+pub(super) const TRANSPORT_PATIENCE: Duration = Duration::from_secs(10);
+/// Records taken in before anything else gets its turn.
+const RECORDS_AT_ONCE: usize = 1024;
+/// Pause before what has failed is tried again.
+const RETRY_INTERVAL: Duration = Duration::from_millis(20);
+
+/// The receiving thread's state.
+pub(super) struct Server {
+    run: RunId,
+    desk: Desk,
+    deliveries: BTreeMap<u64, Delivery>,
+    ports: LearnerPorts,
+    /// What is still to be sent, in this order.
+    outbox: VecDeque<Outgoing>,
+    heartbeat: Duration,
+    last_heartbeat: Option<Instant>,
+    trouble: Trouble,
+}
+
+/// Flights of one batch that wait for an earlier one.
+struct Delivery {
+    next: usize,
+    count: usize,
+    early: BTreeMap<usize, CommittedFlight>,
+    to: Sender<CommittedFlight>,
+}
+
+enum Outgoing {
+    Snapshot(Snapshot),
+    Control(ControlRecord),
+}
+
+/// What a round leaves to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Next {
+    /// There may be more to take in.
+    AtOnce,
+    /// Nothing until somebody calls.
+    Wait,
+}
+
+impl Server {
+    pub(super) fn new(identity: &RunIdentity, config: &Config, ports: LearnerPorts) -> Self {
+        Self {
+            run: identity.run,
+            desk: Desk::new(&config.transport),
+            deliveries: BTreeMap::new(),
+            ports,
+            outbox: VecDeque::new(),
+            heartbeat: config.transport.heartbeat(),
+            last_heartbeat: None,
+            trouble: Trouble::default(),
+        }
+    }
+
+    /// Serves until it is told to finish.
+    ///
+    /// # Errors
+    /// [`ReceptionError::Hopeless`] and [`ReceptionError::Transport`].
+    pub(super) fn run(&mut self, inbox: &Receiver<Command>, shared: &Shared) -> Result<(), ReceptionError> {
+        while self.take_commands(inbox) {
+            let now = Instant::now();
+            self.take_status(now);
+            let next = self.take_records(now)?;
+            self.desk.on_time(now);
+            self.hand_out(now);
+            self.give_sign_of_life(now);
+            self.send_out();
+            shared.update(&self.desk);
+            if let Some(error) = self.trouble.lasting(now) {
+                return Err(ReceptionError::Transport(error));
+            }
+            if next == Next::Wait {
+                self.wait();
+            }
+        }
+        self.say_stop();
+        Ok(())
+    }
+
+    /// Takes the training thread's wishes; false when the last is the end.
+    fn take_commands(&mut self, inbox: &Receiver<Command>) -> bool {
+        loop {
+            match inbox.try_recv() {
+                Ok(Command::Publish(snapshot)) => self.outbox.push_back(Outgoing::Snapshot(snapshot)),
+                Ok(Command::Fly {
+                    batch,
+                    epoch,
+                    keep,
+                    tickets,
+                    deliver,
+                }) => {
+                    let delivery = Delivery {
+                        next: 0,
+                        count: tickets.len(),
+                        early: BTreeMap::new(),
+                        to: deliver,
+                    };
+                    self.deliveries.insert(batch, delivery);
+                    for (index, ticket) in tickets.into_iter().enumerate() {
+                        self.desk.order(Order {
+                            ticket,
+                            epoch,
+                            keep,
+                            place: Place { batch, index },
+                        });
+                    }
+                }
+                Ok(Command::Finish) | Err(TryRecvError::Disconnected) => return false,
+                Err(TryRecvError::Empty) => return true,
+            }
+        }
+    }
+
+    fn take_status(&mut self, now: Instant) {
+        while let Some(record) = self.trouble.unless(self.ports.receive_status()).flatten() {
+            match record.read(self.run) {
+                Some(status) => self.desk.on_status(&status, now),
+                None => tracing::warn!(?record, "status record refused"),
+            }
+        }
+    }
+
+    /// Takes records in.
+    fn take_records(&mut self, now: Instant) -> Result<Next, HopelessFlight> {
+        for _ in 0..RECORDS_AT_ONCE {
+            let Some(record) = self.trouble.unless(self.ports.receive_transition()).flatten() else {
+                return Ok(Next::Wait);
+            };
+            if let Some((place, flight)) = self.desk.on_record(&record, now)? {
+                self.deliver(place, flight);
+                self.hand_out(now);
+                self.send_out();
+            }
+        }
+        Ok(Next::AtOnce)
+    }
+
+    /// Passes on what is next in its batch, and keeps what is early.
+    fn deliver(&mut self, place: Place, flight: CommittedFlight) {
+        let Some(delivery) = self.deliveries.get_mut(&place.batch) else {
+            return;
+        };
+        delivery.early.insert(place.index, flight);
+        while let Some(flight) = delivery.early.remove(&delivery.next) {
+            delivery.next += 1;
+            pass(FaultPoint::LearnerFlightCommitted);
+            // A training thread that no longer waits has been told to stop.
+            let _ = delivery.to.send(flight);
+        }
+        if delivery.next == delivery.count {
+            self.deliveries.remove(&place.batch);
+        }
+    }
+
+    fn hand_out(&mut self, now: Instant) {
+        self.outbox
+            .extend(self.desk.issue(now).into_iter().map(Outgoing::Control));
+    }
+
+    /// Sends what is to be sent, as far as that works.
+    fn send_out(&mut self) {
+        let before = self.outbox.len();
+        while let Some(outgoing) = self.outbox.front() {
+            let sent = match outgoing {
+                Outgoing::Snapshot(snapshot) => self.ports.publish(snapshot),
+                Outgoing::Control(record) => self.ports.send_control(*record),
+            };
+            if self.trouble.unless(sent).is_none() {
+                break;
+            }
+            self.outbox.pop_front();
+        }
+        if self.outbox.len() < before {
+            self.trouble.unless(self.ports.wake_actors());
+        }
+    }
+
+    fn give_sign_of_life(&mut self, now: Instant) {
+        let last = self.last_heartbeat;
+        if last.is_some_and(|last| now.duration_since(last) < self.heartbeat) {
+            return;
+        }
+        self.last_heartbeat = Some(now);
+        self.trouble.unless(self.ports.maintain());
+        let heartbeat = ControlRecord::heartbeat(self.run);
+        self.trouble.unless(self.ports.send_control(heartbeat));
+    }
+
+    fn wait(&mut self) {
+        let patience = if self.outbox.is_empty() {
+            self.heartbeat
+        } else {
+            RETRY_INTERVAL
+        };
+        if self.trouble.unless(self.ports.wait(patience)).is_none() {
+            sleep(RETRY_INTERVAL);
+        }
+    }
+
+    fn say_stop(&mut self) {
+        // Actors that miss it leave when this learner's end shows.
+        self.trouble
+            .unless(self.ports.send_control(ControlRecord::stop(self.run)));
+        self.trouble.unless(self.ports.wake_actors());
+    }
+}
+
+/// What goes wrong with the services, and for how long already.
+#[derive(Default)]
+struct Trouble {
+    /// When the first of the rounds began of which each has met a failure.
+    since: Option<Instant>,
+    /// The failure that was told last; the same one again is not told.
+    told: String,
+    /// The present round's last failure.
+    present: Option<ServiceError>,
+}
+
+impl Trouble {
+    /// The result, unless it is a failure, which is noted.
+    fn unless<T>(&mut self, result: Result<T, ServiceError>) -> Option<T> {
+        match result {
+            Ok(result) => Some(result),
+            Err(error) => {
+                self.present = Some(error);
+                None
+            }
+        }
+    }
+
+    /// Ends a round that began at `now`; what is wrong if it has been for too long.
+    fn lasting(&mut self, now: Instant) -> Option<String> {
+        let Some(error) = self.present.take() else {
+            self.since = None;
+            self.told.clear();
+            return None;
+        };
+        let error = error.to_string();
+        if self.told != error {
+            tracing::warn!(error, "a service failed; going on");
+            self.told.clone_from(&error);
+        }
+        let since = *self.since.get_or_insert(now);
+        (now.duration_since(since) > TRANSPORT_PATIENCE).then_some(error)
+    }
+}
