@@ -6,8 +6,8 @@ source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 help_if_asked "$@" <<END
 Usage: launch/fuzz.sh [SECONDS | --executions N] [--target NAME ...] [--jobs N]
 
-Drives every fuzz target of tests/fuzz for SECONDS each [default: 60], or until each has done its share of N executions in all,
-and prints for each its executions, how many edges of the code it reached, and what it found.
+Drives every fuzz target of tests/fuzz for SECONDS each [default: 60], or until each has done its share of N executions in all (slow
+ones a smaller one), and prints for each its executions, how many edges of the code it reached, and what it found.
 
 The first build takes as long as that of the whole project: all of it is built again with counters, into target/fuzz.
 Ten million executions take some 20 minutes on two cores. What is reached is kept in target/fuzz/corpus, where the next run goes on.
@@ -56,21 +56,21 @@ RUSTFLAGS="${flags[*]}" CARGO_INCREMENTAL=0 cargo build --release --locked --tar
     --package skein-fuzz --features coverage --bin skein-fuzz
 readonly program=$work/$platform/release/skein-fuzz
 
-mapfile -t targets < <("$program" | while IFS=$'\t' read -r name longest _; do
+mapfile -t targets < <("$program" | while IFS=$'\t' read -r name longest weight _; do
     ((${#chosen[@]} == 0)) || [[ " ${chosen[*]} " == *" $name "* ]] || continue
-    echo "$name $longest"
+    echo "$name $longest $weight"
 done)
 ((${#targets[@]} > 0)) || fail "no target is called ${chosen[*]}"
-if [[ -n $executions ]]; then
-    limit=-runs=$((executions / ${#targets[@]} + 1))
-else
-    limit=-max_total_time=$seconds
-fi
+weights=$(printf '%s\n' "${targets[@]}" | awk '{ sum += $3 } END { print sum }')
 mkdir -p "$work/findings" "$work/logs"
+# Readers of files read them from memory.
+TMPDIR=$(mktemp --directory --tmpdir=/dev/shm skein-fuzz-XXXXXX)
+trap 'rm -rf "$TMPDIR"' EXIT
 
 # Drives one target and prints its line of the table.
 drive() {
-    local name=$1 longest=$2 log=$work/logs/$1.log found
+    local name=$1 longest=$2 weight=$3 log=$work/logs/$1.log found limit=-max_total_time=$seconds
+    [[ -z $executions ]] || limit=-runs=$((executions * weight / weights + 1))
     mkdir -p "$work/corpus/$name"
     SKEIN_FUZZ_TARGET=$name "$program" "$work/corpus/$name" "$limit" -max_len="$longest" -timeout=10 -rss_limit_mb=4096 \
         -print_final_stats=1 -artifact_prefix="$work/findings/$name-" >"$log" 2>&1 && found=none || found="see $log"
@@ -82,7 +82,7 @@ drive() {
     [[ $found == none ]]
 }
 export -f drive
-export work program limit
+export work program seconds executions weights TMPDIR
 
 printf '%-20s %12s %10s %8s  %s\n' target executions 'a second' edges findings
 printf '%s\n' "${targets[@]}" | xargs -P "$jobs" -L 1 bash -c 'drive "$@"' drive || {

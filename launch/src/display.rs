@@ -47,6 +47,13 @@ impl Display {
         }
     }
 
+    /// Where the run is and how much longer it will take, and the figures that show whether it learns.
+    pub fn text(&mut self, progress: &Progress, restarts: Restarts) -> (String, String) {
+        let left_secs = self.pace.secs_left(progress);
+        let figures = Figures { progress, restarts };
+        (Head { progress, left_secs }.to_string(), figures.to_string())
+    }
+
     /// Removes the bar, so that other things can be printed.
     pub fn finish(&self) {
         if let Surface::Terminal(bar) = &self.surface {
@@ -63,8 +70,7 @@ impl Default for Display {
 
 impl Watcher for Display {
     fn progress(&mut self, progress: &Progress, restarts: Restarts) {
-        let figures = Figures { progress, restarts };
-        let left_secs = self.pace.secs_left(progress);
+        let (head, figures) = self.text(progress, restarts);
         match &mut self.surface {
             Surface::Terminal(bar) => {
                 let (position, length) = match progress.phase {
@@ -73,8 +79,7 @@ impl Watcher for Display {
                 };
                 bar.set_length(length);
                 bar.set_position(position);
-                let figures = wrapped(&figures.to_string(), terminal_columns());
-                bar.set_message(format!("{}\n{figures}", Head { progress, left_secs }));
+                bar.set_message(format!("{head}\n{}", wrapped(&figures, terminal_columns())));
             }
             Surface::Plain { last } => {
                 let due = last.is_none_or(|(when, phase)| {
@@ -83,7 +88,7 @@ impl Watcher for Display {
                 });
                 if due {
                     *last = Some((Instant::now(), progress.phase));
-                    eprintln!("{} · {figures}", Head { progress, left_secs });
+                    eprintln!("{head} · {figures}");
                 }
             }
         }

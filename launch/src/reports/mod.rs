@@ -48,6 +48,34 @@ pub enum ReportError {
     },
 }
 
+/// What a run left to be drawn. A run that ended early has less.
+#[derive(Debug)]
+pub struct Material {
+    flights: Option<Vec<curves::FlightRow>>,
+    reconstructions: Option<reconstructions::Pairs>,
+    paths: Option<flight_paths::PathsByCourse>,
+}
+
+impl Material {
+    /// Reads all of it, before anything is drawn.
+    ///
+    /// # Errors
+    /// [`ReportError`] names the file that is there but cannot be used.
+    pub fn read(run: &RunDirectory) -> Result<Self, ReportError> {
+        Ok(Self {
+            flights: existing(run.flights_csv())
+                .map(|path| curves::read_flights(&path))
+                .transpose()?,
+            reconstructions: existing(run.reconstructions())
+                .map(|path| reconstructions::Pairs::read(&path))
+                .transpose()?,
+            paths: existing(run.evaluation_paths_csv())
+                .map(|path| flight_paths::read_paths(&path))
+                .transpose()?,
+        })
+    }
+}
+
 /// Draws every plot whose input the run left, and returns the pictures. A run that ended early has fewer.
 ///
 /// `courses` are those of the final evaluation; `window` is the number of flights averaged over, and `ideal_walls_passed` what a perfect agent would average.
@@ -60,22 +88,22 @@ pub fn draw_all(
     window: usize,
     ideal_walls_passed: f64,
 ) -> Result<Vec<PathBuf>, ReportError> {
+    let material = Material::read(run)?;
     let mut pictures = Vec::new();
     let mut picture = |name: &str| {
         let path = run.plots().join(name);
         pictures.push(path.clone());
         path
     };
-    if let Some(path) = existing(run.flights_csv()) {
-        let flights = curves::read_flights(&path)?;
-        curves::draw_return(&flights, window, &picture("return.png"))?;
-        curves::draw_walls_passed(&flights, window, ideal_walls_passed, &picture("walls_passed.png"))?;
+    if let Some(flights) = &material.flights {
+        curves::draw_return(flights, window, &picture("return.png"))?;
+        curves::draw_walls_passed(flights, window, ideal_walls_passed, &picture("walls_passed.png"))?;
     }
-    if let Some(path) = existing(run.reconstructions()) {
-        reconstructions::draw(&reconstructions::Pairs::read(&path)?, &picture("reconstructions.png"))?;
+    if let Some(pairs) = &material.reconstructions {
+        reconstructions::draw(pairs, &picture("reconstructions.png"))?;
     }
-    if let Some(path) = existing(run.evaluation_paths_csv()) {
-        flight_paths::draw(courses, &flight_paths::read_paths(&path)?, &picture("flight_paths.png"))?;
+    if let Some(paths) = &material.paths {
+        flight_paths::draw(courses, paths, &picture("flight_paths.png"))?;
     }
     Ok(pictures)
 }

@@ -20,6 +20,7 @@ const CAPTION: u32 = 28;
 const TITLE: u32 = 48;
 
 /// Depth images and their reconstructions, `[n, 72, 128]` bytes each, brighter is farther.
+#[derive(Debug)]
 pub(super) struct Pairs {
     depth: Vec<u8>,
     reconstruction: Vec<u8>,

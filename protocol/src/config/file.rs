@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use toml::{Table, Value};
 
-use super::{Config, Invalid};
+use super::{Config, DEEPEST, Invalid};
 
 /// Why a configuration cannot be used. Every variant names the file or the override it came from.
 #[derive(Debug, thiserror::Error)]
@@ -175,6 +175,9 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
     };
     let (path, value) = text.split_once('=').ok_or_else(|| fail("has no `=`"))?;
     let (sections, key) = path.trim().rsplit_once('.').ok_or_else(|| fail("names no section"))?;
+    if sections.split('.').count() > DEEPEST {
+        return Err(fail("names sections deeper within each other than any section lies"));
+    }
     let mut target = table;
     for section in sections.split('.') {
         target = target
@@ -327,6 +330,16 @@ mod tests {
             ),
             ("[run]\ndevice = \"gpu\"", vec![], vec!["gpu", "cuda:N"]),
             ("[sac]\ndiscount = nan", vec![], vec!["sac.discount = NaN"]),
+            (
+                "",
+                vec!["simulator.................x=1"],
+                vec!["--set simulator....", "deeper"],
+            ),
+            (
+                "[simulator]\na = [[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]]",
+                vec![],
+                vec!["simulator = nested 18 deep", "16"],
+            ),
         ] {
             let error = load(text, &overrides).unwrap_err();
             for part in expected {

@@ -69,6 +69,13 @@ impl Config {
         self.evaluation.validate()?;
         self.checkpoints.validate()?;
         self.transport.validate()?;
+        let depth = 1 + self.simulator.values().map(nesting).max().unwrap_or(0);
+        require(
+            depth <= DEEPEST,
+            "simulator",
+            format!("nested {depth} deep"),
+            format!("is deeper than {DEEPEST}: what is written of it could not be read back"),
+        )?;
         require(
             self.learning.warmup_steps <= self.replay.capacity,
             "learning.warmup_steps",
@@ -96,6 +103,18 @@ impl Config {
             *course = course.file_name().map(PathBuf::from).unwrap_or_default();
         }
         xxh3_64(portable.to_toml().as_bytes())
+    }
+}
+
+/// How deep sections, tables and lists may lie within each other: the parser of TOML itself ends at 80, and recursion at the end of the stack.
+pub(crate) const DEEPEST: usize = 16;
+
+/// Lists and tables within each other in `value`.
+fn nesting(value: &toml::Value) -> usize {
+    match value {
+        toml::Value::Array(values) => 1 + values.iter().map(nesting).max().unwrap_or(0),
+        toml::Value::Table(table) => 1 + table.values().map(nesting).max().unwrap_or(0),
+        _ => 0,
     }
 }
 

@@ -12,6 +12,7 @@
 pub mod allocations;
 mod corpus;
 pub mod mutation;
+mod scratch;
 mod script;
 pub mod targets;
 

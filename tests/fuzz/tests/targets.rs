@@ -65,6 +65,20 @@ fn drive(name: &str) {
     println!("{tried} mutations of {} inputs", inputs.len());
 }
 
+/// What once broke a promise, by its file in `regressions/`.
+#[track_caller]
+fn recall(name: &str, file: &str) {
+    let target = TARGETS.iter().find(|target| target.name == name).unwrap();
+    let path = format!("regressions/{name}/{file}");
+    let (_, bytes) = committed(target).into_iter().find(|(found, _)| *found == path).unwrap();
+    exercise(target, file, &bytes);
+}
+
+#[test]
+fn sections_within_sections_are_refused_before_they_can_only_be_written() {
+    recall("overrides", "deeply_nested_sections");
+}
+
 macro_rules! drive {
     ($($claim:ident => $target:literal),* $(,)?) => {
         $(#[test] fn $claim() { drive($target); })*
@@ -88,4 +102,10 @@ drive! {
     no_signal_panics_and_what_is_believed_says_the_same_again => "signals",
     no_snapshot_file_panics_and_what_is_accepted_is_finite => "snapshot_file",
     no_received_snapshot_panics_and_what_is_accepted_is_what_was_sent => "snapshot_received",
+    no_replay_content_panics_and_what_is_restored_goes_on => "replay",
+    no_run_identity_panics_and_what_is_accepted_is_of_its_configuration => "run_identity",
+    no_result_file_panics_the_conclusion => "results",
+    no_progress_line_panics_the_display => "progress",
+    no_report_file_panics_its_reader => "report_files",
+    no_report_file_panics_the_plots => "report_pictures",
 }

@@ -42,10 +42,17 @@ fn driven() -> &'static Driven {
     })
 }
 
-/// Name, longest input, and what is read, a line each.
+/// Name, longest input, weight, and what is read, a line each.
 fn list() -> ! {
     for target in &TARGETS {
-        println!("{}\t{}\t{}", target.name, target.longest_bytes, target.reads);
+        let Target {
+            name,
+            reads,
+            longest_bytes,
+            weight,
+            ..
+        } = target;
+        println!("{name}\t{longest_bytes}\t{weight}\t{reads}");
     }
     process::exit(0);
 }

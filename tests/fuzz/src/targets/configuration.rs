@@ -9,12 +9,13 @@ use skein_simulator::course::Course;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 
 use super::courses::{assert_flyable, fly};
-use super::{Target, shipped, text};
+use super::{Target, USUAL, shipped, text};
 
 pub(super) const CONFIG: Target = Target {
     name: "config",
     reads: "configuration files",
     longest_bytes: 8192,
+    weight: USUAL,
     samples: config_samples,
     run: |bytes| {
         if let Some(text) = text(bytes) {
@@ -27,6 +28,7 @@ pub(super) const OVERRIDES: Target = Target {
     name: "overrides",
     reads: "--set arguments, one a line",
     longest_bytes: 4096,
+    weight: USUAL,
     samples: override_samples,
     run: overridden,
 };
@@ -35,6 +37,7 @@ pub(super) const SIMULATOR: Target = Target {
     name: "simulator",
     reads: "the configuration's [simulator] section, and flies with it",
     longest_bytes: 4096,
+    weight: USUAL,
     samples: simulator_samples,
     run: simulated,
 };

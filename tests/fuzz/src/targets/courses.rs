@@ -11,13 +11,14 @@ use skein_simulator::course::{
 use skein_simulator::reward::RewardTerms;
 use skein_simulator::simulator::{Outcome, Simulator, SimulatorSettings};
 
-use super::{Target, shipped, text};
+use super::{Target, USUAL, shipped, text};
 use crate::script::Script;
 
 pub(super) const FILE: Target = Target {
     name: "course_file",
     reads: "course files",
     longest_bytes: 8192,
+    weight: USUAL,
     samples: file_samples,
     run: |bytes| match text(bytes).map(|text| Course::parse(text, "fuzzed.toml")) {
         Some(Ok(course)) => assert_flyable(course),
@@ -30,6 +31,7 @@ pub(super) const LAYOUT: Target = Target {
     name: "course_layout",
     reads: "courses of any geometry, spelt by a script of choices",
     longest_bytes: 1024,
+    weight: USUAL / 5,
     samples: layout_samples,
     run: |bytes| {
         if let Ok(course) = Course::new(layout(&mut Script::new(bytes))) {
@@ -42,6 +44,7 @@ pub(super) const GENERATOR: Target = Target {
     name: "generator",
     reads: "ranges of generated courses, spelt by a script of choices",
     longest_bytes: 256,
+    weight: USUAL / 20,
     samples: || vec![Vec::new(), [128; 100].to_vec(), (0..=255).collect()],
     run: |bytes| {
         let mut script = Script::new(bytes);
@@ -108,7 +111,7 @@ pub(super) fn fly(simulator: &mut Simulator, settings: &SimulatorSettings, level
     }
 }
 
-fn layout(script: &mut Script<'_>) -> CourseLayout {
+pub(super) fn layout(script: &mut Script<'_>) -> CourseLayout {
     let corridor = corridor(script);
     let start = start(script);
     let wall_thickness_m = script.number(0.05..=0.5);

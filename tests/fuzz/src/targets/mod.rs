@@ -3,6 +3,9 @@
 mod configuration;
 mod courses;
 mod records;
+mod replay;
+mod reports;
+mod runs;
 mod signals;
 mod snapshots;
 
@@ -17,6 +20,8 @@ pub struct Target {
     pub reads: &'static str,
     /// Inputs longer than this show nothing that shorter ones do not.
     pub longest_bytes: usize,
+    /// Its part in a number of executions over all targets: slow ones get fewer.
+    pub weight: usize,
     /// Valid inputs, made by the code that writes them or from what is shipped: no format has to be kept in step by hand.
     pub samples: fn() -> Vec<Vec<u8>>,
     /// Reads the input; panics when a promise is broken.
@@ -35,8 +40,11 @@ impl Target {
     }
 }
 
+/// Weight of a target that reads thousands of inputs a second.
+const USUAL: usize = 100;
+
 /// All of them.
-pub static TARGETS: [Target; 10] = [
+pub static TARGETS: [Target; 16] = [
     configuration::CONFIG,
     configuration::OVERRIDES,
     configuration::SIMULATOR,
@@ -47,12 +55,23 @@ pub static TARGETS: [Target; 10] = [
     signals::SIGNALS,
     snapshots::FILE,
     snapshots::RECEIVED,
+    replay::REPLAY,
+    runs::IDENTITY,
+    runs::RESULTS,
+    runs::PROGRESS,
+    reports::FILES,
+    reports::PICTURES,
 ];
 
 /// A file of the repository, by its path from the root.
 fn shipped(path: &str) -> Vec<u8> {
     let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
     std::fs::read(format!("{root}/{path}")).unwrap()
+}
+
+/// `content` after a byte that says what it is.
+fn tagged(kind: u8, content: &[u8]) -> Vec<u8> {
+    [&[kind], content].concat()
 }
 
 /// The input as text; what is not UTF-8 is refused by whoever opens a file, before any reader of ours sees it.

@@ -13,14 +13,15 @@ use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
 
-use super::Target;
 use super::signals::pod;
+use super::{Target, USUAL};
 use crate::script::Script;
 
 pub(super) const RECORDS: Target = Target {
     name: "records",
     reads: "transition and status records, spelt by a script of what actors do",
     longest_bytes: 512,
+    weight: USUAL,
     samples,
     run: |bytes| Learner::new().follow(&mut Script::new(bytes)),
 };

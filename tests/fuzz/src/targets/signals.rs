@@ -5,13 +5,14 @@ use skein_protocol::ids::{ActorId, Incarnation, PolicyVersion, RunId};
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, ControlRecord};
 
-use super::Target;
 use super::records::sample_ticket;
+use super::{Target, USUAL};
 
 pub(super) const SIGNALS: Target = Target {
     name: "signals",
     reads: "status and control records",
     longest_bytes: 128,
+    weight: USUAL,
     samples: signal_samples,
     run: |bytes| {
         status(pod(bytes), run_of(bytes));

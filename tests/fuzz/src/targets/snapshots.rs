@@ -9,14 +9,15 @@ use skein_protocol::config::Config;
 use skein_protocol::ids::{PolicyVersion, RunId};
 use skein_protocol::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 
-use super::Target;
 use super::signals::pod;
+use super::{Target, USUAL};
 use crate::script::Script;
 
 pub(super) const FILE: Target = Target {
     name: "snapshot_file",
     reads: "snapshot files: the safetensors header and metadata, before sound parameters",
     longest_bytes: 1 << 14,
+    weight: USUAL,
     samples: || vec![SOUND.header.clone()],
     run: file,
 };
@@ -25,6 +26,7 @@ pub(super) const RECEIVED: Target = Target {
     name: "snapshot_received",
     reads: "snapshots off the wire: header, then changes to a sound one's bytes",
     longest_bytes: 256,
+    weight: USUAL / 4,
     samples: received_samples,
     run: received,
 };

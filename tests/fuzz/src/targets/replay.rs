@@ -1,0 +1,115 @@
+//! The replay buffer's content, as a checkpoint whose checksums are right may hold it: what is restored can be drawn from and goes on.
+
+use std::sync::Arc;
+
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
+use skein_learner::flight::{CommittedFlight, StepObservation};
+use skein_learner::replay::{Minibatch, Replay, ReplayState, RingState};
+use skein_protocol::config::Config;
+use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
+use skein_protocol::transition::Outcome;
+use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
+
+use super::{Target, USUAL};
+use crate::script::Script;
+
+pub(super) const REPLAY: Target = Target {
+    name: "replay",
+    reads: "contents of a replay buffer, spelt by a script of lengths and numbers",
+    longest_bytes: 512,
+    weight: USUAL / 10,
+    samples: || vec![Vec::new(), vec![0; 40], [2, 3, 1].repeat(20), (0..=255).collect()],
+    run: restore,
+};
+
+/// Values in a row of the smallest buffer: two observations, an action, a reward, an end.
+const ROW: usize = 2 * LATENT + ACTION + 2;
+
+fn config() -> Config {
+    let mut config = Config::default();
+    config.replay.capacity = 256;
+    config.vae.train_steps = 16;
+    config.learning.flights_per_epoch = 1;
+    config.transport.max_records_per_flight = 16;
+    config
+}
+
+fn restore(bytes: &[u8]) {
+    let (config, mut script) = (config(), Script::new(bytes));
+    let state = ReplayState {
+        images: images(&mut script),
+        success: ring(&mut script, 32),
+        regular: ring(&mut script, 224),
+    };
+    let Ok(mut replay) = Replay::restore(&config, state.clone()) else {
+        return;
+    };
+    assert_eq!(replay.state(), state);
+    let mut rng = Pcg64Mcg::seed_from_u64(1);
+    if !replay.is_empty() {
+        replay.sample(&mut rng, 8, &mut Minibatch::default());
+    }
+    if replay.image_count().is_some_and(|images| images > 0) {
+        replay.sample_images(&mut rng, 2, &mut Vec::new());
+    }
+    // A flight more: taken in, or refused for want of room for its images.
+    let _ = replay.insert(flight());
+    let encode = |images: &[u8]| Ok::<_, ()>(vec![[0.5; LATENT]; images.len() / IMAGE_PIXELS]);
+    replay.freeze_latents(8, encode).unwrap();
+    assert_eq!(replay.image_count(), None);
+}
+
+fn images(script: &mut Script<'_>) -> Option<Vec<Arc<Vec<u8>>>> {
+    let blocks = script.u8();
+    let block = |script: &mut Script<'_>| {
+        let odd = usize::from(script.u8() == 255);
+        Arc::new(vec![7; usize::from(script.u8() % 5) * IMAGE_PIXELS + odd])
+    };
+    (!blocks.is_multiple_of(3)).then(|| (0..blocks % 6).map(|_| block(script)).collect())
+}
+
+/// Mostly as many rows and image numbers as were inserted.
+fn ring(script: &mut Script<'_>, capacity: usize) -> RingState {
+    let inserted = match script.u8() {
+        255 => script.u64(),
+        few => u64::from(few % 64),
+    };
+    let filled = usize::try_from(inserted).unwrap_or(usize::MAX).min(capacity);
+    let extra = usize::from(script.u8() == 255);
+    let numbers = match script.u8() % 3 {
+        0 => filled + extra,
+        1 => 0,
+        _ => usize::from(script.u8()),
+    };
+    RingState {
+        inserted,
+        rows: vec![0.25; filled * ROW + extra],
+        images: (0..numbers).map(|_| u32::from(script.u8() % 16)).collect(),
+    }
+}
+
+fn flight() -> CommittedFlight {
+    let seen = StepObservation {
+        latent: [0.0; LATENT],
+        velocity_mps: [0.0; 3],
+        position_m: [0.0; 3],
+        orientation: [0.0, 0.0, 0.0, 1.0],
+    };
+    CommittedFlight {
+        flight: FlightId(1),
+        epoch: Epoch(0),
+        policy_version: PolicyVersion(0),
+        actor: ActorId(0),
+        level: 1,
+        observations: vec![seen; 3],
+        actions: vec![[0.0; ACTION]; 2],
+        rewards: vec![1.0; 2],
+        reward_terms: vec![[0.0; 4]; 2],
+        level_up: vec![false, true],
+        outcome: Outcome::Collided,
+        walls_passed: 1,
+        course_walls: 5,
+        depth: Some(vec![9; 3 * IMAGE_PIXELS]),
+    }
+}

@@ -1,0 +1,97 @@
+//! What plots are drawn from: `flights.csv`, `evaluation_paths.csv`, and the images beside their reconstructions.
+
+use std::sync::LazyLock;
+
+use skein_launch::prepare::NamedCourse;
+use skein_launch::reports::{Material, draw_all};
+use skein_protocol::run::RunDirectory;
+use skein_simulator::course::{Course, CourseLayout};
+
+use super::courses::layout;
+use super::{Target, USUAL, shipped, tagged};
+use crate::scratch::with_files;
+use crate::script::Script;
+
+pub(super) const FILES: Target = Target {
+    name: "report_files",
+    reads: "flights.csv (after a 0), evaluation_paths.csv (after a 1), reconstructions.safetensors (after a 2)",
+    longest_bytes: 4096,
+    weight: USUAL,
+    samples,
+    run: |bytes| {
+        with_run(bytes, |run| match Material::read(run) {
+            Ok(_) => {}
+            Err(error) => {
+                let folder = run.root().display().to_string();
+                assert!(error.to_string().contains(&folder), "{error}");
+            }
+        });
+    },
+};
+
+pub(super) const PICTURES: Target = Target {
+    name: "report_pictures",
+    reads: "the same, and draws what is accepted, beside courses of any geometry",
+    longest_bytes: 2048,
+    weight: 1,
+    samples,
+    run: |bytes| {
+        // What follows a zero byte spells a course.
+        let (files, course) = bytes.split_at(
+            bytes
+                .iter()
+                .skip(1)
+                .position(|byte| *byte == 0)
+                .map_or(bytes.len(), |at| at + 1),
+        );
+        let mut courses = vec![TRAINING.clone()];
+        courses.extend(fuzzed_course(course));
+        with_run(files, |run| {
+            if let Ok(pictures) = draw_all(run, &courses, 50, 3.0) {
+                assert!(pictures.iter().all(|picture| picture.exists()));
+            }
+        });
+    },
+};
+
+static TRAINING: LazyLock<NamedCourse> = LazyLock::new(|| {
+    let text = String::from_utf8(shipped("configs/courses/training.toml")).unwrap();
+    NamedCourse {
+        name: "training".to_owned(),
+        course: Course::parse(&text, "training.toml").unwrap(),
+    }
+});
+
+fn fuzzed_course(script: &[u8]) -> Option<NamedCourse> {
+    let layout: CourseLayout = layout(&mut Script::new(script.get(1..)?));
+    Some(NamedCourse {
+        name: "fuzzed".to_owned(),
+        course: Course::new(layout).ok()?,
+    })
+}
+
+/// A run that left one file, of the kind that the first byte says.
+fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory)) {
+    const NAMES: [&str; 3] = ["flights.csv", "evaluation_paths.csv", "reconstructions.safetensors"];
+    let Some((&kind, content)) = bytes.split_first() else {
+        return;
+    };
+    let name = NAMES[usize::from(kind) % NAMES.len()];
+    with_files(&[(name, content)], |folder| read(&RunDirectory::new(folder)));
+}
+
+fn samples() -> Vec<Vec<u8>> {
+    let flights = "flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
+                   0,0,0,0,1,12,0,-0.9,collided\n1,0,0,1,1,33,1,0.2,timed_out\n";
+    let paths = "course,flight,step,x_m,y_m,z_m,outcome\n\
+                 training,0,0,1.5,0,3,collided\ntraining,0,1,9.7,1,3,collided\nfuzzed,1,0,1.5,0.5,3.5,reached_end\n";
+    // Empty images: a header is what there is to damage.
+    let images = r#"{"depth":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]},"reconstruction":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]}}"#;
+    let images = [&(images.len() as u64).to_le_bytes()[..], images.as_bytes()].concat();
+    vec![
+        tagged(0, flights.as_bytes()),
+        tagged(1, paths.as_bytes()),
+        tagged(2, &images),
+        [&tagged(1, paths.as_bytes())[..], &[0], &[128; 60]].concat(),
+    ]
+}

@@ -1,0 +1,132 @@
+//! What lies in a run's directory besides configuration and snapshots, and what its learner says on standard output.
+
+use std::sync::LazyLock;
+
+use skein_launch::conclusion::conclusion;
+use skein_launch::display::Display;
+use skein_launch::supervisor::Restarts;
+use skein_protocol::PROTOCOL_VERSION;
+use skein_protocol::config::Config;
+use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::progress::Progress;
+use skein_protocol::run::RunDirectory;
+use skein_protocol::summary::Summary;
+use skein_protocol::transition::Outcome;
+
+use super::{Target, USUAL, tagged};
+use crate::scratch::with_files;
+
+pub(super) const IDENTITY: Target = Target {
+    name: "run_identity",
+    reads: "run.json",
+    longest_bytes: 1024,
+    weight: USUAL,
+    samples: || vec![RUN.0.clone()],
+    run: identity,
+};
+
+pub(super) const RESULTS: Target = Target {
+    name: "results",
+    reads: "evaluation.json (after a 0) and summary.json (after a 1), as a run's conclusion reads them",
+    longest_bytes: 4096,
+    weight: USUAL,
+    samples: result_samples,
+    run: results,
+};
+
+pub(super) const PROGRESS: Target = Target {
+    name: "progress",
+    reads: "what a learner says on standard output, line by line, as it is shown",
+    longest_bytes: 4096,
+    weight: USUAL,
+    samples: progress_samples,
+    run: progress,
+};
+
+/// `run.json` and `config.toml` of a run.
+static RUN: LazyLock<(Vec<u8>, Vec<u8>)> = LazyLock::new(|| {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunDirectory::new(folder.path());
+    run.create(&Config::default()).unwrap();
+    let read = |path| std::fs::read(path).unwrap();
+    (read(run.identity()), read(run.config()))
+});
+
+fn identity(bytes: &[u8]) {
+    with_files(
+        &[("run.json", bytes), ("config.toml", &RUN.1)],
+        |folder| match RunDirectory::new(folder).open() {
+            Ok((identity, config)) => {
+                assert_eq!(identity.protocol_version, PROTOCOL_VERSION);
+                assert_eq!(identity.config_digest, config.digest());
+            }
+            Err(error) => assert!(error.to_string().contains(&folder.display().to_string()), "{error}"),
+        },
+    );
+}
+
+fn result_samples() -> Vec<Vec<u8>> {
+    let scores = [FlightScore {
+        walls_passed: 3,
+        flight_return: -1.5,
+        outcome: Outcome::Collided,
+    }; 4];
+    let report = EvaluationReport {
+        policy_version: PolicyVersion(80),
+        policy_sha256: "1024266715d59141".to_owned(),
+        courses: vec![CourseEvaluation::of("training", 5, &scores)],
+    };
+    // Read, not made: it has fields for whatever a run may come to, and a reader that knows fewer of them reads it too.
+    let summary = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"1024266715d59141","final_version":80,
+        "best_version":70,"best_confirmed_walls_passed":4.9,"flights":800,"steps":42837,"updates":20418,"vae_updates":400,
+        "evaluation_flights":400,"tickets_reissued":0,"records_refused":0,"wall_secs":333.3,"phase_secs":{"flying":12.5}}"#;
+    let read: Summary = serde_json::from_str(summary).unwrap();
+    let written = serde_json::to_vec(&read).unwrap();
+    vec![tagged(0, &serde_json::to_vec(&report).unwrap()), tagged(1, &written)]
+}
+
+fn results(bytes: &[u8]) {
+    let Some((&kind, content)) = bytes.split_first() else {
+        return;
+    };
+    let name = if kind % 2 == 0 {
+        "evaluation.json"
+    } else {
+        "summary.json"
+    };
+    with_files(&[(name, content)], |folder| {
+        let told = conclusion(&RunDirectory::new(folder));
+        assert!(told.contains(name), "{told}");
+    });
+}
+
+fn progress_samples() -> Vec<Vec<u8>> {
+    let line = |phase: &str, flights: u64, secs: f64| {
+        format!(
+            r#"{{"phase":"{phase}","flights":{flights},"total_flights":2000,"evaluation_flights":[0,20],"steps":10000,"updates":4000,"vae_updates":100,"steps_per_sec":151.6,"updates_per_sec":63.2,"walls_passed":1.25,"mean_return":null,"temperature":0.05,"vae_loss":50.1,"actors":2,"elapsed_secs":{secs}}}"#
+        )
+    };
+    let lines = [
+        line("flying", 10, 1.0),
+        line("learning", 20, 2.0),
+        line("evaluating", 20, 62.5),
+        line("finishing", 0, 0.0),
+    ];
+    let sample = lines.join("\n").into_bytes();
+    let understood = sample
+        .split(|byte| *byte == b'\n')
+        .all(|line| serde_json::from_slice::<Progress>(line).is_ok());
+    assert!(understood, "the samples are the progress of another version");
+    vec![sample]
+}
+
+fn progress(bytes: &[u8]) {
+    let mut display = Display::new();
+    for line in bytes.split(|byte| *byte == b'\n') {
+        if let Ok(progress) = serde_json::from_slice::<Progress>(line) {
+            let (head, figures) = display.text(&progress, Restarts::default());
+            assert!(!head.is_empty() && !figures.is_empty());
+        }
+    }
+}
