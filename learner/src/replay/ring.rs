@@ -65,6 +65,9 @@ impl RowLayout {
     }
 }
 
+/// More transitions than a run can commit; they are counted up from here without a look at where numbers end.
+const MOST_INSERTED: u64 = 1 << 62;
+
 /// A ring of rows; the oldest is overwritten when it is full.
 #[derive(Debug)]
 pub(super) struct Ring {
@@ -94,6 +97,9 @@ impl Ring {
     /// A ring as it was, or what is wrong with the parts.
     pub(super) fn restore(capacity: usize, layout: RowLayout, state: RingState) -> Result<Self, String> {
         let RingState { inserted, rows, images } = state;
+        if inserted > MOST_INSERTED {
+            return Err(format!("{inserted} transitions are more than any run commits"));
+        }
         let mut ring = Self::new(capacity, layout);
         ring.inserted = inserted;
         if rows.len() != ring.len() * layout.width() {

@@ -79,6 +79,11 @@ fn sections_within_sections_are_refused_before_they_can_only_be_written() {
     recall("overrides", "deeply_nested_sections");
 }
 
+#[test]
+fn a_buffer_that_has_counted_to_the_end_is_refused_before_it_counts_on() {
+    recall("replay", "inserted_at_the_end_of_numbers");
+}
+
 macro_rules! drive {
     ($($claim:ident => $target:literal),* $(,)?) => {
         $(#[test] fn $claim() { drive($target); })*
@@ -104,8 +109,10 @@ drive! {
     no_received_snapshot_panics_and_what_is_accepted_is_what_was_sent => "snapshot_received",
     no_replay_content_panics_and_what_is_restored_goes_on => "replay",
     no_run_identity_panics_and_what_is_accepted_is_of_its_configuration => "run_identity",
+    no_announcement_panics_and_what_may_be_joined_is_what_we_would_say => "announcement",
     no_result_file_panics_the_conclusion => "results",
     no_progress_line_panics_the_display => "progress",
     no_report_file_panics_its_reader => "report_files",
     no_report_file_panics_the_plots => "report_pictures",
+    no_event_file_panics_its_reader => "curves",
 }

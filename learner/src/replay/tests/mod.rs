@@ -281,6 +281,10 @@ fn content_of_another_shape_is_not_restored() {
     let mut too_few = replay.state();
     too_few.images = Some(Vec::new());
     assert_eq!(Replay::restore(&narrow, too_few).unwrap_err().part, "depth images");
+    let mut endless = replay.state();
+    endless.success.inserted = u64::MAX;
+    let error = Replay::restore(&narrow, endless).unwrap_err();
+    assert!(error.problem.contains("more than any run commits"), "{error}");
 }
 
 /// Prints what a minibatch costs: `cargo test --release -p skein-learner -- --ignored --nocapture minibatch_of_256`.

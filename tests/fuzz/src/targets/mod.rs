@@ -44,7 +44,7 @@ impl Target {
 const USUAL: usize = 100;
 
 /// All of them.
-pub static TARGETS: [Target; 16] = [
+pub static TARGETS: [Target; 18] = [
     configuration::CONFIG,
     configuration::OVERRIDES,
     configuration::SIMULATOR,
@@ -57,10 +57,12 @@ pub static TARGETS: [Target; 16] = [
     snapshots::RECEIVED,
     replay::REPLAY,
     runs::IDENTITY,
+    runs::ANNOUNCEMENT,
     runs::RESULTS,
     runs::PROGRESS,
     reports::FILES,
     reports::PICTURES,
+    reports::CURVES,
 ];
 
 /// A file of the repository, by its path from the root.

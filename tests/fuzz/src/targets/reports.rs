@@ -2,6 +2,7 @@
 
 use std::sync::LazyLock;
 
+use skein_launch::inspection::read_curves;
 use skein_launch::prepare::NamedCourse;
 use skein_launch::reports::{Material, draw_all};
 use skein_protocol::run::RunDirectory;
@@ -28,6 +29,56 @@ pub(super) const FILES: Target = Target {
         });
     },
 };
+
+pub(super) const CURVES: Target = Target {
+    name: "curves",
+    reads: "TensorBoard event files: the messages, a line each, in sound frames; after a byte above 127 the file as it is",
+    longest_bytes: 1024,
+    weight: USUAL / 2,
+    samples: curve_samples,
+    run: |bytes| {
+        let file = match bytes.split_first() {
+            Some((128.., file)) => file.to_vec(),
+            _ => bytes.split(|byte| *byte == b'\n').flat_map(framed).collect(),
+        };
+        with_files(&[("events.out.tfevents.1", &file)], |folder| {
+            if let Err(error) = read_curves(folder) {
+                assert!(error.to_string().contains("events.out.tfevents.1"), "{error}");
+            }
+        });
+    },
+};
+
+/// One message as it stands in an event file: length, masked CRC-32C of the length, message, masked CRC-32C of the message.
+fn framed(message: &[u8]) -> Vec<u8> {
+    let length = (message.len() as u64).to_le_bytes();
+    let masked = |bytes: &[u8]| {
+        crc32c::crc32c(bytes)
+            .rotate_right(15)
+            .wrapping_add(0xa282_ead8)
+            .to_le_bytes()
+    };
+    [&length[..], &masked(&length), message, &masked(message)].concat()
+}
+
+/// A step and two values; the same whole, with its frame.
+fn curve_samples() -> Vec<Vec<u8>> {
+    let value = |tag: &[u8]| {
+        [
+            &[0x0a, 6 + tag.len() as u8 + 1, 0x0a, tag.len() as u8],
+            tag,
+            &[0x15, 0, 0, 0xc0, 0x3f],
+        ]
+        .concat()
+    };
+    let values = [value(b"return"), value(b"steps")].concat();
+    let message = [&[0x10, 7, 0x2a, values.len() as u8], &values[..]].concat();
+    let read = with_files(&[("events.out.tfevents.1", &framed(&message))], |folder| {
+        read_curves(folder).unwrap()
+    });
+    assert_eq!(read["return"][&7], [1.5], "the sample is an event of another version");
+    vec![message.clone(), tagged(128, &framed(&message))]
+}
 
 pub(super) const PICTURES: Target = Target {
     name: "report_pictures",

@@ -10,7 +10,7 @@ use skein_protocol::config::Config;
 use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::progress::Progress;
-use skein_protocol::run::RunDirectory;
+use skein_protocol::run::{Announcement, Life, RunDirectory, RunIdentity};
 use skein_protocol::summary::Summary;
 use skein_protocol::transition::Outcome;
 
@@ -24,6 +24,28 @@ pub(super) const IDENTITY: Target = Target {
     weight: USUAL,
     samples: || vec![RUN.0.clone()],
     run: identity,
+};
+
+pub(super) const ANNOUNCEMENT: Target = Target {
+    name: "announcement",
+    reads: "what a learner announces of its present life",
+    longest_bytes: 1024,
+    weight: USUAL,
+    samples: || {
+        let life: Life = serde_json::from_str("7").unwrap();
+        let (identity, config) = opened();
+        vec![serde_json::to_vec(&Announcement::new(&identity, life, &config)).unwrap()]
+    },
+    run: |bytes| {
+        if let Ok(announcement) = serde_json::from_slice::<Announcement>(bytes)
+            && announcement.check(&IDENTIFIED.0, &IDENTIFIED.1).is_ok()
+        {
+            // Life and process are the learner's to choose; in all else it is what we would say.
+            let mut mine = Announcement::new(&IDENTIFIED.0, announcement.life, &IDENTIFIED.1);
+            mine.pid = announcement.pid;
+            assert_eq!(announcement, mine);
+        }
+    },
 };
 
 pub(super) const RESULTS: Target = Target {
@@ -52,6 +74,15 @@ static RUN: LazyLock<(Vec<u8>, Vec<u8>)> = LazyLock::new(|| {
     let read = |path| std::fs::read(path).unwrap();
     (read(run.identity()), read(run.config()))
 });
+
+static IDENTIFIED: LazyLock<(RunIdentity, Config)> = LazyLock::new(opened);
+
+fn opened() -> (RunIdentity, Config) {
+    with_files(&[("run.json", &RUN.0), ("config.toml", &RUN.1)], |folder| {
+        RunDirectory::new(folder).open()
+    })
+    .unwrap()
+}
 
 fn identity(bytes: &[u8]) {
     with_files(
