@@ -21,20 +21,32 @@ pub(super) struct FlightRow {
     pub(super) episode_return: f64,
 }
 
+/// No return is larger: a flight has at most 65536 records, of rewards up to `skein_protocol::transition::LARGEST_NUMBER`. An axis much longer than any
+/// return would take for ever to divide.
+const LARGEST_RETURN: f64 = 1e12;
+
 /// Reads `flights.csv`.
 ///
 /// # Errors
 /// [`ReportError::Malformed`] names the line.
 pub(super) fn read_flights(path: &Path) -> Result<Vec<FlightRow>, ReportError> {
-    let malformed = |error: csv::Error| ReportError::Malformed {
+    let malformed = |problem: String| ReportError::Malformed {
         path: path.to_owned(),
-        problem: error.to_string(),
+        problem,
     };
-    csv::Reader::from_path(path)
-        .map_err(malformed)?
-        .deserialize()
-        .collect::<Result<_, _>>()
-        .map_err(malformed)
+    let mut rows = csv::Reader::from_path(path)
+        .map_err(|error| malformed(error.to_string()))?
+        .into_deserialize();
+    let mut flights = Vec::new();
+    while let Some(row) = rows.next() {
+        let row: FlightRow = row.map_err(|error| malformed(error.to_string()))?;
+        if !(-LARGEST_RETURN..=LARGEST_RETURN).contains(&row.episode_return) {
+            let (line, value) = (rows.reader().position().line() - 1, row.episode_return);
+            return Err(malformed(format!("line {line}: a return of {value} is none")));
+        }
+        flights.push(row);
+    }
+    Ok(flights)
 }
 
 /// Draws the return of every flight and its moving average over `window` flights (paper, figure 9).
@@ -236,5 +248,16 @@ mod tests {
         std::fs::write(&path, "flight,walls_passed,return\n0,2,1.5\n1,two,1.5\n").unwrap();
         let error = read_flights(&path).unwrap_err().to_string();
         assert!(error.contains("flights.csv") && error.contains("line: 3"), "{error}");
+    }
+
+    #[test]
+    fn a_return_that_no_axis_could_show_is_named_by_its_line() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("flights.csv");
+        for value in ["1e308", "-1e13", "inf", "nan"] {
+            std::fs::write(&path, format!("flight,walls_passed,return\n0,2,1.5\n1,2,{value}\n")).unwrap();
+            let error = read_flights(&path).unwrap_err().to_string();
+            assert!(error.contains("line 3: a return of"), "{error}");
+        }
     }
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use plotters::prelude::*;
 use serde::Deserialize;
-use skein_protocol::transition::Outcome;
+use skein_protocol::transition::{LARGEST_NUMBER, Outcome};
 use skein_simulator::course::{Course, Wall};
 
 use super::ReportError;
@@ -19,6 +19,7 @@ const TOP: u32 = 52;
 const CAPTION: u32 = 34;
 const PANEL_GAP: u32 = 20;
 const AXIS: u32 = 44;
+const HIGHEST_PANEL: u32 = 600;
 
 const CORRIDOR: RGBColor = RGBColor(0xf3, 0xf5, 0xf8);
 const WALL: RGBColor = RGBColor(0x4a, 0x50, 0x5a);
@@ -52,14 +53,25 @@ struct Row {
 /// # Errors
 /// [`ReportError::Malformed`] names the line.
 pub(super) fn read_paths(path: &Path) -> Result<PathsByCourse, ReportError> {
-    let malformed = |error: csv::Error| ReportError::Malformed {
+    let malformed = |problem: String| ReportError::Malformed {
         path: path.to_owned(),
-        problem: error.to_string(),
+        problem,
     };
     let mut courses = PathsByCourse::new();
     let mut current = None;
-    for row in csv::Reader::from_path(path).map_err(malformed)?.deserialize() {
-        let row: Row = row.map_err(malformed)?;
+    let mut rows = csv::Reader::from_path(path)
+        .map_err(|error| malformed(error.to_string()))?
+        .into_deserialize();
+    while let Some(row) = rows.next() {
+        let row: Row = row.map_err(|error| malformed(error.to_string()))?;
+        let at_m = [row.x_m, row.y_m, row.z_m];
+        if !at_m
+            .iter()
+            .all(|metres| (-LARGEST_NUMBER..=LARGEST_NUMBER).contains(metres))
+        {
+            let line = rows.reader().position().line() - 1;
+            return Err(malformed(format!("line {line}: no flight comes to {at_m:?}")));
+        }
         let flights = courses.entry(row.course.clone()).or_default();
         let key = Some((row.course, row.flight));
         if current != key {
@@ -70,7 +82,7 @@ pub(super) fn read_paths(path: &Path) -> Result<PathsByCourse, ReportError> {
             current = key;
         }
         if let Some(flight) = flights.last_mut() {
-            flight.points_m.push([row.x_m, row.y_m, row.z_m]);
+            flight.points_m.push(at_m);
         }
     }
     Ok(courses)
@@ -99,9 +111,12 @@ pub(super) fn draw(courses: &[NamedCourse], paths: &PathsByCourse, path: &Path) 
     canvas.save(path)
 }
 
-/// Saved pixels per metre, the same along and across the corridor: angles in the picture are angles in the world.
+/// Saved pixels per metre, the same along and across the corridor: angles in the picture are angles in the world. A corridor that is wider or higher than
+/// long does not fill the picture's width: its panels would be higher than memory is large.
 fn pixels_per_metre(course: &Course) -> f32 {
-    (WIDTH - LEFT - RIGHT) as f32 / course.corridor().length_m
+    let corridor = course.corridor();
+    let along = (WIDTH - LEFT - RIGHT) as f32 / corridor.length_m;
+    along.min(HIGHEST_PANEL as f32 / corridor.width_m.max(corridor.height_m))
 }
 
 fn panel_height(course: &Course, view: View) -> u32 {
@@ -318,5 +333,27 @@ mod tests {
         assert_eq!((lengths("a"), lengths("b")), (vec![2, 1], vec![1]));
         assert_eq!(paths["a"][0].outcome, Outcome::Collided);
         assert_eq!(paths["a"][0].points_m[1], [2.0, 0.0, 3.0]);
+    }
+
+    #[test]
+    fn a_corridor_wider_than_long_has_a_picture_of_bounded_height() {
+        let text = "name = \"hall\"\norder = [1]\nwall_x_m = [8.0]\nwall_thickness_m = 0.3\n\
+                    corridor = { length_m = 10.0, width_m = 100.0, height_m = 100.0 }\n\
+                    start = { offset_m = 1.5, jitter_y_m = 0.0, jitter_z_m = 0.0 }\n\
+                    [[wall]]\nlabel = 1\nshape = \"circle\"\ncentre_m = [0.0, 50.0]\ndiameter_m = 2.2\n";
+        let hall = Course::parse(text, "hall.toml").unwrap();
+        assert_eq!(block_height(&hall), CAPTION + 2 * HIGHEST_PANEL + PANEL_GAP + AXIS);
+    }
+
+    #[test]
+    fn a_place_that_no_flight_comes_to_is_named_by_its_line() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("evaluation_paths.csv");
+        for place in ["nan,0,0", "0,-inf,0", "0,0,1e30"] {
+            let rows = format!("course,flight,step,x_m,y_m,z_m,outcome\na,0,0,{place},collided\n");
+            std::fs::write(&path, rows).unwrap();
+            let error = read_paths(&path).unwrap_err().to_string();
+            assert!(error.contains("line 2: no flight comes to"), "{error}");
+        }
     }
 }

@@ -129,6 +129,16 @@ impl Config {
         let directory = path.parent().unwrap_or(Path::new(""));
         for course in config.courses.paths_mut() {
             *course = directory.join(&*course);
+            if course.to_str().is_none() {
+                let message = format!(
+                    "[courses] {} is not UTF-8, so it could not be written into the files of a run; rename the folder",
+                    course.display()
+                );
+                return Err(ConfigError::Key {
+                    path: path.to_owned(),
+                    message,
+                });
+            }
         }
         Ok(config)
     }
@@ -265,6 +275,14 @@ mod tests {
         assert_eq!(config.courses.evaluation, [here.join("c.toml"), "/d.toml".into()]);
         let error = load("", &["courses.training="]).unwrap_err();
         assert!(error.contains("--set courses.training="), "{error}");
+    }
+
+    #[test]
+    fn a_folder_whose_name_cannot_be_written_down_is_refused() {
+        use std::os::unix::ffi::OsStrExt;
+        let path = Path::new(std::ffi::OsStr::from_bytes(b"/runs/\xff/config.toml"));
+        let error = Config::parse("", path, &[]).unwrap_err().to_string();
+        assert!(error.contains("is not UTF-8") && error.contains("rename"), "{error}");
     }
 
     #[test]

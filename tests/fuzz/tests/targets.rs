@@ -84,6 +84,16 @@ fn a_buffer_that_has_counted_to_the_end_is_refused_before_it_counts_on() {
     recall("replay", "inserted_at_the_end_of_numbers");
 }
 
+#[test]
+fn returns_near_the_end_of_numbers_are_refused_before_an_axis_is_divided() {
+    recall("report_pictures", "returns_at_the_end_of_numbers");
+}
+
+#[test]
+fn places_far_beyond_any_course_are_refused() {
+    recall("report_pictures", "flown_to_infinity");
+}
+
 macro_rules! drive {
     ($($claim:ident => $target:literal),* $(,)?) => {
         $(#[test] fn $claim() { drive($target); })*
