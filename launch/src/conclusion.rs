@@ -119,6 +119,7 @@ mod tests {
             evaluation_flights: 0,
             tickets_reissued: 0,
             records_refused: 0,
+            resumes: 0,
             wall_secs: 75.0,
             phase_secs: BTreeMap::new(),
         };

@@ -1,7 +1,6 @@
 //! What is written of the final evaluation: the report, where the flights flew, and what the VAE makes of what they saw.
 
-use std::collections::HashMap;
-use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, TensorView};
@@ -11,7 +10,7 @@ use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::transition::Outcome;
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, durable};
 
 use crate::flight::CommittedFlight;
 use crate::trainer::Trainer;
@@ -23,19 +22,27 @@ const PICTURES: usize = 8;
 
 /// Why an evaluation cannot be written.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot write {}: {problem}", path.display())]
+#[error("cannot write {}: {source}", path.display())]
 pub struct EvaluationError {
     /// The file.
     pub path: PathBuf,
     /// Why.
-    pub problem: String,
+    #[source]
+    pub source: io::Error,
 }
 
-fn failed<E: ToString>(path: &Path) -> impl Fn(E) -> EvaluationError {
-    |error| EvaluationError {
-        path: path.to_owned(),
-        problem: error.to_string(),
-    }
+/// Puts `content` in the place of the file at `path`, at once or not at all.
+fn replace<E>(path: &Path, content: Result<Vec<u8>, E>) -> Result<(), EvaluationError>
+where
+    E: Into<Box<dyn std::error::Error + Send + Sync>>,
+{
+    content
+        .map_err(io::Error::other)
+        .and_then(|bytes| durable::replace(path, &bytes))
+        .map_err(|source| EvaluationError {
+            path: path.to_owned(),
+            source,
+        })
 }
 
 /// A row of `evaluation_paths.csv`.
@@ -61,8 +68,8 @@ pub fn write_report(
     policy_sha256: &str,
     flown: &[CommittedFlight],
 ) -> Result<EvaluationReport, EvaluationError> {
-    let path = directory.evaluation_paths_csv();
-    let mut paths = csv::Writer::from_path(&path).map_err(failed(&path))?;
+    let mut paths = csv::Writer::from_writer(Vec::new());
+    let mut rows = Ok(());
     let mut courses = Vec::new();
     for (course, flights) in config
         .courses
@@ -75,18 +82,19 @@ pub fn write_report(
         let walls = flights.first().map_or(0, |flight| flight.course_walls.into());
         courses.push(CourseEvaluation::of(&name, walls, &scores));
         for (number, flight) in flights.iter().take(PATHS).enumerate() {
-            write_path(&mut paths, &name, number, flight).map_err(failed(&path))?;
+            rows = rows.and_then(|()| write_path(&mut paths, &name, number, flight));
         }
     }
-    paths.flush().map_err(failed(&path))?;
+    let paths = rows
+        .map_err(io::Error::from)
+        .and_then(|()| paths.into_inner().map_err(|error| io::Error::other(error.to_string())));
+    replace(&directory.evaluation_paths_csv(), paths)?;
     let report = EvaluationReport {
         policy_version,
         policy_sha256: policy_sha256.to_owned(),
         courses,
     };
-    let path = directory.evaluation_json();
-    let json = serde_json::to_string_pretty(&report).map_err(failed(&path))?;
-    fs::write(&path, json).map_err(failed(&path))?;
+    replace(&directory.evaluation_json(), serde_json::to_vec_pretty(&report))?;
     Ok(report)
 }
 
@@ -99,7 +107,7 @@ fn score(flight: &CommittedFlight) -> FlightScore {
 }
 
 fn write_path(
-    paths: &mut csv::Writer<fs::File>,
+    paths: &mut csv::Writer<Vec<u8>>,
     course: &str,
     number: usize,
     flight: &CommittedFlight,
@@ -128,7 +136,6 @@ pub fn write_reconstructions(
     trainer: &Trainer,
     flights: &[CommittedFlight],
 ) -> Result<(), EvaluationError> {
-    let path = directory.reconstructions();
     let depth = flights
         .iter()
         .filter_map(|flight| flight.depth.as_deref())
@@ -145,13 +152,9 @@ pub fn write_reconstructions(
         .collect();
     let reconstruction = trainer.reconstruct(&chosen);
     let shape = vec![chosen.len() / IMAGE_PIXELS, IMAGE_HEIGHT, IMAGE_WIDTH];
-    let mut tensors = HashMap::new();
-    for (name, bytes) in [("depth", &chosen), ("reconstruction", &reconstruction)] {
-        tensors.insert(
-            name,
-            TensorView::new(Dtype::U8, shape.clone(), bytes).map_err(failed(&path))?,
-        );
-    }
-    let file = safetensors::serialize(tensors, None).map_err(failed(&path))?;
-    fs::write(&path, file).map_err(failed(&path))
+    let view = |bytes| TensorView::new(Dtype::U8, shape.clone(), bytes);
+    let file = view(&chosen)
+        .and_then(|depth| Ok([("depth", depth), ("reconstruction", view(&reconstruction)?)]))
+        .and_then(|tensors| safetensors::serialize(tensors, None));
+    replace(&directory.reconstructions(), file)
 }

@@ -7,15 +7,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result};
 use clap::Parser;
-use skein_learner::training;
-use skein_protocol::failure::with_causes;
+use skein_learner::training::{self, TrainingError};
+use skein_protocol::failure::{EXIT_START_AGAIN, with_causes};
 use skein_protocol::logging::{LogFormat, log_to_file};
 use skein_protocol::run::{LearnerSeat, RunDirectory};
+use skein_protocol::summary::{Ending, Summary};
 use tokio::signal::unix::{SignalKind, signal};
 
 /// The learner of a run: hands out tickets, trains on the flights that come back, publishes snapshots. Started by run_local.sh.
 ///
-/// Progress goes to standard output, one JSON object a line. SIGTERM or SIGINT ends the training in order: what was learned is saved.
+/// It goes on from the newest undamaged checkpoint in the directory, if there is one. Progress goes to standard output, one JSON object a line. SIGTERM or SIGINT ends the training in order: what was learned is saved.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
@@ -28,11 +29,20 @@ fn main() -> ExitCode {
     match run(&Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
+            let status = status_of(&error);
             let error = with_causes(error.as_ref());
             tracing::error!(error, "learner failed");
             eprintln!("skein-learner: {error}");
-            ExitCode::FAILURE
+            status
         }
+    }
+}
+
+/// Exit status after `error`: whether starting again may help.
+fn status_of(error: &anyhow::Error) -> ExitCode {
+    match error.downcast_ref::<TrainingError>() {
+        Some(error) if error.is_of_the_transport() => ExitCode::from(EXIT_START_AGAIN),
+        _ => ExitCode::FAILURE,
     }
 }
 
@@ -45,10 +55,14 @@ fn run(arguments: &Arguments) -> Result<()> {
     log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
     tracing::info!(run = %identity.run, life = %seat.life(), seed = config.run.seed, device = %config.run.device, "learner starts");
     let stop = stop_on_signals().context("cannot listen to signals")?;
+    // A summary that cannot be read is made again, from the last checkpoint.
+    if Summary::of(&directory).is_some_and(|summary| summary.ending == Ending::Completed) {
+        let root = directory.root().display();
+        tracing::info!("the run is complete: nothing is left to do");
+        eprintln!("skein-learner: the run in {root} is complete: nothing is left to do");
+        return Ok(());
+    }
     let summary = training::run(&directory, &identity, seat.life(), &config, &stop)?;
-    let path = directory.summary_json();
-    let json = serde_json::to_string_pretty(&summary).context("cannot write the summary")?;
-    std::fs::write(&path, json).with_context(|| format!("cannot write {}", path.display()))?;
     tracing::info!(ending = ?summary.ending, policy_sha256 = summary.policy_sha256, "learner ends");
     Ok(())
 }

@@ -1,14 +1,14 @@
 //! What the learner tells while it runs: progress lines on standard output, and where its time goes.
 
-use std::collections::BTreeMap;
 use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use skein_protocol::progress::{Phase, Progress};
+use skein_protocol::progress::Progress;
 
+use crate::disk::Disk;
 use crate::flights::reception::Shared;
 
 /// Time between two lines.
@@ -25,35 +25,17 @@ pub struct Reporter {
 }
 
 impl Reporter {
-    /// Starts reporting on a run of `total_flights` training flights.
+    /// Starts reporting, with `progress` as the first line: in it `elapsed_secs` are those of earlier lives, to which this one's are added.
     ///
     /// # Errors
     /// When the system grants no thread.
-    pub fn start(total_flights: u64, reception: Arc<Shared>) -> std::io::Result<Self> {
-        let progress = Arc::new(Mutex::new(Progress {
-            phase: Phase::Flying,
-            flights: 0,
-            total_flights,
-            evaluation_flights: (0, 0),
-            steps: 0,
-            updates: 0,
-            vae_updates: 0,
-            steps_per_sec: 0.0,
-            updates_per_sec: 0.0,
-            walls_passed: None,
-            mean_return: None,
-            temperature: None,
-            vae_loss: None,
-            actors: 0,
-            live_actors: Vec::new(),
-            stalled: None,
-            elapsed_secs: 0.0,
-        }));
+    pub fn start(progress: Progress, reception: Arc<Shared>, disk: Disk) -> std::io::Result<Self> {
+        let progress = Arc::new(Mutex::new(progress));
         let ended = Arc::new(AtomicBool::new(false));
         let (of_thread, end_of_thread) = (progress.clone(), ended.clone());
         let thread = thread::Builder::new()
             .name("progress".to_owned())
-            .spawn(move || report(&of_thread, &end_of_thread, &reception))?;
+            .spawn(move || report(&of_thread, &end_of_thread, &reception, &disk))?;
         Ok(Self {
             progress,
             ended,
@@ -77,13 +59,14 @@ impl Drop for Reporter {
     }
 }
 
-fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared) {
+fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared, disk: &Disk) {
     let started = Instant::now();
     let mut marks: Vec<(f64, u64, u64)> = Vec::new();
     loop {
         let last = ended.load(Ordering::Relaxed);
         let mut line = progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        line.elapsed_secs = started.elapsed().as_secs_f64();
+        line.elapsed_secs += started.elapsed().as_secs_f64();
+        line.stalled = disk.waiting();
         line.live_actors = reception.live_actors();
         line.actors = line.live_actors.len();
         marks.push((line.elapsed_secs, line.steps, line.updates));
@@ -101,26 +84,5 @@ fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared) {
             return;
         }
         thread::sleep(INTERVAL);
-    }
-}
-
-/// Seconds by what the training thread did.
-#[derive(Debug, Default)]
-pub struct Phases {
-    secs: BTreeMap<&'static str, f64>,
-}
-
-impl Phases {
-    /// Adds the time since `started` to `phase`.
-    pub fn add(&mut self, phase: &'static str, started: Instant) {
-        *self.secs.entry(phase).or_default() += started.elapsed().as_secs_f64();
-    }
-
-    /// For the summary.
-    pub fn to_map(&self) -> BTreeMap<String, f64> {
-        self.secs
-            .iter()
-            .map(|(phase, secs)| ((*phase).to_owned(), *secs))
-            .collect()
     }
 }

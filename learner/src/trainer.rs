@@ -13,19 +13,40 @@ use skein_protocol::ticket::Exploration;
 use skein_protocol::{IMAGE_PIXELS, LATENT};
 use tch::{Device, Kind, Tensor};
 
-use crate::checkpoint::{NamedTensor, TensorValues};
+use crate::checkpoint::{NamedTensor, Progress, TensorValues};
 use crate::device::{self, DeviceError};
 use crate::error::UpdateError;
 use crate::flight::CommittedFlight;
 use crate::flights::assembly::Keep;
 use crate::noise::Noise;
-use crate::replay::{InsertError, Minibatch, Replay};
+use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
 use crate::sac::{Batch, Columns, Sac, SacMetrics};
-use crate::state::Stateful;
+use crate::state::{self, NamedTensors, Stateful};
 use crate::vae::{Vae, VaeMetrics, images_from_bytes};
 
 /// Images encoded at once when stored codes are made anew.
 const ENCODE_CHUNK: usize = 64;
+
+/// Why a stored state cannot be taken over.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainerRestoreError {
+    /// Of the networks.
+    #[error(transparent)]
+    Networks(#[from] state::RestoreError),
+    /// Of the replay buffer.
+    #[error(transparent)]
+    Replay(#[from] replay::RestoreError),
+    /// The tensors hold other counts than the counters.
+    #[error("the stored {what} are {found}, but its counters say {expected}")]
+    Count {
+        /// What is counted.
+        what: &'static str,
+        /// In the tensors.
+        found: u64,
+        /// In the counters.
+        expected: u64,
+    },
+}
 
 /// Networks and replay buffer.
 #[derive(Debug)]
@@ -56,6 +77,32 @@ impl Trainer {
             steps: 0,
             config: config.clone(),
         })
+    }
+
+    /// Takes over the state in a checkpoint: what follows is then bit for bit what would have followed.
+    ///
+    /// # Errors
+    /// [`TrainerRestoreError`] names what does not fit; the trainer is not to be used then.
+    pub fn restore(
+        &mut self,
+        progress: &Progress,
+        tensors: &[NamedTensor],
+        replay: ReplayState,
+    ) -> Result<(), TrainerRestoreError> {
+        let tensors: NamedTensors = tensors.iter().map(restored).collect();
+        self.vae.load_named(&tensors)?;
+        self.sac.load_named(&tensors)?;
+        self.replay = Replay::restore(&self.config, replay)?;
+        self.steps = progress.environment_steps;
+        for (what, found, expected) in [
+            ("VAE steps", self.vae.updates(), progress.vae_steps),
+            ("SAC updates", self.sac.updates(), progress.sac_updates),
+        ] {
+            if found != expected {
+                return Err(TrainerRestoreError::Count { what, found, expected });
+            }
+        }
+        Ok(())
     }
 
     /// Environment steps taken in.
@@ -117,15 +164,15 @@ impl Trainer {
         self.replay.insert(flight)
     }
 
-    /// Trains the VAE as far as the steps flown ask for, and freezes it when its time is over. `after_each` may do something between steps.
+    /// Trains the VAE as far as the steps flown ask for, and freezes it when its time is over. `after_each` may do something between steps, and give up.
     ///
     /// # Errors
-    /// [`UpdateError`] when a number is no longer finite.
-    pub fn train_vae(
+    /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
+    pub fn train_vae<E: From<UpdateError>>(
         &mut self,
         epoch: Epoch,
-        mut after_each: impl FnMut(&VaeMetrics),
-    ) -> Result<Option<VaeMetrics>, UpdateError> {
+        mut after_each: impl FnMut(&VaeMetrics) -> Result<(), E>,
+    ) -> Result<Option<VaeMetrics>, E> {
         if self.vae_is_frozen() {
             return Ok(None);
         }
@@ -139,7 +186,7 @@ impl Trainer {
             self.replay
                 .sample_images(&mut rng, self.config.vae.batch_size, &mut images);
             let metrics = self.vae.update(&images_from_bytes(&images), &mut noise)?;
-            after_each(&metrics);
+            after_each(&metrics)?;
             last = Some(metrics);
         }
         if self.steps >= self.config.vae.train_steps as u64 {
@@ -157,15 +204,15 @@ impl Trainer {
     }
 
     /// Does the SAC updates that the steps flown since the warm-up ask for; returns the means of their metrics. `after_each` may do something
-    /// between updates.
+    /// between updates, and give up.
     ///
     /// # Errors
-    /// [`UpdateError`] when a number is no longer finite.
-    pub fn train_policy(
+    /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
+    pub fn train_policy<E: From<UpdateError>>(
         &mut self,
         epoch: Epoch,
-        mut after_each: impl FnMut(&SacMetrics),
-    ) -> Result<Option<SacMetrics>, UpdateError> {
+        mut after_each: impl FnMut(&SacMetrics) -> Result<(), E>,
+    ) -> Result<Option<SacMetrics>, E> {
         let learning = &self.config.learning;
         let counted = self.steps.saturating_sub(learning.warmup_steps as u64);
         let due = (counted as f64 * learning.updates_per_step) as u64;
@@ -179,7 +226,7 @@ impl Trainer {
                 .sac
                 .update(&Batch::new(columns(&minibatch), self.device), &mut noise)?;
             means.add(&metrics);
-            after_each(&metrics);
+            after_each(&metrics)?;
         }
         Ok(means.finish())
     }
@@ -262,6 +309,16 @@ fn stored(name: String, tensor: &Tensor) -> NamedTensor {
     }
 }
 
+fn restored(stored: &NamedTensor) -> (String, Tensor) {
+    let flat = match &stored.values {
+        TensorValues::F32(values) => Tensor::from_slice(values),
+        TensorValues::F64(values) => Tensor::from_slice(values),
+        TensorValues::I64(values) => Tensor::from_slice(values),
+    };
+    let shape: Vec<i64> = stored.shape.iter().map(|&size| size as i64).collect();
+    (stored.name.clone(), flat.reshape(shape))
+}
+
 /// Means of the metrics of an epoch's updates.
 #[derive(Default)]
 struct Means {
@@ -300,3 +357,6 @@ impl Means {
         })
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,57 +1,39 @@
 //! The training loop: delayed learning, in reading order.
 //!
 //! An epoch is a fixed number of flights, all flown with one frozen snapshot. When the last of them is committed, the learner takes them in, in flight
-//! order, updates the networks and publishes the next snapshot. Everything it does follows from configuration, seed and committed flights.
+//! order, updates the networks and publishes the next snapshot. Everything it does follows from configuration, seed and committed flights; a learner
+//! that died goes on from a checkpoint as if nothing had been (`saving`).
 
-use std::collections::VecDeque;
-use std::sync::atomic::{AtomicBool, Ordering};
+mod candidates;
+mod error;
+mod saving;
+mod stop;
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use skein_protocol::config::Config;
+use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::Phase;
 use skein_protocol::run::{Life, RunDirectory, RunIdentity};
-use skein_protocol::snapshot::{Snapshot, SnapshotError, SnapshotLayout};
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::summary::{Ending, Summary};
 
-use crate::UpdateError;
-use crate::best::{is_better, is_candidate};
-use crate::checkpoint::{BestSnapshot, CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, Progress};
+use crate::checkpoint::{CheckpointWriter, EpochOrder, Progress};
 use crate::curriculum;
-use crate::device::DeviceError;
-use crate::evaluation::{self, EvaluationError};
+use crate::disk::Disk;
 use crate::flight::CommittedFlight;
-use crate::flights::assembly::Keep;
 use crate::flights::reception::{Batch, Reception, ReceptionError};
-use crate::metrics::{Metrics, MetricsError, Scalar};
-use crate::replay::InsertError;
-use crate::report::{Phases, Reporter};
+use crate::metrics::{Metrics, Scalar};
+use crate::report::Reporter;
 use crate::sac::SacMetrics;
 use crate::trainer::Trainer;
 
-/// Why a training ended before its time.
-#[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)] // every variant is the error of the part it is named after
-pub enum TrainingError {
-    #[error(transparent)]
-    Device(#[from] DeviceError),
-    #[error(transparent)]
-    Reception(#[from] ReceptionError),
-    #[error(transparent)]
-    Insert(#[from] InsertError),
-    #[error(transparent)]
-    Update(#[from] UpdateError),
-    #[error(transparent)]
-    Metrics(#[from] MetricsError),
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    #[error(transparent)]
-    Snapshot(#[from] SnapshotError),
-    #[error(transparent)]
-    Evaluation(#[from] EvaluationError),
-    #[error("cannot start a thread: {0}")]
-    Thread(#[source] std::io::Error),
-}
+pub use error::TrainingError;
+use stop::StopWatch;
 
 /// A run under way.
 struct Training<'a> {
@@ -59,25 +41,38 @@ struct Training<'a> {
     identity: &'a RunIdentity,
     directory: &'a RunDirectory,
     stop: &'a AtomicBool,
+    stop_watch: StopWatch<'a>,
+    disk: Disk,
     layout: SnapshotLayout,
     trainer: Trainer,
     reception: Reception,
     reporter: Reporter,
     metrics: Metrics,
     checkpoints: CheckpointWriter,
-    phases: Phases,
+    started: Instant,
     epoch_started: Instant,
-    version: PolicyVersion,
-    epochs_done: u64,
-    flights: u64,
-    last_checkpoint: u64,
-    evaluations: u64,
-    evaluation_flights: u64,
-    latest_candidate: Option<u64>,
-    best: Option<BestSnapshot>,
+    /// What is counted of the run. What trainer and metrics count themselves is filled in for a checkpoint.
+    progress: Progress,
+    /// The newest checkpoint's.
+    saved: Progress,
+    /// Times the learner was started before.
+    resumes: u64,
+    /// Ordered and not learned from.
+    in_the_air: VecDeque<InTheAir>,
+    /// The newest snapshot, those of the flights in the air, and the best.
+    snapshots: BTreeMap<PolicyVersion, Snapshot>,
 }
 
-/// Trains the run in `directory` to its end, in this `life` of its learner, or until `stop` is set; returns what it came to.
+/// Flights of an epoch that are under way.
+struct InTheAir {
+    order: EpochOrder,
+    batch: Batch,
+    /// Those that have come in.
+    flights: Vec<CommittedFlight>,
+}
+
+/// Trains the run in `directory` to its end, in this `life` of its learner, or until `stop` is set; writes and returns what it came to. It goes on from
+/// the newest undamaged checkpoint, if there is one.
 ///
 /// # Errors
 /// [`TrainingError`]; what was learned until the last checkpoint is on disk.
@@ -86,83 +81,44 @@ pub fn run(
     identity: &RunIdentity,
     life: Life,
     config: &Config,
-    stop: &AtomicBool,
+    stop: &Arc<AtomicBool>,
 ) -> Result<Summary, TrainingError> {
-    let started = Instant::now();
-    let mut training = Training::new(directory, identity, life, config, stop)?;
-    let ending = match training.learn().and_then(|()| training.evaluate_best()) {
-        Ok(()) => Ending::Completed,
-        Err(TrainingError::Reception(ReceptionError::Stopped)) => Ending::Interrupted,
-        Err(error) => {
-            training.reception.finish();
-            return Err(error);
+    let mut training = Training::begin(directory, identity, life, config, stop)?;
+    let end = match training.train() {
+        Ok(()) => training.save().map(|progress| (Ending::Completed, progress)),
+        Err(TrainingError::Reception(ReceptionError::Stopped)) => {
+            training.save().map(|progress| (Ending::Interrupted, progress))
         }
+        Err(TrainingError::Abandoned) => training.go_back().map(|progress| (Ending::Interrupted, progress)),
+        Err(error) => Err(error),
     };
-    training.finish(ending, started)
+    training.conclude(end)
 }
 
-impl<'a> Training<'a> {
-    fn new(
-        directory: &'a RunDirectory,
-        identity: &'a RunIdentity,
-        life: Life,
-        config: &'a Config,
-        stop: &'a AtomicBool,
-    ) -> Result<Self, TrainingError> {
-        let trainer = Trainer::new(config)?;
-        let store = CheckpointStore::new(
-            &directory.checkpoints(),
-            identity.config_digest,
-            config.checkpoints.keep,
-        );
-        let reception = Reception::start(identity, life, config)?;
-        Ok(Self {
-            config,
-            identity,
-            directory,
-            stop,
-            layout: SnapshotLayout::of(config),
-            trainer,
-            reporter: Reporter::start(config.run.flights, reception.shared()).map_err(TrainingError::Thread)?,
-            reception,
-            metrics: Metrics::create(directory, config.evaluation.window_flights as usize)?,
-            checkpoints: CheckpointWriter::start(store)?,
-            phases: Phases::default(),
-            epoch_started: Instant::now(),
-            version: PolicyVersion(0),
-            epochs_done: 0,
-            flights: 0,
-            last_checkpoint: 0,
-            evaluations: 0,
-            evaluation_flights: 0,
-            latest_candidate: None,
-            best: None,
-        })
+impl Training<'_> {
+    fn train(&mut self) -> Result<(), TrainingError> {
+        self.learn()?;
+        // Whoever dies in the final evaluation has lost the evaluation alone.
+        self.checkpoint()?;
+        self.evaluate_best()
     }
 
-    /// All epochs.
+    /// All epochs, those that an earlier life has learned from apart.
     fn learn(&mut self) -> Result<(), TrainingError> {
         let epochs = curriculum::epochs(self.config);
-        let mut in_the_air: VecDeque<Batch> = VecDeque::new();
-        let mut next_to_fly = 0;
-        self.publish()?;
-        for epoch in (0..epochs).map(Epoch) {
+        // An earlier life may have been stopped while it looked.
+        self.look_for_best()?;
+        while self.progress.epochs < epochs {
+            let epoch = Epoch(self.progress.epochs);
             // With policy lag 1, the next epoch is flown with the snapshot at hand while this one is learned from.
-            while next_to_fly < epochs && next_to_fly <= epoch.0 + self.config.learning.policy_lag {
-                in_the_air.push_back(self.fly(Epoch(next_to_fly))?);
-                next_to_fly += 1;
-            }
-            let Some(batch) = in_the_air.pop_front() else {
-                break;
-            };
-            let flights = self.collect(batch)?;
+            self.order_until(epochs.min(epoch.0 + 1 + self.config.learning.policy_lag))?;
+            let flights = self.collect()?;
             self.take_in(flights)?;
             self.train_vae(epoch)?;
             self.train_policy(epoch)?;
-            self.epochs_done = epoch.0 + 1;
-            self.version = PolicyVersion(self.epochs_done);
+            self.progress.epochs += 1;
             self.publish()?;
-            tracing::debug!(epoch = epoch.0, flights = self.flights, version = %self.version, "epoch learned from");
+            tracing::debug!(epoch = epoch.0, flights = self.progress.flights, "epoch learned from");
             self.metrics.flush()?;
             self.look_for_best()?;
             self.checkpoint_if_due()?;
@@ -170,39 +126,76 @@ impl<'a> Training<'a> {
         Ok(())
     }
 
+    /// Publishes the parameters as they are now.
     fn publish(&mut self) -> Result<(), TrainingError> {
         let started = Instant::now();
-        self.reception.publish(self.trainer.snapshot(self.version))?;
-        self.phases.add("publish", started);
+        let snapshot = self.trainer.snapshot(self.progress.version());
+        self.reception.publish(snapshot.clone())?;
+        self.snapshots.insert(snapshot.version, snapshot);
+        self.forget_snapshots();
+        self.progress.spent.add("publish", started);
         Ok(())
     }
 
-    /// Orders the flights of `epoch`, to be flown with the newest snapshot.
-    fn fly(&mut self, epoch: Epoch) -> Result<Batch, TrainingError> {
+    /// Forgets snapshots that nobody will fly any more.
+    fn forget_snapshots(&mut self) {
+        let mut needed = vec![self.progress.version().0];
+        needed.extend(self.in_the_air.iter().map(|epoch| epoch.order.policy_version));
+        needed.extend(self.progress.best.as_ref().map(|best| best.policy_version));
+        self.snapshots.retain(|version, _| needed.contains(&version.0));
+    }
+
+    /// Orders the flights of all epochs before `end` that are not ordered yet, to be flown with the newest snapshot.
+    fn order_until(&mut self, end: u64) -> Result<(), TrainingError> {
+        let first = self
+            .in_the_air
+            .back()
+            .map_or(self.progress.epochs, |last| last.order.epoch + 1);
+        for epoch in first..end {
+            self.order(EpochOrder {
+                epoch,
+                policy_version: self.progress.version().0,
+                exploration: self.trainer.exploration(),
+                keep: self.trainer.keep(),
+            })?;
+        }
+        Ok(())
+    }
+
+    fn order(&mut self, order: EpochOrder) -> Result<(), TrainingError> {
         let tickets = curriculum::training(
             self.config,
             self.identity.run,
-            epoch,
-            self.version,
-            self.trainer.exploration(),
+            Epoch(order.epoch),
+            PolicyVersion(order.policy_version),
+            order.exploration,
         );
-        Ok(self.reception.fly(epoch, self.trainer.keep(), tickets)?)
+        let batch = self.reception.fly(Epoch(order.epoch), order.keep, tickets)?;
+        let flights = Vec::with_capacity(batch.remaining());
+        self.in_the_air.push_back(InTheAir { order, batch, flights });
+        Ok(())
     }
 
-    /// Waits for all flights of an epoch.
-    fn collect(&mut self, mut batch: Batch) -> Result<Vec<CommittedFlight>, TrainingError> {
+    /// Waits for all flights of the epoch that was ordered first. Until they are there, it counts as in the air.
+    fn collect(&mut self) -> Result<Vec<CommittedFlight>, TrainingError> {
         let started = Instant::now();
         self.reporter.update(|progress| progress.phase = Phase::Flying);
-        let mut flights = Vec::with_capacity(batch.remaining());
-        while let Some(flight) = batch.next(self.stop)? {
-            self.reporter.update(|progress| {
-                progress.flights += 1;
-                progress.steps += flight.steps() as u64;
-            });
-            flights.push(flight);
+        if let Some(InTheAir { batch, flights, .. }) = self.in_the_air.front_mut() {
+            while let Some(flight) = batch.next(self.stop)? {
+                self.reporter.update(|progress| {
+                    progress.flights += 1;
+                    progress.steps += flight.steps() as u64;
+                });
+                flights.push(flight);
+            }
         }
-        self.phases.add("wait for flights", started);
-        Ok(flights)
+        self.progress.spent.add("wait for flights", started);
+        pass(FaultPoint::LearnerEpochCollected);
+        Ok(self
+            .in_the_air
+            .pop_front()
+            .map(|epoch| epoch.flights)
+            .unwrap_or_default())
     }
 
     /// Takes the epoch's flights into metrics and replay buffer, in flight order.
@@ -214,7 +207,7 @@ impl<'a> Training<'a> {
         for flight in flights {
             self.metrics.flight(&flight)?;
             self.trainer.take_in(flight)?;
-            self.flights += 1;
+            self.progress.flights += 1;
         }
         let windows = self.metrics.windows();
         self.reporter.update(|progress| {
@@ -229,25 +222,27 @@ impl<'a> Training<'a> {
             (Scalar::StepsPerSec, steps_per_sec),
         ];
         self.metrics.scalars(self.last_flight(), &sizes)?;
-        self.phases.add("take flights in", started);
+        self.progress.spent.add("take flights in", started);
         Ok(())
     }
 
     /// The number of the newest flight: what curves are keyed by.
     fn last_flight(&self) -> u64 {
-        self.flights.saturating_sub(1)
+        self.progress.flights.saturating_sub(1)
     }
 
     fn train_vae(&mut self, epoch: Epoch) -> Result<(), TrainingError> {
         let started = Instant::now();
-        let reporter = &self.reporter;
+        let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
         let trained = self.trainer.train_vae(epoch, |metrics| {
             reporter.update(|progress| {
                 progress.vae_updates += 1;
                 progress.vae_loss = Some(metrics.loss.into());
             });
+            pass(FaultPoint::LearnerMidUpdates);
+            watch.after_update()
         })?;
-        self.phases.add("VAE steps", started);
+        self.progress.spent.add("VAE steps", started);
         let Some(metrics) = trained else {
             return Ok(());
         };
@@ -261,17 +256,20 @@ impl<'a> Training<'a> {
 
     fn train_policy(&mut self, epoch: Epoch) -> Result<(), TrainingError> {
         let started = Instant::now();
-        let reporter = &self.reporter;
+        let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
         let updates_before = self.trainer.updates();
         let trained = self.trainer.train_policy(epoch, |metrics| {
             reporter.update(|progress| {
                 progress.updates += 1;
                 progress.temperature = Some(metrics.temperature.into());
             });
+            pass(FaultPoint::LearnerMidUpdates);
+            watch.after_update()
         })?;
+        pass(FaultPoint::LearnerUpdated);
         let done = self.trainer.updates() - updates_before;
         let updates_per_sec = done as f64 / started.elapsed().as_secs_f64();
-        self.phases.add("SAC updates", started);
+        self.progress.spent.add("SAC updates", started);
         let Some(SacMetrics {
             critic_loss,
             policy_loss,
@@ -291,149 +289,5 @@ impl<'a> Training<'a> {
             (Scalar::UpdatesPerSec, updates_per_sec),
         ];
         Ok(self.metrics.scalars(self.last_flight(), &curves)?)
-    }
-
-    fn checkpoint_if_due(&mut self) -> Result<(), TrainingError> {
-        if self.flights - self.last_checkpoint >= self.config.checkpoints.every_flights {
-            self.checkpoint()?;
-        }
-        Ok(())
-    }
-
-    /// Hands the state at the end of an epoch to the writing thread, and keeps the newest snapshot as a file.
-    fn checkpoint(&mut self) -> Result<(), TrainingError> {
-        let started = Instant::now();
-        self.trainer
-            .snapshot(self.version)
-            .save(&self.directory.latest_snapshot(), &self.layout, self.config)?;
-        self.checkpoints.save(CheckpointState {
-            progress: Progress {
-                flights: self.flights,
-                epochs: self.epochs_done,
-                policy_version: self.version.0,
-                environment_steps: self.trainer.steps(),
-                vae_steps: self.trainer.vae_updates(),
-                sac_updates: self.trainer.updates(),
-                evaluations: self.evaluations,
-                latest_candidate: self.latest_candidate,
-                best: self.best.clone(),
-                windows: self.metrics.windows().clone(),
-            },
-            tensors: self.trainer.tensors(),
-            replay: self.trainer.replay().state(),
-        })?;
-        self.last_checkpoint = self.flights;
-        self.phases.add("checkpoint", started);
-        Ok(())
-    }
-
-    /// Confirms the newest snapshot by evaluation flights if it is a candidate; keeps it if it is the best. The last one always is a candidate.
-    fn look_for_best(&mut self) -> Result<(), TrainingError> {
-        let walls_passed = &self.metrics.windows().walls_passed;
-        let last = self.flights == self.config.run.flights;
-        let section = &self.config.evaluation;
-        if !last
-            && !is_candidate(
-                section,
-                self.flights,
-                self.latest_candidate,
-                walls_passed,
-                self.best.as_ref(),
-            )
-        {
-            return Ok(());
-        }
-        let window_walls_passed = walls_passed.mean().unwrap_or_default();
-        let flown = self.evaluate(self.version, 0..1, section.confirm_flights, Keep::Latents)?;
-        self.latest_candidate = Some(self.flights);
-        let passed: f64 = flown.iter().map(|flight| f64::from(flight.walls_passed)).sum();
-        let candidate = BestSnapshot {
-            policy_version: self.version.0,
-            flights: self.flights,
-            window_walls_passed,
-            confirmed_walls_passed: passed / flown.len() as f64,
-        };
-        self.metrics.scalars(
-            self.last_flight(),
-            &[(Scalar::EvaluationWallsPassed, candidate.confirmed_walls_passed)],
-        )?;
-        tracing::info!(?candidate, best = ?self.best, "candidate confirmed");
-        if is_better(&candidate, self.best.as_ref()) {
-            self.trainer
-                .snapshot(self.version)
-                .save(&self.directory.best_snapshot(), &self.layout, self.config)?;
-            self.best = Some(candidate);
-        }
-        Ok(())
-    }
-
-    /// Flies `flights` evaluation flights on each of `courses` with a published snapshot.
-    fn evaluate(
-        &mut self,
-        version: PolicyVersion,
-        courses: std::ops::Range<u32>,
-        flights: u64,
-        keep: Keep,
-    ) -> Result<Vec<CommittedFlight>, TrainingError> {
-        let started = Instant::now();
-        let run = self.identity.run;
-        let tickets = curriculum::evaluation(self.config, run, self.evaluations, version, courses, flights);
-        let total = tickets.len() as u64;
-        self.evaluations += 1;
-        self.reporter.update(|progress| {
-            progress.phase = Phase::Evaluating;
-            progress.evaluation_flights = (0, total);
-        });
-        let mut batch = self.reception.fly(Epoch(self.epochs_done), keep, tickets)?;
-        let mut flown = Vec::with_capacity(batch.remaining());
-        while let Some(flight) = batch.next(self.stop)? {
-            self.reporter.update(|progress| progress.evaluation_flights.0 += 1);
-            flown.push(flight);
-        }
-        self.evaluation_flights += total;
-        self.phases.add("evaluation", started);
-        Ok(flown)
-    }
-
-    /// Evaluates the best snapshot on all courses and writes what came of it.
-    fn evaluate_best(&mut self) -> Result<(), TrainingError> {
-        let (best, _) = Snapshot::load(&self.directory.best_snapshot())?;
-        let (version, sha256) = (best.version, best.sha256());
-        self.reception.publish(best)?;
-        let courses = self.config.courses.evaluation.len() as u32;
-        let flown = self.evaluate(version, 0..courses, self.config.evaluation.flights, Keep::Latents)?;
-        let pictured = self.evaluate(version, 0..1, 1, Keep::Depth)?;
-        evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;
-        evaluation::write_reconstructions(self.directory, &self.trainer, &pictured)?;
-        Ok(())
-    }
-
-    /// Writes what remains, lets the actors go, and sums up.
-    fn finish(mut self, ending: Ending, started: Instant) -> Result<Summary, TrainingError> {
-        self.reporter.update(|progress| progress.phase = Phase::Finishing);
-        self.metrics.flush()?;
-        self.checkpoint()?;
-        self.checkpoints.finish()?;
-        let shared = self.reception.shared();
-        self.reception.finish();
-        Ok(Summary {
-            skein_version: env!("CARGO_PKG_VERSION").to_owned(),
-            run: self.identity.run,
-            seed: self.config.run.seed,
-            ending,
-            policy_sha256: self.trainer.snapshot(self.version).sha256(),
-            final_version: self.version,
-            best_version: self.best.as_ref().map(|best| PolicyVersion(best.policy_version)),
-            best_confirmed_walls_passed: self.best.as_ref().map(|best| best.confirmed_walls_passed),
-            flights: self.flights,
-            steps: self.trainer.steps(),
-            updates: self.trainer.updates(),
-            vae_updates: self.trainer.vae_updates(),
-            evaluation_flights: self.evaluation_flights,
-            tickets_reissued: shared.reissued.load(Ordering::Relaxed),
-            records_refused: shared.refused.load(Ordering::Relaxed),
-            wall_secs: started.elapsed().as_secs_f64(),
-            phase_secs: self.phases.to_map(),
-        })
     }
 }

@@ -46,7 +46,7 @@ points! {
     LearnerFlightCommitted => "learner.flight-committed",
     /// All flights of an epoch are there, none is learned from.
     LearnerEpochCollected => "learner.epoch-collected",
-    /// The first update of an epoch is done.
+    /// An update of an epoch is done.
     LearnerMidUpdates => "learner.mid-updates",
     /// All updates of an epoch are done, nothing is published.
     LearnerUpdated => "learner.updated",

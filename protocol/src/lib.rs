@@ -7,6 +7,7 @@
 
 pub mod claims;
 pub mod config;
+pub mod durable;
 pub mod evaluation;
 pub mod failure;
 pub mod fault;

@@ -39,8 +39,33 @@ pub struct Progress {
     /// Who waits for whom, when nothing has moved for a while.
     #[serde(default)]
     pub stalled: Option<String>,
-    /// Seconds since the learner started.
+    /// Seconds that the learner has run, earlier lives included as far as checkpoints tell.
     pub elapsed_secs: f64,
+}
+
+impl Progress {
+    /// Of a run of `total_flights` training flights that has not begun.
+    pub fn start(total_flights: u64) -> Self {
+        Self {
+            phase: Phase::Flying,
+            flights: 0,
+            total_flights,
+            evaluation_flights: (0, 0),
+            steps: 0,
+            updates: 0,
+            vae_updates: 0,
+            steps_per_sec: 0.0,
+            updates_per_sec: 0.0,
+            walls_passed: None,
+            mean_return: None,
+            temperature: None,
+            vae_loss: None,
+            actors: 0,
+            live_actors: Vec::new(),
+            stalled: None,
+            elapsed_secs: 0.0,
+        }
+    }
 }
 
 /// What the learner is about.

@@ -16,7 +16,7 @@ use xxhash_rust::xxh3::xxh3_64;
 
 use crate::config::Config;
 use crate::ids::{PolicyVersion, RunId};
-use crate::{ACTION, LATENT};
+use crate::{ACTION, LATENT, durable};
 
 /// Channels of the encoder's four 4×4 convolutions of stride 2; the first is the image's (paper, section 3.3; widths as in arXiv:1803.10122).
 pub const ENCODER_CHANNELS: [usize; 5] = [1, 32, 64, 128, 256];
@@ -261,7 +261,7 @@ impl Snapshot {
         digest.iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// Writes the snapshot as safetensors, with `config` in its metadata; in place at once, or not at all.
+    /// Writes the snapshot as safetensors, with `config` in its metadata; on disk in its place, or not at all.
     ///
     /// # Errors
     /// [`SnapshotError::Io`] names the file.
@@ -282,13 +282,10 @@ impl Snapshot {
             path: path.to_owned(),
             problem: error.to_string(),
         })?;
-        let io = |source| SnapshotError::Io {
+        durable::replace(path, &file).map_err(|source| SnapshotError::Io {
             path: path.to_owned(),
             source,
-        };
-        let aside = path.with_extension("tmp");
-        fs::write(&aside, file).map_err(io)?;
-        fs::rename(&aside, path).map_err(io)
+        })
     }
 
     /// Reads a snapshot file and the configuration it was trained with.

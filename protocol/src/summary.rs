@@ -1,9 +1,12 @@
 //! `summary.json`: what a run came to.
 
 use std::collections::BTreeMap;
+use std::io;
+use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
+use crate::durable;
 use crate::ids::{PolicyVersion, RunId};
 use crate::run::RunDirectory;
 
@@ -40,9 +43,12 @@ pub struct Summary {
     pub tickets_reissued: u64,
     /// Records that were refused.
     pub records_refused: u64,
-    /// Seconds from the learner's start to its end.
+    /// Times the learner was started again, whether it went on from a checkpoint or from the first flight.
+    #[serde(default)]
+    pub resumes: u64,
+    /// Seconds from the learner's start to its end, over all its lives; what a death undid is not counted.
     pub wall_secs: f64,
-    /// Seconds of the learner's main thread by what it did.
+    /// Seconds of the learner's main thread by what it did, as far as `wall_secs`.
     pub phase_secs: BTreeMap<String, f64>,
 }
 
@@ -50,6 +56,15 @@ impl Summary {
     /// That of `run`; `None` if it has none, or none that can be read.
     pub fn of(run: &RunDirectory) -> Option<Self> {
         serde_json::from_slice(&std::fs::read(run.summary_json()).ok()?).ok()
+    }
+
+    /// Puts it at `path`, at once or not at all.
+    ///
+    /// # Errors
+    /// Of the file system.
+    pub fn save(&self, path: &Path) -> io::Result<()> {
+        let json = serde_json::to_string_pretty(self).map_err(io::Error::other)?;
+        durable::replace(path, json.as_bytes())
     }
 }
 
@@ -61,4 +76,41 @@ pub enum Ending {
     Completed,
     /// It was told to stop.
     Interrupted,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_saved_summary_is_loaded_and_a_damaged_one_is_no_summary() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let path = run.summary_json();
+        assert_eq!(Summary::of(&run), None);
+        let summary = Summary {
+            skein_version: "0.1.0".to_owned(),
+            run: RunId(3),
+            seed: 1,
+            ending: Ending::Completed,
+            policy_sha256: "ab".to_owned(),
+            final_version: PolicyVersion(4),
+            best_version: None,
+            best_confirmed_walls_passed: None,
+            flights: 40,
+            steps: 400,
+            updates: 20,
+            vae_updates: 10,
+            evaluation_flights: 6,
+            tickets_reissued: 0,
+            records_refused: 0,
+            resumes: 2,
+            wall_secs: 1.5,
+            phase_secs: BTreeMap::from([("publish".to_owned(), 0.5)]),
+        };
+        summary.save(&path).unwrap();
+        assert_eq!(Summary::of(&run), Some(summary));
+        std::fs::write(&path, "{").unwrap();
+        assert_eq!(Summary::of(&run), None);
+    }
 }

@@ -5,6 +5,7 @@
 
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
+use serde::{Deserialize, Serialize};
 
 use crate::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion, RunId};
 
@@ -41,7 +42,7 @@ pub enum CourseChoice {
 }
 
 /// How actions are chosen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Exploration {
     /// Uniformly at random, before the first update.
     Uniform,

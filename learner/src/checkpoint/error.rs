@@ -36,14 +36,12 @@ pub enum CheckpointError {
         expected: u32,
     },
     /// It belongs to another configuration.
-    #[error("{} was written under configuration {found:016x}, but the run's is {expected:016x}: a run is resumed under the configuration it began with", path.display())]
+    #[error("{} was written under another configuration: {differences}; a run is resumed under the configuration it began with", path.display())]
     Configuration {
-        /// The manifest.
+        /// The checkpoint.
         path: PathBuf,
-        /// Digest of the configuration it was written under.
-        found: u64,
-        /// Digest of the run's.
-        expected: u64,
+        /// Each key with both values.
+        differences: String,
     },
     /// A file is not what was written.
     #[error("{} is damaged: {what} is {found} where the manifest says {expected}", path.display())]
@@ -65,6 +63,19 @@ pub enum CheckpointError {
         /// What is wrong with it.
         problem: String,
     },
+    /// There are checkpoints, but none can be used.
+    #[error(
+        "none of the {count} checkpoints in {} can be used; to train anew from the first flight, remove that folder. The newest: {newest}", directory.display()
+    )]
+    NoneUsable {
+        /// Where they lie.
+        directory: PathBuf,
+        /// How many there are.
+        count: usize,
+        /// Why the newest cannot be used.
+        #[source]
+        newest: Box<CheckpointError>,
+    },
     /// The writing thread is gone.
     #[error("the thread that writes checkpoints to {} ended early", directory.display())]
     WriterGone {
@@ -74,6 +85,11 @@ pub enum CheckpointError {
 }
 
 impl CheckpointError {
+    /// Whether the checkpoint is damaged, so that an older one may do; one of another version or configuration is sound, and older ones are no better.
+    pub(super) fn is_damage(&self) -> bool {
+        !matches!(self, Self::Format { .. } | Self::Configuration { .. })
+    }
+
     /// Names `path` and `action` of an I/O error.
     pub(super) fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(io::Error) -> Self {
         let path = path.into();

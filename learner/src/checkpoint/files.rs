@@ -2,12 +2,15 @@
 
 use std::borrow::Cow;
 use std::collections::HashSet;
-use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, View};
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use skein_protocol::fault::{FaultPoint, pass};
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::snapshot::Snapshot;
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, durable};
 
 use super::manifest::Manifest;
 use super::{CheckpointError, CheckpointState, NamedTensor, Progress, TensorValues};
@@ -15,9 +18,15 @@ use crate::replay::{ReplayState, RingState};
 
 const TENSORS: &str = "tensors.safetensors";
 const REPLAY: &str = "replay.safetensors";
+const SNAPSHOTS: &str = "snapshots.safetensors";
 const PROGRESS: &str = "progress.bin";
+/// The configuration.
+pub(super) const CONFIG: &str = "config.toml";
 /// All files but the manifest.
-pub(super) const NAMES: [&str; 3] = [TENSORS, REPLAY, PROGRESS];
+pub(super) const NAMES: [&str; 5] = [TENSORS, REPLAY, SNAPSHOTS, PROGRESS, CONFIG];
+
+/// Bytes that reading `progress.bin` may set aside: two windows of a million flights, and room for the rest. A length that makes no sense ends there.
+const PROGRESS_LIMIT: usize = 64 << 20;
 
 // Safetensors are little-endian, and values are written as they lie in memory.
 const _: () = assert!(cfg!(target_endian = "little"));
@@ -32,15 +41,28 @@ struct ProgressFile {
     image_blocks: Option<u64>,
 }
 
-/// Writes all files but the manifest into `directory`.
-pub(super) fn write(directory: &Path, state: &CheckpointState) -> Result<(), CheckpointError> {
+/// Writes all files but the manifest into `directory`; `config` is the portable configuration.
+pub(super) fn write(directory: &Path, state: &CheckpointState, config: &str) -> Result<(), CheckpointError> {
     let tensors = state
         .tensors
         .iter()
         .map(|tensor| (tensor.name.clone(), Borrowed::of(tensor)))
         .collect();
     write_tensors(&directory.join(TENSORS), tensors)?;
+    pass(FaultPoint::CheckpointTensors);
     write_tensors(&directory.join(REPLAY), replay_tensors(&state.replay))?;
+    pass(FaultPoint::CheckpointReplay);
+    let snapshots = state
+        .snapshots
+        .iter()
+        .map(|snapshot| {
+            (
+                snapshot.version.to_string(),
+                Borrowed::flat(Dtype::F32, &snapshot.values),
+            )
+        })
+        .collect();
+    write_tensors(&directory.join(SNAPSHOTS), snapshots)?;
     let progress = ProgressFile {
         progress: state.progress.clone(),
         success_inserted: state.replay.success.inserted,
@@ -48,27 +70,58 @@ pub(super) fn write(directory: &Path, state: &CheckpointState) -> Result<(), Che
         image_blocks: state.replay.images.as_ref().map(|blocks| blocks.len() as u64),
     };
     let bytes = bincode::serde::encode_to_vec(&progress, bincode::config::standard())
-        .expect("progress consists of numbers and lists of them");
-    let path = directory.join(PROGRESS);
-    fs::write(&path, bytes).map_err(CheckpointError::io("write", &path))
+        .expect("progress consists of numbers, texts and lists of them");
+    write_bytes(&directory.join(PROGRESS), &bytes)?;
+    write_bytes(&directory.join(CONFIG), config.as_bytes())?;
+    pass(FaultPoint::CheckpointProgress);
+    Ok(())
+}
+
+/// Writes a file that only the user can read.
+pub(super) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
+    durable::create_private(path)
+        .and_then(|mut file| file.write_all(bytes))
+        .map_err(CheckpointError::io("write", path))
 }
 
 /// Reads what [`write`] wrote, each file checked against `manifest`.
 pub(super) fn read(directory: &Path, manifest: &Manifest) -> Result<CheckpointState, CheckpointError> {
-    let tensors = read_tensors(&Stored::open(directory, TENSORS, manifest)?)?;
     let path = directory.join(PROGRESS);
     let bytes = manifest.read_file(directory, PROGRESS)?;
-    let (file, _): (ProgressFile, usize) = bincode::serde::decode_from_slice(&bytes, bincode::config::standard())
-        .map_err(|error| CheckpointError::Content {
-            path,
-            problem: error.to_string(),
-        })?;
+    let file = parse_progress(&bytes).map_err(|problem| CheckpointError::Content { path, problem })?;
     let replay = read_replay(&Stored::open(directory, REPLAY, manifest)?, &file)?;
     Ok(CheckpointState {
         progress: file.progress,
-        tensors,
+        tensors: read_tensors(&Stored::open(directory, TENSORS, manifest)?)?,
         replay,
+        snapshots: read_snapshots(&Stored::open(directory, SNAPSHOTS, manifest)?)?,
     })
+}
+
+fn parse_progress(bytes: &[u8]) -> Result<ProgressFile, String> {
+    let limited = bincode::config::standard().with_limit::<PROGRESS_LIMIT>();
+    let (file, read) = bincode::serde::decode_from_slice(bytes, limited).map_err(|error| error.to_string())?;
+    match bytes.len() - read {
+        0 => Ok(file),
+        more => Err(format!("{more} bytes follow what it should hold")),
+    }
+}
+
+fn read_snapshots(stored: &Stored) -> Result<Vec<Snapshot>, CheckpointError> {
+    let tensors = stored.tensors()?;
+    let mut snapshots = Vec::new();
+    for name in tensors.names() {
+        let version = name
+            .parse()
+            .map_err(|_| stored.unusable(format!("{name} is no snapshot's version")))?;
+        let values = stored.tensor(&tensors, name, Dtype::F32)?;
+        snapshots.push(Snapshot {
+            version: PolicyVersion(version),
+            values: bytemuck::allocation::pod_collect_to_vec(values.data()),
+        });
+    }
+    snapshots.sort_by_key(|snapshot| snapshot.version);
+    Ok(snapshots)
 }
 
 fn replay_tensors(replay: &ReplayState) -> Vec<(String, Borrowed<'_>)> {

@@ -13,10 +13,15 @@ use super::CheckpointError;
 pub(super) const NAME: &str = "manifest.json";
 
 /// Changes with everything that makes older checkpoints unreadable.
-const FORMAT: u32 = 1;
+pub(super) const FORMAT: u32 = 2;
 
 /// Bytes of a file that are read at once for its checksum.
 const PIECE: usize = 1 << 20;
+
+/// What stands before the manifest's own checksum, which is its last field in every format: a damaged one is told from another format.
+const OWN_CHECKSUM: &str = ",\n  \"xxh3\": \"";
+/// What stands behind it.
+const END: &str = "\"\n}\n";
 
 /// Format, configuration, and the files with their checksums.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -47,20 +52,10 @@ impl Manifest {
         flights: u64,
         config_digest: u64,
     ) -> Result<Self, CheckpointError> {
-        let entry = |name: &&str| {
-            let path = directory.join(name);
-            // Piece by piece: depth images can be larger than what is wise to hold twice.
-            let mut hasher = Xxh3Default::new();
-            let bytes = File::open(&path)
-                .and_then(|file| io::copy(&mut BufReader::with_capacity(PIECE, file), &mut hasher))
-                .map_err(CheckpointError::io("read", &path))?;
-            Ok(Entry {
-                name: (*name).to_owned(),
-                bytes,
-                xxh3: hex(hasher.digest()),
-            })
-        };
-        let files = names.iter().map(entry).collect::<Result<_, _>>()?;
+        let files = names
+            .iter()
+            .map(|name| Entry::of(directory, name))
+            .collect::<Result<_, _>>()?;
         Ok(Self {
             format: FORMAT,
             config_digest: hex(config_digest),
@@ -69,46 +64,62 @@ impl Manifest {
         })
     }
 
-    /// Its text.
-    pub(super) fn to_json(&self) -> String {
-        serde_json::to_string_pretty(self).expect("a manifest is plain data") + "\n"
+    /// Its text: JSON, with a checksum of all that stands before it as the last field.
+    pub(super) fn to_text(&self) -> String {
+        let json = serde_json::to_string_pretty(self).expect("a manifest is plain data");
+        let body = json.strip_suffix("\n}").expect("an object of several fields ends so");
+        format!("{body}{OWN_CHECKSUM}{}{END}", hex(xxh3_64(body.as_bytes())))
     }
 
-    /// Reads the manifest of the checkpoint in `directory` and checks that it is of this format and `config_digest`.
-    pub(super) fn read(directory: &Path, config_digest: u64) -> Result<Self, CheckpointError> {
+    /// Reads the manifest of the checkpoint in `directory` and checks that it is undamaged and of this format.
+    pub(super) fn read(directory: &Path) -> Result<Self, CheckpointError> {
         let path = directory.join(NAME);
+        let bytes = fs::read(&path).map_err(CheckpointError::io("read", &path))?;
+        Self::parse(&bytes, &path)
+    }
+
+    /// Reads the manifest from the `bytes` of its file at `path`.
+    fn parse(bytes: &[u8], path: &Path) -> Result<Self, CheckpointError> {
         let damaged = |problem: String| CheckpointError::Manifest {
-            path: path.clone(),
+            path: path.to_owned(),
             problem,
         };
-        let text = fs::read_to_string(&path).map_err(CheckpointError::io("read", &path))?;
+        let text = str::from_utf8(bytes).map_err(|error| damaged(error.to_string()))?;
+        let body = text
+            .strip_suffix(END)
+            .and_then(|text| text.rsplit_once(OWN_CHECKSUM))
+            .and_then(|(body, checksum)| (hex(xxh3_64(body.as_bytes())) == checksum).then_some(body))
+            .ok_or_else(|| damaged("its checksum is not that of its content".to_owned()))?;
+        let json = format!("{body}\n}}");
         // The format is read first: another one may have other fields.
         #[derive(Deserialize)]
         struct Format {
             format: u32,
         }
-        let Format { format: found } = serde_json::from_str(&text).map_err(|error| damaged(error.to_string()))?;
+        let Format { format: found } = serde_json::from_str(&json).map_err(|error| damaged(error.to_string()))?;
         if found != FORMAT {
             return Err(CheckpointError::Format {
-                path,
+                path: path.to_owned(),
                 found,
                 expected: FORMAT,
             });
         }
-        let manifest: Self = serde_json::from_str(&text).map_err(|error| damaged(error.to_string()))?;
-        if manifest.to_json() != text {
-            return Err(damaged("it is not laid out as it was written".to_owned()));
+        serde_json::from_str(&json).map_err(|error| damaged(error.to_string()))
+    }
+
+    /// Checks that every file in `directory` is what was written.
+    pub(super) fn verify(&self, directory: &Path) -> Result<(), CheckpointError> {
+        for entry in &self.files {
+            let path = directory.join(&entry.name);
+            let found = Entry::of(directory, &entry.name)?;
+            entry.check(&path, found.bytes, &found.xxh3)?;
         }
-        let found =
-            parse_hex(&manifest.config_digest).ok_or_else(|| damaged("config_digest is no number".to_owned()))?;
-        if found != config_digest {
-            return Err(CheckpointError::Configuration {
-                path,
-                found,
-                expected: config_digest,
-            });
-        }
-        Ok(manifest)
+        Ok(())
+    }
+
+    /// Fingerprint of the configuration it was written under.
+    pub(super) fn is_of(&self, config_digest: u64) -> bool {
+        self.config_digest == hex(config_digest)
     }
 
     /// Flights committed according to the manifest.
@@ -128,31 +139,49 @@ impl Manifest {
             })?;
         let path = directory.join(name);
         let content = fs::read(&path).map_err(CheckpointError::io("read", &path))?;
+        entry.check(&path, content.len() as u64, &hex(xxh3_64(&content)))?;
+        Ok(content)
+    }
+}
+
+impl Entry {
+    /// Of the file `name` in `directory`, as it is now.
+    fn of(directory: &Path, name: &str) -> Result<Self, CheckpointError> {
+        let path = directory.join(name);
+        // Piece by piece: depth images can be larger than what is wise to hold twice.
+        let mut hasher = Xxh3Default::new();
+        let bytes = File::open(&path)
+            .and_then(|file| io::copy(&mut BufReader::with_capacity(PIECE, file), &mut hasher))
+            .map_err(CheckpointError::io("read", &path))?;
+        Ok(Self {
+            name: name.to_owned(),
+            bytes,
+            xxh3: hex(hasher.digest()),
+        })
+    }
+
+    /// Compares what was found at `path` with what was written.
+    fn check(&self, path: &Path, bytes: u64, xxh3: &str) -> Result<(), CheckpointError> {
         let damaged = |what, found, expected| CheckpointError::Damaged {
-            path: path.clone(),
+            path: path.to_owned(),
             what,
             found,
             expected,
         };
-        if content.len() as u64 != entry.bytes {
+        if bytes != self.bytes {
             return Err(damaged(
                 "size",
-                format!("{} bytes", content.len()),
-                format!("{} bytes", entry.bytes),
+                format!("{bytes} bytes"),
+                format!("{} bytes", self.bytes),
             ));
         }
-        let checksum = hex(xxh3_64(&content));
-        if checksum != entry.xxh3 {
-            return Err(damaged("checksum", checksum, entry.xxh3.clone()));
+        if xxh3 != self.xxh3 {
+            return Err(damaged("checksum", xxh3.to_owned(), self.xxh3.clone()));
         }
-        Ok(content)
+        Ok(())
     }
 }
 
 fn hex(value: u64) -> String {
     format!("{value:016x}")
-}
-
-fn parse_hex(text: &str) -> Option<u64> {
-    u64::from_str_radix(text, 16).ok()
 }

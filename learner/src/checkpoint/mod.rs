@@ -1,13 +1,16 @@
 //! Checkpoints: everything that determines the rest of a run, in a directory of its own.
 //!
 //! A run resumed from one continues bit for bit as if it had never stopped, so all of it is here: parameters and moments of every network, the replay
-//! buffer with the depth images it still needs, counters, averages. Random generators are not: they are derived anew for every epoch.
+//! buffer with the depth images it still needs, snapshots that are still flown or are the best, counters, averages, how far the files of metrics
+//! had come. Random generators are not: they are derived anew for every epoch.
 //!
 //! `checkpoints/flight-<n>/` holds
 //! - `tensors.safetensors`: parameters, targets, moments, log α;
 //! - `replay.safetensors`: rows of both parts, numbers of their images, images;
+//! - `snapshots.safetensors`: snapshots by their versions;
 //! - `progress.bin`: [`Progress`], bincode;
-//! - `manifest.json`: format, configuration, and size and checksum of each of the above.
+//! - `config.toml`: the configuration, to say what differs from another one;
+//! - `manifest.json`: format, size and checksum of each of the above, and a checksum of itself.
 //!
 //! It is written aside and renamed into place when all of it is on disk ([`store`]): a directory of that name is complete, and what is damaged later
 //! is refused by its checksum, never learned from.
@@ -21,9 +24,14 @@ mod tests;
 mod writer;
 
 use serde::{Deserialize, Serialize};
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::snapshot::Snapshot;
+use skein_protocol::ticket::Exploration;
 
-use crate::metrics::Windows;
+use crate::flights::assembly::Keep;
+use crate::metrics::MetricsState;
 use crate::replay::ReplayState;
+use crate::spent::Spent;
 
 pub use error::CheckpointError;
 pub use store::{CheckpointStore, checkpoint_directory};
@@ -38,31 +46,78 @@ pub struct CheckpointState {
     pub tensors: Vec<NamedTensor>,
     /// The replay buffer's content.
     pub replay: ReplayState,
+    /// Snapshots that are still needed, the newest among them, by rising version.
+    pub snapshots: Vec<Snapshot>,
 }
 
-/// How far a run is: every counter that decides what happens next.
+/// How far a run is: every counter that decides what happens next, and what it came to so far.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
     /// Training flights committed; the checkpoint's name.
     pub flights: u64,
-    /// Epochs completed.
+    /// Epochs learned from; the version of the newest snapshot.
     pub epochs: u64,
-    /// The newest published snapshot.
-    pub policy_version: u64,
+    /// SHA-256 of the newest snapshot.
+    pub policy_sha256: String,
     /// Environment steps committed.
     pub environment_steps: u64,
     /// Steps the VAE was trained.
     pub vae_steps: u64,
     /// SAC updates done.
     pub sac_updates: u64,
-    /// Evaluations begun to confirm a candidate for the best snapshot; numbers their flights.
+    /// Epochs whose flights were ordered and not learned from, in order.
+    pub in_the_air: Vec<EpochOrder>,
+    /// Evaluations flown to confirm a candidate for the best snapshot; numbers their flights.
     pub evaluations: u64,
-    /// Flights committed when the latest candidate was chosen.
+    /// Evaluation flights flown.
+    pub evaluation_flights: u64,
+    /// Flights committed when the latest candidate was confirmed.
     pub latest_candidate: Option<u64>,
     /// The best snapshot so far.
     pub best: Option<BestSnapshot>,
-    /// Averages over the latest flights.
-    pub windows: Windows,
+    /// Averages over the latest flights, and where the files of metrics end.
+    pub metrics: MetricsState,
+    /// Time and losses so far.
+    pub spent: Spent,
+}
+
+impl Progress {
+    /// Of a run that has not begun, whose averages are over `window_flights` flights.
+    pub fn start(window_flights: usize) -> Self {
+        Self {
+            flights: 0,
+            epochs: 0,
+            policy_sha256: String::new(),
+            environment_steps: 0,
+            vae_steps: 0,
+            sac_updates: 0,
+            in_the_air: Vec::new(),
+            evaluations: 0,
+            evaluation_flights: 0,
+            latest_candidate: None,
+            best: None,
+            metrics: MetricsState::new(window_flights),
+            spent: Spent::default(),
+        }
+    }
+
+    /// The newest snapshot's version: one is published after each epoch.
+    pub fn version(&self) -> PolicyVersion {
+        PolicyVersion(self.epochs)
+    }
+}
+
+/// Flights of one epoch as they were ordered: what makes their tickets, besides configuration and run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EpochOrder {
+    /// The epoch.
+    pub epoch: u64,
+    /// The snapshot it is flown with.
+    pub policy_version: u64,
+    /// How actions are chosen.
+    pub exploration: Exploration,
+    /// What is kept of its flights.
+    pub keep: Keep,
 }
 
 /// The best snapshot, and why it is.

@@ -1,22 +1,37 @@
 //! The folder of checkpoints: writing into place, finding, loading, removing old ones.
 //!
 //! Names that begin with a dot are work in progress and never read: a checkpoint is written under such a name, all of it brought to disk, and renamed; to be
-//! removed, it is renamed back to one first.
+//! removed, it is renamed back to one first. One that is written again, for the same flight, keeps its predecessor beside it until it is in place:
+//! there is no moment without a sound checkpoint, once there is one.
 
-use std::fs::{self, File};
+use std::collections::BTreeSet;
+use std::fs;
 use std::path::{Path, PathBuf};
 
+use skein_protocol::config::Config;
+use skein_protocol::durable;
+use skein_protocol::fault::{FaultPoint, pass};
 use tracing::warn;
 
 use super::manifest::{self, Manifest};
 use super::{CheckpointError, CheckpointState, files};
 
+/// Ends the name of a checkpoint that is about to be replaced by one of the same flight.
+const REPLACED: &str = ".replaced";
+
 /// The checkpoints of a run.
 #[derive(Debug, Clone)]
 pub struct CheckpointStore {
     directory: PathBuf,
-    config_digest: u64,
+    config: Config,
     keep: usize,
+}
+
+/// A checkpoint in the folder.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Place {
+    flights: u64,
+    path: PathBuf,
 }
 
 /// Where in `checkpoints` the state after `flights` committed flights lies.
@@ -25,12 +40,12 @@ pub fn checkpoint_directory(checkpoints: &Path, flights: u64) -> PathBuf {
 }
 
 impl CheckpointStore {
-    /// The checkpoints in `directory` of the run whose configuration has `config_digest`; the `keep` newest are kept.
-    pub fn new(directory: &Path, config_digest: u64, keep: usize) -> Self {
+    /// The checkpoints in `directory` of the run configured by `config`; the newest few that are sound are kept, as many as `config` says.
+    pub fn new(directory: &Path, config: &Config) -> Self {
         Self {
             directory: directory.to_owned(),
-            config_digest,
-            keep: keep.max(1),
+            config: config.clone(),
+            keep: config.checkpoints.keep.max(1),
         }
     }
 
@@ -41,35 +56,69 @@ impl CheckpointStore {
 
     /// Writes `state`, and removes those beyond the newest few. Returns where it lies.
     ///
+    /// `relied_on` are files outside whose content up to now the state counts on: they are brought to disk before the checkpoint is in place.
+    ///
     /// # Errors
-    /// [`CheckpointError`]; what was there before still is.
-    pub fn save(&self, state: &CheckpointState) -> Result<PathBuf, CheckpointError> {
+    /// [`CheckpointError`]; what was there before still is, and what was half written takes no room.
+    pub fn save(&self, state: &CheckpointState, relied_on: &[PathBuf]) -> Result<PathBuf, CheckpointError> {
         let flights = state.progress.flights;
         // One name for all: whatever an interrupted write left, of this flight or another, makes room for the next.
         let aside = self.directory.join(".writing");
         remove(&aside)?;
-        fs::create_dir_all(&aside).map_err(CheckpointError::io("create", &aside))?;
-        files::write(&aside, state)?;
-        let manifest = Manifest::of(&aside, &files::NAMES, flights, self.config_digest)?;
-        let path = aside.join(manifest::NAME);
-        fs::write(&path, manifest.to_json()).map_err(CheckpointError::io("write", &path))?;
-        for name in files::NAMES.iter().chain([&manifest::NAME]) {
-            sync(&aside.join(name))?;
+        if let Err(error) = self.write_aside(&aside, state, relied_on) {
+            remove(&aside)?;
+            return Err(error);
         }
-        sync(&aside)?;
+        pass(FaultPoint::CheckpointSynced);
         let place = checkpoint_directory(&self.directory, flights);
-        self.retire(&place)?;
+        self.make_way(&place)?;
         fs::rename(&aside, &place).map_err(CheckpointError::io("rename into place", &aside))?;
         sync(&self.directory)?;
+        pass(FaultPoint::CheckpointRenamed);
         self.remove_others(flights)?;
         Ok(place)
     }
 
-    /// All checkpoints, the newest first, by the flights committed.
+    fn write_aside(&self, aside: &Path, state: &CheckpointState, relied_on: &[PathBuf]) -> Result<(), CheckpointError> {
+        durable::create_private_directory(aside).map_err(CheckpointError::io("create", aside))?;
+        pass(FaultPoint::CheckpointCreated);
+        files::write(aside, state, &self.config.portable())?;
+        let manifest = Manifest::of(aside, &files::NAMES, state.progress.flights, self.config.digest())?;
+        files::write_bytes(&aside.join(manifest::NAME), manifest.to_text().as_bytes())?;
+        pass(FaultPoint::CheckpointManifest);
+        for name in files::NAMES.iter().chain([&manifest::NAME]) {
+            sync(&aside.join(name))?;
+        }
+        sync(aside)?;
+        // A new file's name is in its folder, which has to be brought to disk as well.
+        let folders: BTreeSet<&Path> = relied_on.iter().filter_map(|path| path.parent()).collect();
+        let mut all = relied_on.iter().map(PathBuf::as_path).chain(folders);
+        all.try_for_each(sync_once)
+    }
+
+    /// Gives the checkpoint at `place`, if there is a sound one, the name under which it is still found until the new one is in its place.
+    fn make_way(&self, place: &Path) -> Result<(), CheckpointError> {
+        if !is_sound(place) {
+            // Perhaps its predecessor still lies beside it: that one stays.
+            return self.retire(place);
+        }
+        let replaced = replaced(place);
+        self.retire(&replaced)?;
+        fs::rename(place, replaced).map_err(CheckpointError::io("rename", place))
+    }
+
+    /// The flights of which there is a checkpoint, the newest first.
     ///
     /// # Errors
     /// [`CheckpointError::Io`] when the folder cannot be read; a folder that does not exist has none.
     pub fn list(&self) -> Result<Vec<u64>, CheckpointError> {
+        let mut flights: Vec<u64> = self.places()?.iter().map(|place| place.flights).collect();
+        flights.dedup();
+        Ok(flights)
+    }
+
+    /// All checkpoints, the newest first; of two of one flight, the one that replaces the other.
+    fn places(&self) -> Result<Vec<Place>, CheckpointError> {
         if !self.directory.exists() {
             return Ok(Vec::new());
         }
@@ -77,12 +126,17 @@ impl CheckpointStore {
         let mut found = Vec::new();
         for entry in fs::read_dir(&self.directory).map_err(io())? {
             let name = entry.map_err(io())?.file_name();
-            found.extend(
-                name.to_str()
-                    .and_then(|name| name.strip_prefix("flight-")?.parse::<u64>().ok()),
-            );
+            let flights = name.to_str().and_then(|name| {
+                let number = name.strip_prefix("flight-")?;
+                number.strip_suffix(REPLACED).unwrap_or(number).parse::<u64>().ok()
+            });
+            found.extend(flights.map(|flights| Place {
+                flights,
+                path: self.directory.join(&name),
+            }));
         }
-        found.sort_unstable_by(|left, right| right.cmp(left));
+        // The shorter of two names is that of the newer one.
+        found.sort_by_key(|place| (std::cmp::Reverse(place.flights), place.path.as_os_str().len()));
         Ok(found)
     }
 
@@ -91,13 +145,26 @@ impl CheckpointStore {
     /// # Errors
     /// [`CheckpointError`] names the file that is missing, damaged, or of another version or configuration.
     pub fn load(&self, flights: u64) -> Result<CheckpointState, CheckpointError> {
-        let directory = checkpoint_directory(&self.directory, flights);
-        let manifest = Manifest::read(&directory, self.config_digest)?;
-        let state = files::read(&directory, &manifest)?;
-        for (what, found) in [("the directory's name", flights), ("the manifest", manifest.flights())] {
+        self.load_from(&Place {
+            flights,
+            path: checkpoint_directory(&self.directory, flights),
+        })
+    }
+
+    fn load_from(&self, place: &Place) -> Result<CheckpointState, CheckpointError> {
+        let manifest = Manifest::read(&place.path)?;
+        let config = manifest.read_file(&place.path, files::CONFIG)?;
+        if !manifest.is_of(self.config.digest()) {
+            return Err(self.other_configuration(&place.path, &config));
+        }
+        let state = files::read(&place.path, &manifest)?;
+        for (what, found) in [
+            ("the directory's name", place.flights),
+            ("the manifest", manifest.flights()),
+        ] {
             if found != state.progress.flights {
                 return Err(CheckpointError::Content {
-                    path: directory,
+                    path: place.path.clone(),
                     problem: format!("it is of flight {}, but {what} says {found}", state.progress.flights),
                 });
             }
@@ -105,31 +172,61 @@ impl CheckpointStore {
         Ok(state)
     }
 
+    fn other_configuration(&self, path: &Path, config: &[u8]) -> CheckpointError {
+        let differences = self.config.differences(&String::from_utf8_lossy(config));
+        CheckpointError::Configuration {
+            path: path.to_owned(),
+            differences: match differences {
+                Ok(differences) if !differences.is_empty() => differences.join(", "),
+                _ => "its config.toml says which".to_owned(),
+            },
+        }
+    }
+
     /// Loads the newest checkpoint that is undamaged; `None` when there is none at all. Resuming from an older one costs time, never the result.
     ///
     /// # Errors
-    /// The newest one's [`CheckpointError`] when none can be used.
+    /// [`CheckpointError::NoneUsable`] when all are damaged: a run is not begun anew without a word. [`CheckpointError::Format`] or
+    /// [`CheckpointError::Configuration`] when the newest undamaged one is of another version or configuration.
     pub fn load_newest(&self) -> Result<Option<CheckpointState>, CheckpointError> {
-        let mut refused = None;
-        for flights in self.list()? {
-            match self.load(flights) {
-                Ok(state) => {
-                    if let Some(error) = refused {
-                        warn!(%error, resumed_from = flights, "newest checkpoint refused");
-                    }
-                    return Ok(Some(state));
+        let places = self.places()?;
+        let count = places.len();
+        let mut newest = None;
+        for place in places {
+            match self.load_from(&place) {
+                Ok(state) => return Ok(Some(state)),
+                Err(error) if error.is_damage() => {
+                    warn!(%error, "checkpoint refused, looking for an older one");
+                    newest = newest.or(Some(Box::new(error)));
                 }
-                Err(error) => refused = refused.or(Some(error)),
+                Err(error) => return Err(error),
             }
         }
-        refused.map_or(Ok(None), Err)
+        newest.map_or(Ok(None), |newest| {
+            Err(CheckpointError::NoneUsable {
+                directory: self.directory.clone(),
+                count,
+                newest,
+            })
+        })
     }
 
-    /// Keeps the checkpoint just written and the newest before it. Later ones are of a future that this run has left by resuming from an earlier one.
+    /// Keeps the checkpoint just written and the newest sound ones before it. Later ones are of a future that this run has left by resuming from an
+    /// earlier one.
     fn remove_others(&self, newest: u64) -> Result<(), CheckpointError> {
-        let (later, earlier): (Vec<_>, Vec<_>) = self.list()?.into_iter().partition(|&flights| flights > newest);
-        for flights in later.into_iter().chain(earlier.into_iter().skip(self.keep)) {
-            self.retire(&checkpoint_directory(&self.directory, flights))?;
+        let mut sound = BTreeSet::from([newest]);
+        for place in self.places()? {
+            if place.path == checkpoint_directory(&self.directory, newest) {
+                continue;
+            }
+            let superfluous = place.flights >= newest || sound.len() >= self.keep || sound.contains(&place.flights);
+            if superfluous {
+                self.retire(&place.path)?;
+                continue;
+            }
+            if is_sound(&place.path) {
+                sound.insert(place.flights);
+            }
         }
         Ok(())
     }
@@ -142,8 +239,29 @@ impl CheckpointStore {
         let aside = self.directory.join(".removing");
         remove(&aside)?;
         fs::rename(place, &aside).map_err(CheckpointError::io("rename", place))?;
+        pass(FaultPoint::CheckpointRetired);
         remove(&aside)
     }
+}
+
+/// Whether there is a checkpoint at `place` all of whose files are what was written.
+fn is_sound(place: &Path) -> bool {
+    match Manifest::read(place).and_then(|manifest| manifest.verify(place)) {
+        Ok(()) => true,
+        Err(error) => {
+            if place.exists() {
+                warn!(%error, "a checkpoint is damaged");
+            }
+            false
+        }
+    }
+}
+
+/// The name of the checkpoint at `place` while it is replaced.
+fn replaced(place: &Path) -> PathBuf {
+    let mut name = place.as_os_str().to_owned();
+    name.push(REPLACED);
+    PathBuf::from(name)
 }
 
 fn remove(path: &Path) -> Result<(), CheckpointError> {
@@ -153,9 +271,14 @@ fn remove(path: &Path) -> Result<(), CheckpointError> {
     }
 }
 
+/// Brings to disk what others wrote. Whatever this fails of may be lost, and trying again may succeed without bringing it back: so not even a full disk
+/// is waited for.
+fn sync_once(path: &Path) -> Result<(), CheckpointError> {
+    durable::sync(path)
+        .map_err(|error| CheckpointError::io("write to disk", path)(std::io::Error::other(error.to_string())))
+}
+
 /// Brings a file or directory to disk.
 fn sync(path: &Path) -> Result<(), CheckpointError> {
-    File::open(path)
-        .and_then(|file| file.sync_all())
-        .map_err(CheckpointError::io("write to disk", path))
+    durable::sync(path).map_err(CheckpointError::io("write to disk", path))
 }

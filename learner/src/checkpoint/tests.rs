@@ -1,15 +1,19 @@
 //! What is saved is what is loaded, bit for bit, or it is refused.
 
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use skein_protocol::config::Config;
 use skein_protocol::transition::Outcome;
 
 use super::*;
+use crate::disk::Disk;
 use crate::flight::samples::{flight, with_images};
+use crate::metrics::{EventFile, Windows};
 use crate::replay::Replay;
-
-const DIGEST: u64 = 0xfedc_ba98_7654_3210;
 
 /// With bit patterns that only survive a copy: a negative zero, the smallest number, a NaN with a payload.
 fn state(flights: u64) -> CheckpointState {
@@ -38,11 +42,18 @@ fn state(flights: u64) -> CheckpointState {
         progress: Progress {
             flights,
             epochs: 7,
-            policy_version: 7,
+            policy_sha256: "0123".into(),
             environment_steps: 12,
             vae_steps: 3,
             sac_updates: u64::MAX,
+            in_the_air: vec![EpochOrder {
+                epoch: 7,
+                policy_version: 6,
+                exploration: Exploration::Sample,
+                keep: Keep::Depth,
+            }],
             evaluations: 1,
+            evaluation_flights: 5,
             latest_candidate: Some(5),
             best: Some(BestSnapshot {
                 policy_version: 6,
@@ -50,8 +61,26 @@ fn state(flights: u64) -> CheckpointState {
                 window_walls_passed: 0.1,
                 confirmed_walls_passed: 2.5,
             }),
-            windows,
+            metrics: MetricsState {
+                flights,
+                events: vec![EventFile {
+                    name: "events.out.tfevents.1.skein.000000".into(),
+                    bytes: 77,
+                }],
+                windows,
+            },
+            spent: Spent::default(),
         },
+        snapshots: vec![
+            Snapshot {
+                version: PolicyVersion(6),
+                values: odd.clone(),
+            },
+            Snapshot {
+                version: PolicyVersion(17),
+                values: vec![0.5; 3],
+            },
+        ],
         tensors: vec![
             tensor("adam.steps", &[1], TensorValues::I64(vec![-9_007_199_254_740_993])),
             tensor("log_alpha", &[], TensorValues::F64(vec![-1.0 / 3.0])),
@@ -68,11 +97,15 @@ fn bits(state: &CheckpointState) -> Vec<(String, Vec<u64>)> {
         TensorValues::F64(values) => values.iter().map(|value| value.to_bits()).collect(),
         TensorValues::I64(values) => values.iter().map(|value| value.cast_unsigned()).collect(),
     };
-    state
+    let tensors = state
         .tensors
         .iter()
-        .map(|tensor| (format!("{} {:?}", tensor.name, tensor.shape), bits(&tensor.values)))
-        .collect()
+        .map(|tensor| (format!("{} {:?}", tensor.name, tensor.shape), bits(&tensor.values)));
+    let snapshots = state.snapshots.iter().map(|snapshot| {
+        let bits = snapshot.values.iter().map(|value| value.to_bits().into()).collect();
+        (format!("snapshot {}", snapshot.version), bits)
+    });
+    tensors.chain(snapshots).collect()
 }
 
 fn assert_same(left: &CheckpointState, right: &CheckpointState) {
@@ -81,10 +114,25 @@ fn assert_same(left: &CheckpointState, right: &CheckpointState) {
     assert!(left.replay == right.replay, "the replay buffers differ");
 }
 
+fn config(keep: usize) -> Config {
+    let mut config = Config::default();
+    config.checkpoints.keep = keep;
+    config
+}
+
 fn store(keep: usize) -> (tempfile::TempDir, CheckpointStore) {
     let directory = tempfile::tempdir().unwrap();
-    let store = CheckpointStore::new(&directory.path().join("checkpoints"), DIGEST, keep);
+    let store = CheckpointStore::new(&directory.path().join("checkpoints"), &config(keep));
     (directory, store)
+}
+
+fn writer(store: CheckpointStore) -> CheckpointWriter {
+    CheckpointWriter::start(store, Disk::new(Arc::default())).unwrap()
+}
+
+/// Every file of a checkpoint.
+fn all_files() -> impl Iterator<Item = &'static str> {
+    files::NAMES.into_iter().chain([manifest::NAME])
 }
 
 fn names(directory: &std::path::Path) -> Vec<String> {
@@ -99,7 +147,7 @@ fn names(directory: &std::path::Path) -> Vec<String> {
 #[test]
 fn what_is_saved_is_what_is_loaded() {
     let (_directory, store) = store(2);
-    store.save(&state(500)).unwrap();
+    store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
     assert_same(&store.load_newest().unwrap().unwrap(), &state(500));
 }
@@ -109,7 +157,7 @@ fn two_tensors_of_one_name_are_refused_before_anything_is_in_place() {
     let (_directory, store) = store(2);
     let mut ambiguous = state(500);
     ambiguous.tensors.push(ambiguous.tensors[0].clone());
-    let error = store.save(&ambiguous).unwrap_err().to_string();
+    let error = store.save(&ambiguous, &[]).unwrap_err().to_string();
     assert!(error.contains("adam.steps"), "{error}");
     assert!(store.list().unwrap().is_empty());
 }
@@ -121,15 +169,18 @@ fn a_frozen_vaes_checkpoint_has_no_images_and_says_so() {
     frozen.replay.images = None;
     frozen.replay.success.images.clear();
     frozen.replay.regular.images.clear();
-    store.save(&frozen).unwrap();
+    store.save(&frozen, &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &frozen);
 }
 
 #[test]
 fn one_state_is_always_the_same_bytes() {
     let ((_left, left), (_right, right)) = (store(2), store(2));
-    let (left, right) = (left.save(&state(500)).unwrap(), right.save(&state(500)).unwrap());
-    for name in files::NAMES.iter().chain([&manifest::NAME]) {
+    let (left, right) = (
+        left.save(&state(500), &[]).unwrap(),
+        right.save(&state(500), &[]).unwrap(),
+    );
+    for name in all_files() {
         assert_eq!(
             fs::read(left.join(name)).unwrap(),
             fs::read(right.join(name)).unwrap(),
@@ -139,106 +190,184 @@ fn one_state_is_always_the_same_bytes() {
 }
 
 #[test]
-fn a_damaged_byte_is_refused_and_its_file_named() {
+fn a_damaged_byte_anywhere_is_refused_and_its_file_named() {
     let (_directory, store) = store(2);
-    let place = store.save(&state(500)).unwrap();
-    for name in files::NAMES.iter().chain([&manifest::NAME]) {
+    let place = store.save(&state(500), &[]).unwrap();
+    let mut tried = 0;
+    for name in all_files() {
         let path = place.join(name);
         let sound = fs::read(&path).unwrap();
-        let step = sound.len().div_ceil(200);
-        for index in (0..sound.len()).step_by(step).chain([sound.len() - 1]) {
+        let refused = |bytes: &[u8], what: String| {
+            fs::write(&path, bytes).unwrap();
+            let error = store.load(500).expect_err(&format!("{name}, {what}")).to_string();
+            assert!(error.contains(path.to_str().unwrap()), "{name}, {what}: {error}");
+        };
+        for index in (0..sound.len())
+            .step_by(sound.len().div_ceil(250))
+            .chain([sound.len() - 1])
+        {
             let mut damaged = sound.clone();
-            damaged[index] ^= 0x01;
-            fs::write(&path, &damaged).unwrap();
-            let error = store.load(500).expect_err(&format!("{name}, byte {index}")).to_string();
-            // A manifest that says something else may make another file look wrong; all else is blamed on the file itself.
-            assert!(error.contains(place.to_str().unwrap()), "{error}");
-            assert!(error.contains(name) || *name == manifest::NAME, "{name}: {error}");
+            damaged[index] ^= 1 << (index % 8);
+            refused(&damaged, format!("byte {index}"));
+            tried += 1;
         }
-        fs::write(&path, &sound[..sound.len() - 1]).unwrap();
-        store.load(500).expect_err(&format!("{name} cut short"));
+        for length in (0..sound.len())
+            .step_by(sound.len().div_ceil(50))
+            .chain([sound.len() - 1])
+        {
+            refused(&sound[..length], format!("cut to {length} bytes"));
+        }
+        let mut longer = sound.clone();
+        longer.push(b'\n');
+        refused(&longer, "a byte more".to_owned());
         fs::remove_file(&path).unwrap();
         let error = store.load(500).expect_err(&format!("{name} missing")).to_string();
         assert!(error.contains(name), "{error}");
         fs::write(&path, &sound).unwrap();
     }
+    assert!(tried >= 1000, "only {tried} positions");
     store.load(500).unwrap();
 }
 
 #[test]
-fn another_configuration_is_refused_and_both_are_named() {
+fn another_configuration_is_refused_by_key_with_both_values() {
     let (_directory, store) = store(2);
-    store.save(&state(500)).unwrap();
-    let other = CheckpointStore::new(store.directory(), 1, 2);
+    store.save(&state(500), &[]).unwrap();
+    let mut config = config(2);
+    config.sac.discount = 0.5;
+    let other = CheckpointStore::new(store.directory(), &config);
     let error = other.load_newest().unwrap_err().to_string();
-    for part in ["flight-500/manifest.json", "fedcba9876543210", "0000000000000001"] {
+    for part in ["flight-500", "sac.discount = 0.99 there, 0.5 here"] {
         assert!(error.contains(part), "`{error}` does not mention `{part}`");
     }
+    assert!(!error.contains("batch_size"), "{error}");
 }
 
 #[test]
 fn another_format_is_refused_before_anything_else_is_believed() {
     let (_directory, store) = store(2);
-    let path = store.save(&state(500)).unwrap().join(manifest::NAME);
-    fs::write(&path, r#"{ "format": 9, "something": "new" }"#).unwrap();
-    let error = store.load(500).unwrap_err();
+    store.save(&state(400), &[]).unwrap();
+    let path = store.save(&state(500), &[]).unwrap().join(manifest::NAME);
+    let body = "{\n  \"format\": 9,\n  \"something\": \"new\"";
+    let checksum = xxhash_rust::xxh3::xxh3_64(body.as_bytes());
+    fs::write(&path, format!("{body},\n  \"xxh3\": \"{checksum:016x}\"\n}}\n")).unwrap();
+    // It is no damage that an older checkpoint could make good.
+    let error = store.load_newest().unwrap_err();
+    let expected = manifest::FORMAT;
     assert!(
-        matches!(
-            error,
-            CheckpointError::Format {
-                found: 9,
-                expected: 1,
-                ..
-            }
-        ),
+        matches!(error, CheckpointError::Format { found: 9, expected: ours, .. } if ours == expected),
         "{error}"
     );
+}
+
+#[test]
+fn a_run_whose_checkpoints_are_all_damaged_is_not_begun_anew() {
+    let (_directory, store) = store(2);
+    for flights in [500, 1000] {
+        let place = store.save(&state(flights), &[]).unwrap();
+        fs::write(place.join("progress.bin"), "").unwrap();
+    }
+    let error = store.load_newest().unwrap_err().to_string();
+    for part in [
+        "none of the 2 checkpoints",
+        "flight-1000/progress.bin",
+        "remove that folder",
+    ] {
+        assert!(error.contains(part), "`{error}` does not mention `{part}`");
+    }
+}
+
+#[test]
+fn nobody_else_can_read_a_checkpoint() {
+    let (_directory, store) = store(2);
+    let place = store.save(&state(500), &[]).unwrap();
+    let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+    assert_eq!((mode(store.directory()), mode(&place)), (0o700, 0o700));
+    for name in all_files() {
+        assert_eq!(mode(&place.join(name)), 0o600, "{name}");
+    }
 }
 
 #[test]
 fn only_the_newest_few_are_kept_and_nothing_else_remains() {
     let (_directory, store) = store(2);
     for flights in [500, 1000, 1500] {
-        store.save(&state(flights)).unwrap();
+        store.save(&state(flights), &[]).unwrap();
     }
     assert_eq!(names(store.directory()), ["flight-1000", "flight-1500"]);
     assert_eq!(store.list().unwrap(), [1500, 1000]);
 }
 
 #[test]
+fn a_damaged_checkpoint_does_not_count_among_those_kept() {
+    let (_directory, store) = store(2);
+    for flights in [500, 1000] {
+        store.save(&state(flights), &[]).unwrap();
+    }
+    fs::write(store.directory().join("flight-1000/progress.bin"), "").unwrap();
+    store.save(&state(1500), &[]).unwrap();
+    assert_eq!(names(store.directory()), ["flight-1000", "flight-1500", "flight-500"]);
+    store.save(&state(2000), &[]).unwrap();
+    assert_eq!(names(store.directory()), ["flight-1500", "flight-2000"]);
+}
+
+#[test]
+fn a_checkpoint_that_is_written_again_is_never_missed() {
+    let (_directory, store) = store(1);
+    let place = store.save(&state(500), &[]).unwrap();
+    // The first half of the exchange, then a death.
+    let replaced = store.directory().join("flight-500.replaced");
+    fs::rename(&place, &replaced).unwrap();
+    assert_same(&store.load_newest().unwrap().unwrap(), &state(500));
+    assert_eq!(store.list().unwrap(), [500]);
+    // The second half, then damage to the new one.
+    let place = store.save(&state(500), &[]).unwrap();
+    assert_eq!(names(store.directory()), ["flight-500"]);
+    fs::rename(&place, &replaced).unwrap();
+    fs::create_dir(&place).unwrap();
+    fs::write(place.join("progress.bin"), "").unwrap();
+    assert_same(&store.load_newest().unwrap().unwrap(), &state(500));
+    store.save(&state(500), &[]).unwrap();
+    assert_same(&store.load(500).unwrap(), &state(500));
+    assert_eq!(names(store.directory()), ["flight-500"]);
+}
+
+#[test]
 fn a_damaged_newest_is_passed_over_and_replaced_when_its_flight_is_reached_again() {
     let (_directory, store) = store(2);
-    store.save(&state(500)).unwrap();
-    let newest = store.save(&state(1000)).unwrap();
+    store.save(&state(500), &[]).unwrap();
+    let newest = store.save(&state(1000), &[]).unwrap();
     fs::write(newest.join("progress.bin"), "").unwrap();
     assert_eq!(store.load_newest().unwrap().unwrap().progress.flights, 500);
-    store.save(&state(1000)).unwrap();
+    store.save(&state(1000), &[]).unwrap();
     assert_same(&store.load_newest().unwrap().unwrap(), &state(1000));
 }
 
 #[test]
 fn checkpoints_of_an_abandoned_future_do_not_push_out_the_present() {
     let (_directory, store) = store(1);
-    store.save(&state(1000)).unwrap();
-    store.save(&state(600)).unwrap();
+    store.save(&state(1000), &[]).unwrap();
+    store.save(&state(600), &[]).unwrap();
     assert_eq!(names(store.directory()), ["flight-600"]);
 }
 
 #[test]
 fn what_an_interrupted_write_left_is_never_read_and_then_cleared() {
     let (_directory, store) = store(2);
-    let interrupted = store.save(&state(437)).unwrap();
+    let interrupted = store.save(&state(437), &[]).unwrap();
     fs::write(interrupted.join("tensors.safetensors.part"), "half").unwrap();
     fs::rename(interrupted, store.directory().join(".writing")).unwrap();
     assert!(store.load_newest().unwrap().is_none());
-    let place = store.save(&state(500)).unwrap();
+    let place = store.save(&state(500), &[]).unwrap();
     assert_eq!(names(store.directory()), ["flight-500"]);
     assert_eq!(
         names(&place),
         [
+            "config.toml",
             "manifest.json",
             "progress.bin",
             "replay.safetensors",
+            "snapshots.safetensors",
             "tensors.safetensors"
         ]
     );
@@ -253,9 +382,9 @@ fn a_run_without_checkpoints_has_none() {
 #[test]
 fn the_writing_thread_has_everything_on_disk_when_it_is_finished() {
     let (_directory, store) = store(3);
-    let mut writer = CheckpointWriter::start(store.clone()).unwrap();
+    let mut writer = writer(store.clone());
     for flights in [500, 1000] {
-        writer.save(state(flights)).unwrap();
+        writer.save(state(flights), Vec::new()).unwrap();
     }
     writer.finish().unwrap();
     for flights in [500, 1000] {
@@ -268,14 +397,89 @@ fn a_failed_write_is_told_by_the_next_save_or_the_end() {
     let directory = tempfile::tempdir().unwrap();
     let in_the_way = directory.path().join("checkpoints");
     fs::write(&in_the_way, "a file, not a folder").unwrap();
-    let start = || CheckpointWriter::start(CheckpointStore::new(&in_the_way, DIGEST, 2)).unwrap();
+    let start = || writer(CheckpointStore::new(&in_the_way, &config(2)));
 
     let mut writer = start();
-    writer.save(state(500)).unwrap();
-    let error = writer.save(state(1000)).unwrap_err();
+    writer.save(state(500), Vec::new()).unwrap();
+    let error = writer.save(state(1000), Vec::new()).unwrap_err();
     assert!(error.to_string().contains("checkpoints"), "{error}");
 
     let mut writer = start();
-    writer.save(state(500)).unwrap();
+    writer.save(state(500), Vec::new()).unwrap();
     assert!(matches!(writer.finish().unwrap_err(), CheckpointError::Io { .. }));
+}
+
+#[test]
+fn what_a_checkpoint_relies_on_must_be_there() {
+    let (directory, store) = store(2);
+    let rows = directory.path().join("flights.csv");
+    store.save(&state(500), std::slice::from_ref(&rows)).unwrap_err();
+    assert!(store.list().unwrap().is_empty());
+    fs::write(&rows, "").unwrap();
+    store.save(&state(500), &[rows]).unwrap();
+}
+
+/// A file system of 2 MB in memory; only root can make one.
+struct SmallDisk(tempfile::TempDir);
+
+impl SmallDisk {
+    fn mount() -> Option<Self> {
+        let directory = tempfile::tempdir().unwrap();
+        let mut mount = std::process::Command::new("mount");
+        mount
+            .args(["-t", "tmpfs", "-o", "size=2m", "none"])
+            .arg(directory.path());
+        let mounted = mount.output().is_ok_and(|output| output.status.success());
+        mounted.then_some(Self(directory))
+    }
+
+    fn path(&self) -> &Path {
+        self.0.path()
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = std::process::Command::new("umount").arg(self.0.path()).status();
+    }
+}
+
+#[test]
+fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop() {
+    let Some(small) = SmallDisk::mount() else {
+        println!("skipped: no file system can be mounted here");
+        return;
+    };
+    let store = CheckpointStore::new(&small.path().join("checkpoints"), &config(2));
+    store.save(&state(500), &[]).unwrap();
+    let ballast = small.path().join("ballast");
+    let free = |ballast: &Path| fs::write(ballast, vec![0; 4 << 20]).unwrap_err();
+    assert_eq!(free(&ballast).kind(), std::io::ErrorKind::StorageFull);
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let disk = Disk::new(stop.clone());
+    let mut writer = CheckpointWriter::start(store.clone(), disk.clone()).unwrap();
+    writer.save(state(600), Vec::new()).unwrap();
+    wait_for(|| disk.waiting().is_some());
+    assert_eq!(store.load_newest().unwrap().unwrap().progress.flights, 500);
+    fs::remove_file(&ballast).unwrap();
+    writer.finish().unwrap();
+    assert_same(&store.load_newest().unwrap().unwrap(), &state(600));
+
+    free(&ballast);
+    let mut writer = CheckpointWriter::start(store.clone(), disk.clone()).unwrap();
+    writer.save(state(700), Vec::new()).unwrap();
+    wait_for(|| disk.waiting().is_some());
+    stop.store(true, std::sync::atomic::Ordering::Relaxed);
+    let error = writer.finish().unwrap_err().to_string();
+    assert!(error.contains("No space left on device"), "{error}");
+    assert_same(&store.load_newest().unwrap().unwrap(), &state(600));
+}
+
+fn wait_for(condition: impl Fn() -> bool) {
+    let end = std::time::Instant::now() + std::time::Duration::from_secs(10);
+    while !condition() {
+        assert!(std::time::Instant::now() < end, "it never came");
+        std::thread::sleep(std::time::Duration::from_millis(10));
+    }
 }

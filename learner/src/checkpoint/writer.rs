@@ -1,11 +1,13 @@
 //! Writes checkpoints on a thread of its own, so that learning does not wait for the disk.
 
+use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
 
 use tracing::info;
 
 use super::{CheckpointError, CheckpointState, CheckpointStore};
+use crate::disk::Disk;
 
 /// Hands states to the writing thread.
 ///
@@ -13,53 +15,60 @@ use super::{CheckpointError, CheckpointState, CheckpointStore};
 #[derive(Debug)]
 pub struct CheckpointWriter {
     store: CheckpointStore,
-    states: SyncSender<CheckpointState>,
+    orders: SyncSender<Order>,
     /// Ends with the first error; taken when that is handed out.
     thread: Option<JoinHandle<Result<(), CheckpointError>>>,
 }
 
+/// A state to be written, and the files outside that it counts on.
+#[derive(Debug)]
+struct Order {
+    state: CheckpointState,
+    relied_on: Vec<PathBuf>,
+}
+
 impl CheckpointWriter {
-    /// Starts the thread.
+    /// Starts the thread. It waits for room on `disk`.
     ///
     /// # Errors
     /// [`CheckpointError::Io`] when the system grants no thread.
-    pub fn start(store: CheckpointStore) -> Result<Self, CheckpointError> {
-        let (states, receiver) = sync_channel(0);
+    pub fn start(store: CheckpointStore, disk: Disk) -> Result<Self, CheckpointError> {
+        let (orders, receiver) = sync_channel(0);
         let for_thread = store.clone();
         let thread = thread::Builder::new()
             .name("checkpoints".to_owned())
-            .spawn(move || write_all(&for_thread, &receiver))
+            .spawn(move || write_all(&for_thread, &disk, &receiver))
             .map_err(CheckpointError::io("start a thread that writes to", store.directory()))?;
         Ok(Self {
             store,
-            states,
+            orders,
             thread: Some(thread),
         })
     }
 
-    /// Hands over a state to be written.
+    /// Hands over a state to be written, and the files that it counts on: see [`CheckpointStore::save`].
     ///
     /// # Errors
     /// What went wrong with an earlier one. The thread has ended then; whoever wants to go on writing starts another.
-    pub fn save(&mut self, state: CheckpointState) -> Result<(), CheckpointError> {
-        self.states
-            .send(state)
+    pub fn save(&mut self, state: CheckpointState, relied_on: Vec<PathBuf>) -> Result<(), CheckpointError> {
+        self.orders
+            .send(Order { state, relied_on })
             .or_else(|_| self.join().and_then(|()| Err(self.gone())))
     }
 
     /// Waits until everything handed over is on disk.
     ///
     /// # Errors
-    /// What went wrong with it.
+    /// What went wrong with it and was not told yet.
     pub fn finish(mut self) -> Result<(), CheckpointError> {
         // The thread ends when nobody can hand it anything any more.
-        self.states = sync_channel(0).0;
+        self.orders = sync_channel(0).0;
         self.join()
     }
 
     fn join(&mut self) -> Result<(), CheckpointError> {
-        let ended = self.thread.take().and_then(|thread| thread.join().ok());
-        ended.unwrap_or_else(|| Err(self.gone()))
+        let ended = self.thread.take().map(JoinHandle::join);
+        ended.map_or(Ok(()), |ended| ended.unwrap_or_else(|_| Err(self.gone())))
     }
 
     fn gone(&self) -> CheckpointError {
@@ -69,10 +78,10 @@ impl CheckpointWriter {
     }
 }
 
-fn write_all(store: &CheckpointStore, states: &Receiver<CheckpointState>) -> Result<(), CheckpointError> {
-    for state in states {
+fn write_all(store: &CheckpointStore, disk: &Disk, orders: &Receiver<Order>) -> Result<(), CheckpointError> {
+    for Order { state, relied_on } in orders {
         let started = std::time::Instant::now();
-        let path = store.save(&state)?;
+        let path = disk.with_room(store.directory(), || store.save(&state, &relied_on))?;
         info!(path = %path.display(), secs = started.elapsed().as_secs_f64(), "checkpoint written");
     }
     Ok(())

@@ -2,6 +2,7 @@
 //!
 //! A flight is committed once, complete and in order, or not at all; nothing downstream ever sees half of one, or one flown with two policies.
 
+use serde::{Deserialize, Serialize};
 use skein_protocol::ids::{ActorId, Epoch, Incarnation};
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{Outcome, RecordFault, RecordKind, TransitionRecord};
@@ -9,7 +10,7 @@ use skein_protocol::transition::{Outcome, RecordFault, RecordKind, TransitionRec
 use crate::flight::{CommittedFlight, StepObservation};
 
 /// What the learner wants of a flight, besides that it is flown.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Keep {
     /// Latent codes and telemetry only.
     Latents,

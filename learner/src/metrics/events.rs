@@ -5,18 +5,35 @@
 //! `length u64 | masked CRC of length u32 | message | masked CRC of message u32`, little-endian, where the CRC is CRC-32C and masking rotates
 //! it and adds a constant, so that the checksum of data that itself holds checksums stays a good one (TensorFlow's `record_writer.h`).
 
-use std::fs::File;
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use prost::Message;
+use serde::{Deserialize, Serialize};
+
+use crate::disk::{Disk, Patient};
+
+/// How the names of our files begin, before the second of their start. TensorBoard takes files whose name has `tfevents` in it.
+const NAME: &str = "events.out.tfevents.";
 
 /// Appends scalars to an event file of its own.
 #[derive(Debug)]
 pub struct EventWriter {
+    /// Files of earlier lives, then the present one.
+    files: Vec<EventFile>,
     path: PathBuf,
-    file: BufWriter<File>,
+    file: BufWriter<Patient<File>>,
+}
+
+/// An event file, as far as it belongs to the run.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EventFile {
+    /// Its name in the folder.
+    pub name: String,
+    /// Its length.
+    pub bytes: u64,
 }
 
 /// Why events cannot be written.
@@ -31,31 +48,39 @@ pub struct EventError {
 }
 
 impl EventWriter {
-    /// Starts a new event file in `directory`. TensorBoard reads all files of a directory as one; of files from before an interruption it drops
-    /// what lies at `first_step` or later.
+    /// Starts a new event file in `directory`, after cutting back those there are to `files`: what lies beyond is of flights whose learning was lost.
+    /// TensorBoard reads all files of a directory as one; of earlier ones it drops what lies at `first_step` or later.
+    ///
+    /// A file that has lost a part of `files`, or all of it, is named in a warning: its curves then have a hole, which is no reason not to train.
     ///
     /// # Errors
-    /// [`EventError`] when the file cannot be created.
-    pub fn create(directory: &Path, first_step: u64) -> Result<Self, EventError> {
+    /// [`EventError`] when a file cannot be cut back or created.
+    pub fn resume(directory: &Path, files: Vec<EventFile>, first_step: u64, disk: &Disk) -> Result<Self, EventError> {
         let at = |path: PathBuf| move |source| EventError { path, source };
-        std::fs::create_dir_all(directory).map_err(at(directory.to_owned()))?;
-        // TensorBoard takes files whose name has `tfevents` in it, in alphabetical order; a second start within one second is told apart by the number.
-        let started = now_secs() as u64;
-        let (path, file) = (0..1000)
-            .map(|number| directory.join(format!("events.out.tfevents.{started}.skein.{number:03}")))
-            .find_map(|path| match File::create_new(&path) {
-                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => None,
-                result => Some((path, result)),
-            })
-            .unwrap_or_else(|| (directory.to_owned(), Err(io::ErrorKind::AlreadyExists.into())));
-        let file = BufWriter::new(file.map_err(at(path.clone()))?);
-        let mut writer = Self { path, file };
+        fs::create_dir_all(directory).map_err(at(directory.to_owned()))?;
+        let (path, file) = begin(directory, cut_back(directory, &files)?);
+        let file = BufWriter::new(disk.patient(&path, file.map_err(at(path.clone()))?));
+        let mut writer = Self { files, path, file };
+        writer.files.push(EventFile {
+            name: writer
+                .path
+                .file_name()
+                .unwrap_or_default()
+                .to_string_lossy()
+                .into_owned(),
+            bytes: 0,
+        });
         writer.write(first_step, event::What::FileVersion("brain.Event:2".to_owned()))?;
         writer.write(
             first_step,
             event::What::SessionLog(SessionLog { status: SESSION_START }),
         )?;
         Ok(writer)
+    }
+
+    /// All files of the run, as far as they were written; what is not [flushed](EventWriter::flush) yet is counted in.
+    pub fn files(&self) -> &[EventFile] {
+        &self.files
     }
 
     /// Appends one value for each tag at `step`.
@@ -90,11 +115,84 @@ impl EventWriter {
             step: step.cast_signed(),
             what: Some(what),
         };
-        write_record(&mut self.file, &event.encode_to_vec()).map_err(|source| EventError {
+        let bytes = write_record(&mut self.file, &event.encode_to_vec()).map_err(|source| EventError {
             path: self.path.clone(),
             source,
+        })?;
+        if let Some(present) = self.files.last_mut() {
+            present.bytes += bytes;
+        }
+        Ok(())
+    }
+}
+
+/// Creates a file in `directory` that comes after the one begun `latest`, even if the clock has gone back since: TensorBoard takes files in alphabetical
+/// order. A second start within one second is told apart by the number.
+fn begin(directory: &Path, latest: Option<Begun>) -> (PathBuf, io::Result<File>) {
+    let now = now_secs() as u64;
+    let first = match latest {
+        Some(latest) if latest.second >= now => Begun {
+            number: latest.number + 1,
+            ..latest
+        },
+        _ => Begun { second: now, number: 0 },
+    };
+    (first.number..first.number.saturating_add(1000))
+        .map(|number| directory.join(Begun { number, ..first }.name()))
+        .find_map(|path| match File::create_new(&path) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => None,
+            result => Some((path, result)),
+        })
+        .unwrap_or_else(|| (directory.to_owned(), Err(io::ErrorKind::AlreadyExists.into())))
+}
+
+/// When an event file of ours was begun; what its name says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Begun {
+    second: u64,
+    number: u32,
+}
+
+impl Begun {
+    fn name(self) -> String {
+        format!("{NAME}{}.skein.{:06}", self.second, self.number)
+    }
+
+    /// `None` of a file that is not ours.
+    fn of(name: &str) -> Option<Self> {
+        let (second, number) = name.strip_prefix(NAME)?.split_once(".skein.")?;
+        Some(Self {
+            second: second.parse().ok()?,
+            number: number.parse().ok()?,
         })
     }
+}
+
+/// Cuts our files in `directory` back to `files` and removes all others of ours. Returns when the latest of `files` was begun.
+fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, EventError> {
+    let at = |path: &Path| {
+        let path = path.to_owned();
+        move |source| EventError { path, source }
+    };
+    for entry in fs::read_dir(directory).map_err(at(directory))? {
+        let name = entry.map_err(at(directory))?.file_name();
+        let known = |file: &EventFile| name == file.name.as_str();
+        if name.to_str().and_then(Begun::of).is_some() && !files.iter().any(known) {
+            let path = directory.join(&name);
+            fs::remove_file(&path).map_err(at(&path))?;
+        }
+    }
+    for EventFile { name, bytes } in files {
+        let path = directory.join(name);
+        let found = fs::metadata(&path).map_or(0, |metadata| metadata.len());
+        if found < *bytes {
+            tracing::warn!(path = %path.display(), found, expected = bytes, "a part of an event file is lost: curves have a hole");
+        } else if found > *bytes {
+            let file = OpenOptions::new().write(true).open(&path).map_err(at(&path))?;
+            file.set_len(*bytes).map_err(at(&path))?;
+        }
+    }
+    Ok(files.iter().filter_map(|file| Begun::of(&file.name)).max())
 }
 
 fn now_secs() -> f64 {
@@ -103,12 +201,14 @@ fn now_secs() -> f64 {
         .map_or(0.0, |elapsed| elapsed.as_secs_f64())
 }
 
-fn write_record(into: &mut impl Write, message: &[u8]) -> io::Result<()> {
+/// Writes one record; returns its length.
+fn write_record(into: &mut impl Write, message: &[u8]) -> io::Result<u64> {
     let length = (message.len() as u64).to_le_bytes();
     into.write_all(&length)?;
     into.write_all(&masked_crc(&length).to_le_bytes())?;
     into.write_all(message)?;
-    into.write_all(&masked_crc(message).to_le_bytes())
+    into.write_all(&masked_crc(message).to_le_bytes())?;
+    Ok(8 + 4 + message.len() as u64 + 4)
 }
 
 fn masked_crc(bytes: &[u8]) -> u32 {
@@ -161,12 +261,13 @@ struct SessionLog {
 /// `SessionLog.SessionStatus.START`.
 const SESSION_START: i32 = 1;
 
+/// Reading back what was written.
 #[cfg(test)]
-mod tests {
+pub(super) mod testing {
     use super::*;
 
     /// Reads records back, checking every length and checksum.
-    fn read_records(mut bytes: &[u8]) -> Result<Vec<Event>, String> {
+    pub(in super::super::events) fn read_records(mut bytes: &[u8]) -> Result<Vec<Event>, String> {
         let mut events = Vec::new();
         while !bytes.is_empty() {
             let (length, rest) = bytes.split_first_chunk::<8>().ok_or("length cut short")?;
@@ -187,9 +288,36 @@ mod tests {
         Ok(events)
     }
 
+    /// Every point: its tag, its step, and the bits of its value.
+    pub(in super::super) fn points(bytes: &[u8]) -> Vec<(String, i64, u32)> {
+        let mut points = Vec::new();
+        for event in read_records(bytes).unwrap() {
+            if let Some(event::What::Summary(summary)) = event.what {
+                let bits = |value: &SummaryValue| value.simple_value.unwrap().to_bits();
+                points.extend(
+                    summary
+                        .value
+                        .iter()
+                        .map(|value| (value.tag.clone(), event.step, bits(value))),
+                );
+            }
+        }
+        points
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::testing::read_records;
+    use super::*;
+
+    fn create(directory: &Path, first_step: u64) -> EventWriter {
+        EventWriter::resume(directory, Vec::new(), first_step, &Disk::new(std::sync::Arc::default())).unwrap()
+    }
+
     fn sample_file(first_step: u64) -> Vec<u8> {
         let directory = tempfile::tempdir().unwrap();
-        let mut writer = EventWriter::create(directory.path(), first_step).unwrap();
+        let mut writer = create(directory.path(), first_step);
         writer
             .scalars(7, &[("flight/return", -1.5), ("flight/steps", 12.0)])
             .unwrap();
@@ -241,10 +369,31 @@ mod tests {
     }
 
     #[test]
-    fn two_writers_started_at_one_time_have_files_of_their_own() {
+    fn lengths_are_those_of_the_file() {
         let directory = tempfile::tempdir().unwrap();
-        let first = EventWriter::create(directory.path(), 0).unwrap();
-        let second = EventWriter::create(directory.path(), 0).unwrap();
-        assert_ne!(first.path, second.path);
+        let mut writer = create(directory.path(), 0);
+        writer.scalars(3, &[("a", 1.0), ("b", 2.0)]).unwrap();
+        writer.flush().unwrap();
+        let [file] = writer.files() else {
+            panic!("{:?}", writer.files())
+        };
+        assert_eq!(
+            file.bytes,
+            fs::metadata(directory.path().join(&file.name)).unwrap().len()
+        );
+    }
+
+    #[test]
+    fn a_later_life_has_a_file_of_a_later_name_even_when_the_clock_went_back() {
+        let directory = tempfile::tempdir().unwrap();
+        let ahead = format!("{NAME}99999999999.skein.000000");
+        fs::write(directory.path().join(&ahead), "0123456789").unwrap();
+        let known = vec![EventFile {
+            name: ahead.clone(),
+            bytes: 4,
+        }];
+        let writer = EventWriter::resume(directory.path(), known, 7, &Disk::new(std::sync::Arc::default())).unwrap();
+        assert!(writer.files()[1].name > ahead, "{:?}", writer.files());
+        assert_eq!(fs::read(directory.path().join(ahead)).unwrap(), b"0123");
     }
 }

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use skein_protocol::transition::Outcome;
 
+use crate::disk::{Disk, Patient};
 use crate::flight::CommittedFlight;
 
 /// A row of `flights.csv`; the fields are its columns.
@@ -56,7 +57,7 @@ impl From<&CommittedFlight> for FlightRow {
 #[derive(Debug)]
 pub struct FlightsCsv {
     path: PathBuf,
-    writer: csv::Writer<File>,
+    writer: csv::Writer<Patient<File>>,
 }
 
 /// Why `flights.csv` cannot be written or continued.
@@ -97,14 +98,14 @@ impl FlightsCsv {
     ///
     /// # Errors
     /// [`FlightsError::Io`].
-    pub fn create(path: &Path) -> Result<Self, FlightsError> {
+    pub fn create(path: &Path, disk: &Disk) -> Result<Self, FlightsError> {
         let file = File::create(path).map_err(|source| FlightsError::Io {
             path: path.to_owned(),
             source,
         })?;
         Ok(Self {
             path: path.to_owned(),
-            writer: csv::Writer::from_writer(file),
+            writer: csv::Writer::from_writer(disk.patient(path, file)),
         })
     }
 
@@ -112,9 +113,9 @@ impl FlightsCsv {
     ///
     /// # Errors
     /// [`FlightsError`] when the file does not hold flights 0 to `flights` - 1 in order.
-    pub fn resume(path: &Path, flights: u64) -> Result<Self, FlightsError> {
+    pub fn resume(path: &Path, flights: u64, disk: &Disk) -> Result<Self, FlightsError> {
         if flights == 0 {
-            return Self::create(path);
+            return Self::create(path, disk);
         }
         let io = |source| FlightsError::Io {
             path: path.to_owned(),
@@ -124,7 +125,9 @@ impl FlightsCsv {
         let end = end_of_rows(path, &file, flights)?;
         file.set_len(end).map_err(io)?;
         io::Seek::seek(&mut file, io::SeekFrom::End(0)).map_err(io)?;
-        let writer = csv::WriterBuilder::new().has_headers(false).from_writer(file);
+        let writer = csv::WriterBuilder::new()
+            .has_headers(false)
+            .from_writer(disk.patient(path, file));
         Ok(Self {
             path: path.to_owned(),
             writer,
@@ -189,6 +192,10 @@ mod tests {
     use super::*;
     use crate::flight::samples;
 
+    fn disk() -> Disk {
+        Disk::new(std::sync::Arc::default())
+    }
+
     fn row(number: u64) -> FlightRow {
         FlightRow::from(&samples::flight(number, 3, Outcome::ReachedEnd))
     }
@@ -202,7 +209,7 @@ mod tests {
     fn columns_are_those_documented() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("flights.csv");
-        write(&mut FlightsCsv::create(&path).unwrap(), 0..1);
+        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 0..1);
         assert_eq!(
             fs::read_to_string(&path).unwrap(),
             "flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n0,0,0,0,1,3,0,0.03,reached_end\n"
@@ -216,7 +223,7 @@ mod tests {
             prop_assume!(value.is_finite());
             let directory = tempfile::tempdir().unwrap();
             let path = directory.path().join("flights.csv");
-            let mut csv = FlightsCsv::create(&path).unwrap();
+            let mut csv = FlightsCsv::create(&path, &disk()).unwrap();
             csv.write(&FlightRow { total_reward: value, ..row(0) }).unwrap();
             csv.flush().unwrap();
             let read: FlightRow = csv::Reader::from_path(&path).unwrap().deserialize().next().unwrap().unwrap();
@@ -228,10 +235,13 @@ mod tests {
     fn a_resumed_file_is_that_of_a_run_never_interrupted() {
         let directory = tempfile::tempdir().unwrap();
         let (whole, resumed) = (directory.path().join("whole.csv"), directory.path().join("resumed.csv"));
-        write(&mut FlightsCsv::create(&whole).unwrap(), 0..30);
+        write(&mut FlightsCsv::create(&whole, &disk()).unwrap(), 0..30);
         for checkpoint in [0, 1, 20] {
-            write(&mut FlightsCsv::create(&resumed).unwrap(), 0..25);
-            write(&mut FlightsCsv::resume(&resumed, checkpoint).unwrap(), checkpoint..30);
+            write(&mut FlightsCsv::create(&resumed, &disk()).unwrap(), 0..25);
+            write(
+                &mut FlightsCsv::resume(&resumed, checkpoint, &disk()).unwrap(),
+                checkpoint..30,
+            );
             assert_eq!(
                 fs::read(&whole).unwrap(),
                 fs::read(&resumed).unwrap(),
@@ -244,10 +254,10 @@ mod tests {
     fn a_row_cut_short_behind_the_checkpoint_does_not_matter() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("flights.csv");
-        write(&mut FlightsCsv::create(&path).unwrap(), 0..5);
+        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 0..5);
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, &text[..text.len() - 7]).unwrap();
-        write(&mut FlightsCsv::resume(&path, 4).unwrap(), 4..5);
+        write(&mut FlightsCsv::resume(&path, 4, &disk()).unwrap(), 4..5);
         assert_eq!(fs::read_to_string(&path).unwrap(), text);
     }
 
@@ -255,14 +265,14 @@ mod tests {
     fn a_file_of_other_flights_is_not_continued() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("flights.csv");
-        write(&mut FlightsCsv::create(&path).unwrap(), 0..5);
-        let error = FlightsCsv::resume(&path, 6).unwrap_err().to_string();
+        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 0..5);
+        let error = FlightsCsv::resume(&path, 6, &disk()).unwrap_err().to_string();
         assert!(
             error.contains("flights.csv") && error.contains("ends after 5"),
             "{error}"
         );
-        write(&mut FlightsCsv::create(&path).unwrap(), 3..9);
-        let error = FlightsCsv::resume(&path, 2).unwrap_err().to_string();
+        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 3..9);
+        let error = FlightsCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
         assert!(error.contains("row 0 is flight 3"), "{error}");
     }
 }

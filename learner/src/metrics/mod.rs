@@ -8,12 +8,15 @@ mod flights;
 mod scalars;
 mod window;
 
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 use skein_protocol::run::RunDirectory;
 
+use crate::disk::Disk;
 use crate::flight::CommittedFlight;
 
-pub use events::{EventError, EventWriter};
+pub use events::{EventError, EventFile, EventWriter};
 pub use flights::{FlightRow, FlightsCsv, FlightsError};
 pub use scalars::Scalar;
 pub use window::MovingAverage;
@@ -37,9 +40,33 @@ impl Windows {
     }
 }
 
+/// How far the metrics of a run are; part of a checkpoint.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MetricsState {
+    /// Rows in `flights.csv`.
+    pub flights: u64,
+    /// Event files with their lengths.
+    pub events: Vec<EventFile>,
+    /// Averages over the latest flights.
+    pub windows: Windows,
+}
+
+impl MetricsState {
+    /// Of a new run, averaged over `window_flights` flights.
+    pub fn new(window_flights: usize) -> Self {
+        Self {
+            flights: 0,
+            events: Vec::new(),
+            windows: Windows::new(window_flights),
+        }
+    }
+}
+
 /// Writes all metrics of a training run.
 #[derive(Debug)]
 pub struct Metrics {
+    run: RunDirectory,
+    rows: u64,
     flights: FlightsCsv,
     events: EventWriter,
     windows: Windows,
@@ -57,24 +84,41 @@ pub enum MetricsError {
 }
 
 impl Metrics {
-    /// Begins the metrics of a new run, averaged over `window_flights` flights.
+    /// Continues where the metrics were in `state`. What was written since is dropped, so that nothing is told twice; of a new run that is everything.
     ///
     /// # Errors
-    /// [`MetricsError`] names the file.
-    pub fn create(run: &RunDirectory, window_flights: usize) -> Result<Self, MetricsError> {
-        Self::resume(run, 0, Windows::new(window_flights))
-    }
-
-    /// Continues after `flights` committed flights with the averages as they were then. What was written about later flights is dropped.
-    ///
-    /// # Errors
-    /// [`MetricsError`] names the file; `flights.csv` must hold those flights.
-    pub fn resume(run: &RunDirectory, flights: u64, windows: Windows) -> Result<Self, MetricsError> {
+    /// [`MetricsError`] names the file; `flights.csv` must hold the flights that `state` counts.
+    pub fn resume(run: &RunDirectory, state: MetricsState, disk: &Disk) -> Result<Self, MetricsError> {
+        let MetricsState {
+            flights,
+            events,
+            windows,
+        } = state;
         Ok(Self {
-            flights: FlightsCsv::resume(&run.flights_csv(), flights)?,
-            events: EventWriter::create(&run.tensorboard(), flights)?,
+            run: run.clone(),
+            rows: flights,
+            flights: FlightsCsv::resume(&run.flights_csv(), flights, disk)?,
+            events: EventWriter::resume(&run.tensorboard(), events, flights, disk)?,
             windows,
         })
+    }
+
+    /// How far the metrics are. It holds of the files once they are [flushed](Metrics::flush).
+    pub fn state(&self) -> MetricsState {
+        MetricsState {
+            flights: self.rows,
+            events: self.events.files().to_vec(),
+            windows: self.windows.clone(),
+        }
+    }
+
+    /// The files whose content a checkpoint of the [state](Metrics::state) counts on.
+    pub fn files(&self) -> Vec<PathBuf> {
+        let folder = self.run.tensorboard();
+        let events = self.events.files().iter().map(|file| folder.join(&file.name));
+        // One that was lost can no longer be counted on.
+        let events = events.filter(|path| path.exists());
+        std::iter::once(self.run.flights_csv()).chain(events).collect()
     }
 
     /// Takes in a committed training flight; called in flight order.
@@ -84,6 +128,7 @@ impl Metrics {
     pub fn flight(&mut self, flight: &CommittedFlight) -> Result<(), MetricsError> {
         let row = FlightRow::from(flight);
         self.flights.write(&row)?;
+        self.rows += 1;
         self.windows.total_reward.push(row.total_reward);
         self.windows.walls_passed.push(f32::from(row.walls_passed));
         let term = |index: usize| {
@@ -161,24 +206,76 @@ mod tests {
         metrics.flush().unwrap();
     }
 
+    fn metrics(run: &RunDirectory, state: MetricsState) -> Metrics {
+        Metrics::resume(run, state, &Disk::new(std::sync::Arc::default())).unwrap()
+    }
+
+    fn new() -> MetricsState {
+        MetricsState::new(5)
+    }
+
+    /// Every point of every curve, in order of tags and steps.
+    fn points(run: &RunDirectory) -> Vec<(String, i64, u32)> {
+        let mut points = Vec::new();
+        for entry in std::fs::read_dir(run.tensorboard()).unwrap() {
+            points.extend(events::testing::points(&std::fs::read(entry.unwrap().path()).unwrap()));
+        }
+        points.sort();
+        points
+    }
+
     #[test]
-    fn a_resumed_run_has_the_rows_and_averages_of_one_never_interrupted() {
+    fn a_resumed_run_has_the_rows_points_and_averages_of_one_never_interrupted() {
         let ((_whole, whole_run), (_resumed, resumed_run)) = (run(), run());
-        let mut whole = Metrics::create(&whole_run, 5).unwrap();
+        let mut whole = metrics(&whole_run, new());
         feed(&mut whole, 0..20);
 
-        let mut first = Metrics::create(&resumed_run, 5).unwrap();
+        let mut first = metrics(&resumed_run, new());
         feed(&mut first, 0..12);
-        let at_checkpoint = first.windows().clone();
+        let at_checkpoint = first.state();
         feed(&mut first, 12..17);
         drop(first);
-        let mut second = Metrics::resume(&resumed_run, 12, at_checkpoint).unwrap();
-        feed(&mut second, 12..20);
+        // A life that leaves no checkpoint leaves no point.
+        let mut lost = metrics(&resumed_run, at_checkpoint.clone());
+        feed(&mut lost, 12..19);
+        drop(lost);
+        let mut last = metrics(&resumed_run, at_checkpoint);
+        feed(&mut last, 12..20);
 
-        assert_eq!(second.windows(), whole.windows());
+        assert_eq!(last.windows(), whole.windows());
         assert_eq!(whole.windows().walls_passed.mean(), Some(9.0 / 5.0));
         let read = |run: &RunDirectory| std::fs::read_to_string(run.flights_csv()).unwrap();
         assert_eq!(read(&resumed_run), read(&whole_run));
         assert_eq!(read(&whole_run).lines().count(), 21);
+        assert_eq!(points(&resumed_run), points(&whole_run));
+        assert_eq!(last.files().len(), 3, "flights.csv, and two event files");
+    }
+
+    #[test]
+    fn a_life_that_died_before_its_first_checkpoint_leaves_nothing() {
+        let (_directory, run) = run();
+        feed(&mut metrics(&run, new()), 0..7);
+        std::fs::write(run.tensorboard().join("notes.txt"), "not ours").unwrap();
+        let mut anew = metrics(&run, new());
+        anew.flush().unwrap();
+        assert_eq!(std::fs::read_to_string(run.flights_csv()).unwrap(), "");
+        assert_eq!(
+            std::fs::read_dir(run.tensorboard()).unwrap().count(),
+            2,
+            "the new file, and what is not ours"
+        );
+    }
+
+    #[test]
+    fn a_lost_event_file_is_no_reason_not_to_train() {
+        let (_directory, run) = run();
+        let mut first = metrics(&run, new());
+        feed(&mut first, 0..3);
+        let state = first.state();
+        std::fs::remove_dir_all(run.tensorboard()).unwrap();
+        let mut second = metrics(&run, state);
+        feed(&mut second, 3..6);
+        assert_eq!(second.files().len(), 2);
+        assert_eq!(points(&run).len(), 3 * 9);
     }
 }

@@ -7,16 +7,14 @@ mod courses;
 mod evaluation;
 mod file;
 mod learning;
+mod portable;
 mod replay;
 mod run;
 mod sac;
 mod transport;
 mod vae;
 
-use std::path::PathBuf;
-
 use serde::{Deserialize, Serialize};
-use xxhash_rust::xxh3::xxh3_64;
 
 pub use courses::CoursesSection;
 pub use evaluation::EvaluationSection;
@@ -94,15 +92,6 @@ impl Config {
                 self.learning.warmup_steps
             ),
         )
-    }
-
-    /// Fingerprint of the configuration; processes of one run compare it. Of course files it sees the names only, so that a run's directory can be moved.
-    pub fn digest(&self) -> u64 {
-        let mut portable = self.clone();
-        for course in portable.courses.paths_mut() {
-            *course = course.file_name().map(PathBuf::from).unwrap_or_default();
-        }
-        xxh3_64(portable.to_toml().as_bytes())
     }
 }
 

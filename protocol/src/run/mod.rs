@@ -54,6 +54,8 @@ impl RunDirectory {
         logs => "logs",
         /// Locked by the learner while it lives, see [`LearnerSeat`].
         learner_lock => "learner.lock",
+        /// One row per start of the learner: life,unix_secs,flights it went on from.
+        lives_csv => "lives.csv",
         /// One row per committed training flight.
         flights_csv => "flights.csv",
         /// TensorBoard event files.

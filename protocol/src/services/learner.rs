@@ -162,7 +162,9 @@ impl LearnerPorts {
         *sample.user_header_mut() = snapshot.header(self.run, &self.layout);
         let sample = sample.write_from_slice(bytes);
         pass(FaultPoint::LearnerPublishing);
-        sample.send().map(drop).map_err(failed("weights", "sending"))
+        sample.send().map_err(failed("weights", "sending"))?;
+        pass(FaultPoint::LearnerPublished);
+        Ok(())
     }
 
     /// Wakes all actors that wait.

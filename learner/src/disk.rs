@@ -1,0 +1,209 @@
+//! A full disk pauses the learner and loses nothing.
+//!
+//! Whoever writes and finds no room warns, waits, and tries again until there is room or the run is told to stop; what was learned stays in memory
+//! meanwhile. Files that are written whole are written again ([`Disk::with_room`]); to those that are appended to, what is missing is appended
+//! ([`Patient`]), so that nothing is in them twice. Any other failure is for the caller.
+
+use std::error::Error;
+use std::io::{self, ErrorKind, Write};
+use std::iter::successors;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+/// Between two attempts to write.
+const PAUSE: Duration = Duration::from_secs(1);
+/// Between two warnings.
+const WARN_EVERY: Duration = Duration::from_secs(60);
+
+/// The disk, as those who write see it.
+#[derive(Debug, Clone)]
+pub struct Disk {
+    stop: Arc<AtomicBool>,
+    waiting: Arc<Mutex<Option<String>>>,
+    pause: Duration,
+}
+
+impl Disk {
+    /// The disk of a learner that `stop` tells to end; then nobody waits any more.
+    pub fn new(stop: Arc<AtomicBool>) -> Self {
+        Self {
+            stop,
+            waiting: Arc::default(),
+            pause: PAUSE,
+        }
+    }
+
+    /// What waits for room at the moment.
+    pub fn waiting(&self) -> Option<String> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Repeats `attempt`, which writes `path` anew each time, as long as it fails because the disk is full.
+    ///
+    /// # Errors
+    /// What it fails of otherwise; that the disk is full, once the run is told to stop.
+    pub fn with_room<T, E: Error + 'static>(
+        &self,
+        path: &Path,
+        mut attempt: impl FnMut() -> Result<T, E>,
+    ) -> Result<T, E> {
+        let mut wait = None;
+        loop {
+            match attempt() {
+                Err(error) if is_full(&error) && !self.stop.load(Ordering::Relaxed) => {
+                    wait.get_or_insert_with(|| Wait::of(self)).once_more(path, &error);
+                }
+                result => return result,
+            }
+        }
+    }
+
+    /// A writer to the file at `path` that waits for room.
+    pub fn patient<W: Write>(&self, path: &Path, inner: W) -> Patient<W> {
+        Patient {
+            disk: self.clone(),
+            path: path.to_owned(),
+            inner,
+        }
+    }
+}
+
+/// Whether `error`, or what caused it, is that there is no room.
+fn is_full(error: &(dyn Error + 'static)) -> bool {
+    successors(Some(error), |&error| error.source())
+        .filter_map(|error| error.downcast_ref::<io::Error>())
+        .any(|error| matches!(error.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded))
+}
+
+/// Somebody who waits for room.
+struct Wait<'a> {
+    disk: &'a Disk,
+    warned: Option<Instant>,
+}
+
+impl<'a> Wait<'a> {
+    fn of(disk: &'a Disk) -> Self {
+        Self { disk, warned: None }
+    }
+
+    fn once_more(&mut self, path: &Path, error: &dyn Error) {
+        if self.warned.is_none_or(|warned| warned.elapsed() >= WARN_EVERY) {
+            self.warned = Some(Instant::now());
+            tracing::warn!(path = %path.display(), %error, "the disk is full; training waits for room");
+        }
+        let text = format!("waits for room on the disk to write {}", path.display());
+        *self.disk.waiting.lock().unwrap_or_else(PoisonError::into_inner) = Some(text);
+        thread::sleep(self.disk.pause);
+    }
+}
+
+impl Drop for Wait<'_> {
+    fn drop(&mut self) {
+        // Another one who waits says so again within a pause.
+        *self.disk.waiting.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+}
+
+/// Writes what there is room for, and waits for the rest: see [`Disk::patient`].
+#[derive(Debug)]
+pub struct Patient<W> {
+    disk: Disk,
+    path: PathBuf,
+    inner: W,
+}
+
+impl<W: Write> Write for Patient<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let Self { disk, path, inner } = self;
+        // The system says no room only when it took nothing of these bytes.
+        disk.with_room(path, || inner.write(bytes))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        let Self { disk, path, inner } = self;
+        disk.with_room(path, || inner.flush())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A disk that has room again after so many attempts.
+    struct Small {
+        written: Vec<u8>,
+        refusals: usize,
+    }
+
+    impl Write for Small {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            if self.written.len() >= 5 && self.refusals > 0 {
+                self.refusals -= 1;
+                return Err(ErrorKind::StorageFull.into());
+            }
+            // Never all at once, as a disk that is nearly full.
+            let taken = bytes.len().min(3);
+            self.written.extend_from_slice(&bytes[..taken]);
+            Ok(taken)
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    fn disk() -> Disk {
+        Disk {
+            pause: Duration::from_millis(1),
+            ..Disk::new(Arc::default())
+        }
+    }
+
+    #[test]
+    fn what_waited_for_room_is_written_once() {
+        let disk = disk();
+        let small = Small {
+            written: Vec::new(),
+            refusals: 4,
+        };
+        let mut writer = io::BufWriter::with_capacity(4, disk.patient(Path::new("flights.csv"), small));
+        for text in ["one,", "two,", "three,", "four"] {
+            writer.write_all(text.as_bytes()).unwrap();
+        }
+        writer.flush().unwrap();
+        assert_eq!(writer.get_ref().inner.written, b"one,two,three,four");
+        assert_eq!(writer.get_ref().inner.refusals, 0, "there was always room");
+        assert_eq!(disk.waiting(), None);
+    }
+
+    #[test]
+    fn whoever_waits_says_for_what_until_told_to_stop() {
+        let disk = disk();
+        let for_thread = disk.clone();
+        let waiting = thread::spawn(move || {
+            for_thread.with_room(Path::new("/somewhere/flight-3"), || {
+                Err::<(), _>(io::Error::from(ErrorKind::QuotaExceeded))
+            })
+        });
+        let end = Instant::now() + Duration::from_secs(10);
+        while disk.waiting().is_none() && Instant::now() < end {
+            thread::sleep(Duration::from_millis(1));
+        }
+        assert!(disk.waiting().unwrap().contains("/somewhere/flight-3"));
+        disk.stop.store(true, Ordering::Relaxed);
+        assert_eq!(waiting.join().unwrap().unwrap_err().kind(), ErrorKind::QuotaExceeded);
+    }
+
+    #[test]
+    fn other_failures_are_not_waited_for() {
+        let mut attempts = 0;
+        let error = disk().with_room(Path::new("x"), || {
+            attempts += 1;
+            Err::<(), _>(io::Error::from(ErrorKind::PermissionDenied))
+        });
+        assert_eq!((error.unwrap_err().kind(), attempts), (ErrorKind::PermissionDenied, 1));
+    }
+}

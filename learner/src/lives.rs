@@ -1,0 +1,43 @@
+//! `lives.csv`: when the learner of a run was started, and from where it went on.
+
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+use std::{fs, io};
+
+use skein_protocol::durable;
+
+/// Notes that a learner begins to live, with the state after `flights` flights; returns how many lives there were before.
+///
+/// # Errors
+/// Of the file system.
+pub fn begin_life(path: &Path, flights: u64) -> io::Result<u64> {
+    let mut text = match fs::read_to_string(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => "life,unix_secs,flights\n".to_owned(),
+        text => text?,
+    };
+    let earlier = text.lines().skip(1).count() as u64;
+    let now = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .map_or(0, |elapsed| elapsed.as_secs());
+    text.push_str(&format!("{earlier},{now},{flights}\n"));
+    durable::replace(path, text.as_bytes())?;
+    Ok(earlier)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_life_has_a_row() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("lives.csv");
+        assert_eq!(begin_life(&path, 0).unwrap(), 0);
+        assert_eq!(begin_life(&path, 0).unwrap(), 1);
+        assert_eq!(begin_life(&path, 500).unwrap(), 2);
+        let text = fs::read_to_string(path).unwrap();
+        let rows: Vec<_> = text.lines().collect();
+        assert_eq!(rows.len(), 4);
+        assert!(rows[3].starts_with("2,") && rows[3].ends_with(",500"), "{text}");
+    }
+}

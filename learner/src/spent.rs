@@ -1,0 +1,39 @@
+//! What a run has cost: time by what it was spent on, and what was lost on the way.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::Ordering;
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+
+use crate::flights::reception::Shared;
+
+/// Time and losses, over all lives of the learner as far as checkpoints tell: what a death undid is not in it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Spent {
+    /// Seconds from the learner's start to its end.
+    pub wall_secs: f64,
+    /// Seconds of the training thread by what it did.
+    pub phase_secs: BTreeMap<String, f64>,
+    /// Tickets issued again.
+    pub tickets_reissued: u64,
+    /// Records refused.
+    pub records_refused: u64,
+}
+
+impl Spent {
+    /// Adds the time since `started` to `phase`.
+    pub fn add(&mut self, phase: &'static str, started: Instant) {
+        *self.phase_secs.entry(phase.to_owned()).or_default() += started.elapsed().as_secs_f64();
+    }
+
+    /// With what the present life, begun at `started`, has come to. Its phases are in already.
+    pub fn with_this_life(&self, started: Instant, shared: &Shared) -> Self {
+        Self {
+            wall_secs: self.wall_secs + started.elapsed().as_secs_f64(),
+            phase_secs: self.phase_secs.clone(),
+            tickets_reissued: self.tickets_reissued + shared.reissued.load(Ordering::Relaxed),
+            records_refused: self.records_refused + shared.refused.load(Ordering::Relaxed),
+        }
+    }
+}

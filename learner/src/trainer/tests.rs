@@ -1,0 +1,127 @@
+//! A trainer restored from a checkpoint goes on bit for bit.
+
+use skein_protocol::transition::Outcome;
+
+use super::*;
+use crate::checkpoint::{CheckpointState, CheckpointStore};
+use crate::flight::samples::{flight, with_images};
+
+/// Flights of an epoch, each of 10 steps.
+const FLIGHTS: u64 = 2;
+/// Steps of an epoch.
+const STEPS: usize = 20;
+
+/// The VAE is trained in the first three epochs, the policy from the second one on.
+fn config() -> Config {
+    let mut config = Config::default();
+    config.run.learner_threads = 1;
+    config.learning.warmup_steps = STEPS + 1;
+    config.learning.updates_per_step = 0.25;
+    config.learning.flights_per_epoch = FLIGHTS;
+    config.sac.hidden_width = 16;
+    config.sac.batch_size = 8;
+    config.vae.train_steps = 3 * STEPS;
+    config.vae.updates_per_step = 0.1;
+    config.vae.batch_size = 2;
+    config.replay.capacity = 70;
+    config
+}
+
+/// One epoch as the training loop does it. With a lag, `keep` is what was needed when its flights were ordered.
+fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
+    for number in epoch * FLIGHTS..(epoch + 1) * FLIGHTS {
+        let mut flown = flight(number, STEPS / FLIGHTS as usize, Outcome::Collided);
+        flown.level_up[4] = true;
+        // Rewards that a critic of such few updates does not run away from.
+        flown.rewards.iter_mut().for_each(|reward| *reward = reward.sin());
+        if keep == Keep::Depth {
+            flown = with_images(flown);
+        }
+        trainer.take_in(flown).unwrap();
+    }
+    trainer.train_vae(Epoch(epoch), |_| Ok::<_, UpdateError>(())).unwrap();
+    trainer
+        .train_policy(Epoch(epoch), |_| Ok::<_, UpdateError>(()))
+        .unwrap();
+}
+
+fn state(trainer: &Trainer, epochs: u64) -> CheckpointState {
+    CheckpointState {
+        progress: Progress {
+            flights: epochs * FLIGHTS,
+            epochs,
+            environment_steps: trainer.steps(),
+            vae_steps: trainer.vae_updates(),
+            sac_updates: trainer.updates(),
+            ..Progress::start(5)
+        },
+        tensors: trainer.tensors(),
+        replay: trainer.replay().state(),
+        snapshots: vec![trainer.snapshot(PolicyVersion(epochs))],
+    }
+}
+
+/// Stored to disk, and taken over by a trainer that knows nothing.
+fn resumed(trainer: &Trainer, epochs: u64) -> Trainer {
+    let directory = tempfile::tempdir().unwrap();
+    let store = CheckpointStore::new(directory.path(), &config());
+    store.save(&state(trainer, epochs), &[]).unwrap();
+    let stored = store.load_newest().unwrap().unwrap();
+    let mut resumed = Trainer::new(&config()).unwrap();
+    resumed
+        .restore(&stored.progress, &stored.tensors, stored.replay)
+        .unwrap();
+    assert_eq!(resumed.snapshot(PolicyVersion(epochs)), stored.snapshots[0]);
+    resumed
+}
+
+/// Six epochs, resumed after each of `resumed_after`.
+fn train(lag: u64, resumed_after: &[u64]) -> CheckpointState {
+    let mut trainer = Trainer::new(&config()).unwrap();
+    // What was needed of the flights of the first epochs, when they were ordered.
+    let mut keep = vec![trainer.keep(); lag as usize];
+    for epoch in 0..6 {
+        keep.push(trainer.keep());
+        learn(&mut trainer, epoch, keep[epoch as usize]);
+        if resumed_after.contains(&(epoch + 1)) {
+            trainer = resumed(&trainer, epoch + 1);
+        }
+    }
+    state(&trainer, 6)
+}
+
+#[test]
+fn a_resumed_trainer_goes_on_bit_for_bit_whenever_it_is_resumed() {
+    for lag in [0, 1] {
+        let undisturbed = train(lag, &[]);
+        assert!(undisturbed.progress.vae_steps > 3 && undisturbed.progress.sac_updates > 10);
+        assert!(undisturbed.replay.images.is_none(), "the VAE was never frozen");
+        // While the VAE is trained, as it is frozen, after; and at all of these.
+        for after in [&[1][..], &[2], &[3], &[4], &[1, 2, 3, 4, 5]] {
+            let resumed = train(lag, after);
+            assert_eq!(resumed, undisturbed, "lag {lag}, resumed after {after:?}");
+        }
+    }
+}
+
+#[test]
+fn a_state_that_lacks_a_tensor_or_miscounts_is_refused_by_name() {
+    let mut trainer = Trainer::new(&config()).unwrap();
+    learn(&mut trainer, 0, Keep::Depth);
+    let refusal = |damage: fn(&mut CheckpointState)| {
+        let mut state = state(&trainer, 1);
+        damage(&mut state);
+        let mut other = Trainer::new(&config()).unwrap();
+        let restored = other.restore(&state.progress, &state.tensors, state.replay);
+        restored.unwrap_err().to_string()
+    };
+    let missing = refusal(|state| state.tensors.retain(|tensor| tensor.name != "sac.target.parameters"));
+    assert!(missing.contains("sac.target.parameters"), "{missing}");
+    let miscounted = refusal(|state| state.progress.vae_steps += 1);
+    assert!(
+        miscounted.contains("VAE steps are 2, but its counters say 3"),
+        "{miscounted}"
+    );
+    let images = refusal(|state| _ = state.replay.images.as_mut().unwrap().pop());
+    assert!(images.contains("depth images"), "{images}");
+}

@@ -1,0 +1,123 @@
+//! Evaluation flights in a run: those that confirm a candidate for the best snapshot, and those that show in the end what it can do.
+
+use std::ops::Range;
+use std::time::Instant;
+
+use skein_protocol::fault::{FaultPoint, pass};
+use skein_protocol::ids::{Epoch, PolicyVersion};
+use skein_protocol::progress::Phase;
+
+use super::{Training, TrainingError};
+use crate::best::{is_better, is_candidate};
+use crate::checkpoint::BestSnapshot;
+use crate::curriculum;
+use crate::evaluation;
+use crate::flight::CommittedFlight;
+use crate::flights::assembly::Keep;
+use crate::metrics::Scalar;
+
+impl Training<'_> {
+    /// Confirms the newest snapshot by evaluation flights if it is a candidate; keeps it if it is the best. The last one always is a candidate.
+    ///
+    /// It depends on the state alone and does nothing the second time: a run that was stopped here looks again when it is resumed.
+    pub(super) fn look_for_best(&mut self) -> Result<(), TrainingError> {
+        if !self.is_candidate() {
+            return Ok(());
+        }
+        let version = self.progress.version();
+        let flown = self.evaluate(version, 0..1, self.config.evaluation.confirm_flights, Keep::Latents)?;
+        pass(FaultPoint::LearnerCandidateFlown);
+        let passed: f64 = flown.iter().map(|flight| f64::from(flight.walls_passed)).sum();
+        let candidate = BestSnapshot {
+            policy_version: version.0,
+            flights: self.progress.flights,
+            window_walls_passed: self.metrics.windows().walls_passed.mean().unwrap_or_default(),
+            confirmed_walls_passed: passed / flown.len() as f64,
+        };
+        self.metrics.scalars(
+            self.last_flight(),
+            &[(Scalar::EvaluationWallsPassed, candidate.confirmed_walls_passed)],
+        )?;
+        let best = self.progress.best.as_ref();
+        tracing::info!(
+            version = candidate.policy_version,
+            flights = candidate.flights,
+            walls_passed = candidate.confirmed_walls_passed,
+            window_walls_passed = candidate.window_walls_passed,
+            best_version = best.map(|best| best.policy_version),
+            best_walls_passed = best.map(|best| best.confirmed_walls_passed),
+            "candidate for the best snapshot flown"
+        );
+        self.progress.latest_candidate = Some(self.progress.flights);
+        if is_better(&candidate, best) {
+            self.progress.best = Some(candidate);
+            self.save_snapshot(version, &self.directory.best_snapshot())?;
+            pass(FaultPoint::LearnerBestSaved);
+        }
+        Ok(())
+    }
+
+    fn is_candidate(&self) -> bool {
+        let progress = &self.progress;
+        let last = progress.flights == self.config.run.flights && progress.latest_candidate != Some(progress.flights);
+        last || is_candidate(
+            &self.config.evaluation,
+            progress.flights,
+            progress.latest_candidate,
+            &self.metrics.windows().walls_passed,
+            progress.best.as_ref(),
+        )
+    }
+
+    /// Flies `flights` evaluation flights on each of `courses` with a published snapshot.
+    fn evaluate(
+        &mut self,
+        version: PolicyVersion,
+        courses: Range<u32>,
+        flights: u64,
+        keep: Keep,
+    ) -> Result<Vec<CommittedFlight>, TrainingError> {
+        let started = Instant::now();
+        let (run, number) = (self.identity.run, self.progress.evaluations);
+        let tickets = curriculum::evaluation(self.config, run, number, version, courses, flights);
+        let total = tickets.len() as u64;
+        self.reporter.update(|progress| {
+            progress.phase = Phase::Evaluating;
+            progress.evaluation_flights = (0, total);
+        });
+        let mut batch = self.reception.fly(Epoch(self.progress.epochs), keep, tickets)?;
+        let mut flown = Vec::with_capacity(batch.remaining());
+        while let Some(flight) = batch.next(self.stop)? {
+            self.reporter.update(|progress| progress.evaluation_flights.0 += 1);
+            flown.push(flight);
+        }
+        self.progress.evaluations += 1;
+        self.progress.evaluation_flights += total;
+        self.progress.spent.add("evaluation", started);
+        Ok(flown)
+    }
+
+    /// Evaluates the best snapshot on all courses and writes what came of it.
+    pub(super) fn evaluate_best(&mut self) -> Result<(), TrainingError> {
+        // The last snapshot was a candidate, and the first candidate is the best: there is one.
+        let Some(version) = self
+            .progress
+            .best
+            .as_ref()
+            .map(|best| PolicyVersion(best.policy_version))
+        else {
+            return Ok(());
+        };
+        let best = self.kept_snapshot(version)?;
+        let sha256 = best.sha256();
+        self.reception.publish(best)?;
+        let courses = self.config.courses.evaluation.len() as u32;
+        let flown = self.evaluate(version, 0..courses, self.config.evaluation.flights, Keep::Latents)?;
+        let pictured = self.evaluate(version, 0..1, 1, Keep::Depth)?;
+        pass(FaultPoint::LearnerEvaluated);
+        Ok(self.disk.with_room(self.directory.root(), || {
+            evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;
+            evaluation::write_reconstructions(self.directory, &self.trainer, &pictured)
+        })?)
+    }
+}

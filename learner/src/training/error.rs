@@ -1,0 +1,94 @@
+//! Why a training ends before its time.
+
+use std::io;
+use std::path::PathBuf;
+
+use skein_protocol::snapshot::SnapshotError;
+
+use crate::UpdateError;
+use crate::checkpoint::CheckpointError;
+use crate::device::DeviceError;
+use crate::evaluation::EvaluationError;
+use crate::flights::reception::ReceptionError;
+use crate::metrics::MetricsError;
+use crate::replay::InsertError;
+use crate::trainer::TrainerRestoreError;
+
+/// Why a training ended before its time.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // every variant is the error of the part it is named after
+pub enum TrainingError {
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    #[error(transparent)]
+    Reception(#[from] ReceptionError),
+    #[error(transparent)]
+    Insert(#[from] InsertError),
+    #[error(transparent)]
+    Update(#[from] UpdateError),
+    #[error(transparent)]
+    Metrics(#[from] MetricsError),
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    #[error(transparent)]
+    Snapshot(#[from] SnapshotError),
+    #[error(transparent)]
+    Evaluation(#[from] EvaluationError),
+    #[error("cannot start a thread: {0}")]
+    Thread(#[source] io::Error),
+    #[error("{}: {source}", path.display())]
+    File {
+        path: PathBuf,
+        #[source]
+        source: io::Error,
+    },
+    /// A checkpoint is undamaged, and still makes no sense.
+    #[error("the checkpoint of flight {flights} cannot be resumed: {source}")]
+    Restore {
+        flights: u64,
+        #[source]
+        source: TrainerRestoreError,
+    },
+    /// A checkpoint lacks what it should hold.
+    #[error("the checkpoint of flight {flights} cannot be resumed: its snapshot {version} {problem}")]
+    RestoredSnapshot {
+        flights: u64,
+        version: u64,
+        problem: &'static str,
+    },
+    /// It was told to stop and did not wait for the end of an epoch's updates.
+    #[error("stopped amid the updates of an epoch")]
+    Abandoned,
+}
+
+impl TrainingError {
+    /// Whether a new life of the learner may get further: the transport failed, and nothing that was computed is at fault. Anything else would come again.
+    pub fn is_of_the_transport(&self) -> bool {
+        matches!(self, Self::Reception(ReceptionError::Transport(_)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use skein_protocol::ids::FlightId;
+
+    use super::*;
+    use crate::flights::desk::HopelessFlight;
+
+    #[test]
+    fn only_a_failed_transport_is_worth_another_life() {
+        let hopeless = HopelessFlight {
+            flight: FlightId(3),
+            failures: 3,
+            why: "the simulator broke down".to_owned(),
+        };
+        let error = |error: ReceptionError| TrainingError::from(error);
+        assert!(error(ReceptionError::Transport("no memory".to_owned())).is_of_the_transport());
+        assert!(!error(hopeless.into()).is_of_the_transport());
+        let diverged = UpdateError::NonFinite {
+            tensor: "critic loss",
+            update: 7,
+        };
+        assert!(!TrainingError::from(diverged).is_of_the_transport());
+    }
+}

@@ -1,0 +1,326 @@
+//! How a run outlives its learner: what goes into a checkpoint, how a learner goes on from one, and how it ends.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+use std::{fs, io};
+
+use skein_protocol::config::Config;
+use skein_protocol::fault::{FaultPoint, pass};
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::progress::{self, Phase};
+use skein_protocol::run::{Life, RunDirectory, RunIdentity};
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::summary::{Ending, Summary};
+
+use super::{StopWatch, Training, TrainingError};
+use crate::checkpoint::{CheckpointState, CheckpointStore, CheckpointWriter, Progress};
+use crate::disk::Disk;
+use crate::flights::reception::Reception;
+use crate::lives::begin_life;
+use crate::metrics::Metrics;
+use crate::report::Reporter;
+use crate::trainer::Trainer;
+
+impl<'a> Training<'a> {
+    /// A training at its newest undamaged checkpoint, or at its start if it has none. The flights that were in the air are ordered again.
+    pub(super) fn begin(
+        directory: &'a RunDirectory,
+        identity: &'a RunIdentity,
+        life: Life,
+        config: &'a Config,
+        stop: &'a Arc<AtomicBool>,
+    ) -> Result<Self, TrainingError> {
+        let started = Instant::now();
+        let disk = Disk::new(stop.clone());
+        let mut trainer = Trainer::new(config)?;
+        let store = CheckpointStore::new(&directory.checkpoints(), config);
+        let (saved, snapshots) = match store.load_newest()? {
+            Some(checkpoint) => restore(&mut trainer, checkpoint)?,
+            // A life that died before its first checkpoint may have left files: they are dropped as if they came after flight 0.
+            None => (start(config, &trainer), BTreeMap::new()),
+        };
+        let lives = directory.lives_csv();
+        let resumes = disk
+            .with_room(&lives, || begin_life(&lives, saved.flights))
+            .map_err(file_error(&lives))?;
+        let metrics = Metrics::resume(directory, saved.metrics.clone(), &disk)?;
+        let reception = Reception::start(identity, life, config)?;
+        let first_line = first_line(config, &saved);
+        let mut training = Self {
+            config,
+            identity,
+            directory,
+            stop,
+            stop_watch: StopWatch::of(stop),
+            layout: SnapshotLayout::of(config),
+            trainer,
+            reporter: Reporter::start(first_line, reception.shared(), disk.clone()).map_err(TrainingError::Thread)?,
+            reception,
+            metrics,
+            checkpoints: CheckpointWriter::start(store, disk.clone())?,
+            disk,
+            started,
+            epoch_started: started,
+            progress: saved.clone(),
+            saved,
+            resumes,
+            in_the_air: VecDeque::new(),
+            snapshots,
+        };
+        training.remove_later_results()?;
+        training.take_up()?;
+        Ok(training)
+    }
+
+    /// Publishes what was published and orders what was ordered when the checkpoint was taken.
+    fn take_up(&mut self) -> Result<(), TrainingError> {
+        let orders = std::mem::take(&mut self.progress.in_the_air);
+        if let Some(flights) = (self.progress.epochs > 0).then_some(self.progress.flights) {
+            tracing::info!(
+                flights,
+                epochs = self.progress.epochs,
+                resumes = self.resumes,
+                "resumed from a checkpoint"
+            );
+        }
+        // The present one comes last, so that it is the newest for whoever attaches now.
+        for order in &orders {
+            let version = PolicyVersion(order.policy_version);
+            if version < self.progress.version() {
+                let snapshot = self.kept_snapshot(version)?;
+                self.reception.publish(snapshot)?;
+            }
+        }
+        for order in orders {
+            self.order(order)?;
+        }
+        self.publish()
+    }
+
+    /// Takes back what an earlier life has written since the checkpoint: it was of a future that is to be flown again.
+    fn remove_later_results(&mut self) -> Result<(), TrainingError> {
+        let best = self
+            .progress
+            .best
+            .as_ref()
+            .map(|best| PolicyVersion(best.policy_version));
+        let latest = (self.progress.epochs > 0).then_some(self.progress.version());
+        for (version, path) in [
+            (best, self.directory.best_snapshot()),
+            (latest, self.directory.latest_snapshot()),
+            (None, self.directory.summary_json()),
+        ] {
+            match version {
+                Some(version) => self.save_snapshot(version, &path)?,
+                None => remove(&path).map_err(file_error(&path))?,
+            }
+        }
+        Ok(())
+    }
+
+    /// A snapshot that is kept.
+    pub(super) fn kept_snapshot(&self, version: PolicyVersion) -> Result<Snapshot, TrainingError> {
+        let missing = || TrainingError::RestoredSnapshot {
+            flights: self.saved.flights,
+            version: version.0,
+            problem: "is missing",
+        };
+        self.snapshots.get(&version).cloned().ok_or_else(missing)
+    }
+
+    /// Writes a snapshot that is kept to a file.
+    pub(super) fn save_snapshot(&self, version: PolicyVersion, path: &Path) -> Result<(), TrainingError> {
+        let snapshot = self.kept_snapshot(version)?;
+        Ok(self
+            .disk
+            .with_room(path, || snapshot.save(path, &self.layout, self.config))?)
+    }
+
+    pub(super) fn checkpoint_if_due(&mut self) -> Result<(), TrainingError> {
+        if self.progress.flights - self.saved.flights >= self.config.checkpoints.every_flights {
+            self.checkpoint()?;
+        }
+        Ok(())
+    }
+
+    /// Hands the state to the writing thread, unless it is that of the newest checkpoint; and keeps the newest snapshot as a file.
+    ///
+    /// Only between epochs: then the state follows from the epochs done, whether a candidate was looked at, and what had been ordered earlier.
+    pub(super) fn checkpoint(&mut self) -> Result<(), TrainingError> {
+        let (now, saved) = (&self.progress, &self.saved);
+        if (now.epochs, now.latest_candidate) == (saved.epochs, saved.latest_candidate) {
+            return Ok(());
+        }
+        let started = Instant::now();
+        self.metrics.flush()?;
+        self.save_snapshot(self.progress.version(), &self.directory.latest_snapshot())?;
+        let progress = self.counted();
+        let state = CheckpointState {
+            progress: progress.clone(),
+            tensors: self.trainer.tensors(),
+            replay: self.trainer.replay().state(),
+            snapshots: self.snapshots.values().cloned().collect(),
+        };
+        self.checkpoints.save(state, self.metrics.files())?;
+        self.saved = progress;
+        self.progress.spent.add("checkpoint", started);
+        Ok(())
+    }
+
+    /// The progress with everything that others count.
+    fn counted(&self) -> Progress {
+        let newest = self.snapshots.get(&self.progress.version());
+        Progress {
+            policy_sha256: newest.map(Snapshot::sha256).unwrap_or_default(),
+            environment_steps: self.trainer.steps(),
+            vae_steps: self.trainer.vae_updates(),
+            sac_updates: self.trainer.updates(),
+            in_the_air: self.in_the_air.iter().map(|epoch| epoch.order).collect(),
+            metrics: self.metrics.state(),
+            spent: self
+                .progress
+                .spent
+                .with_this_life(self.started, &self.reception.shared()),
+            ..self.progress.clone()
+        }
+    }
+
+    /// Has everything saved; returns how far the run is.
+    pub(super) fn save(&mut self) -> Result<Progress, TrainingError> {
+        self.reporter.update(|progress| progress.phase = Phase::Finishing);
+        self.metrics.flush()?;
+        self.checkpoint()?;
+        Ok(self.counted())
+    }
+
+    /// Gives up the updates of an epoch half done: the files tell what the next life will go on from. Returns how far that is.
+    pub(super) fn go_back(&mut self) -> Result<Progress, TrainingError> {
+        tracing::warn!(
+            flights = self.progress.flights,
+            checkpoint = self.saved.flights,
+            "told to stop, and an epoch's updates take too long: back to the newest checkpoint"
+        );
+        self.reporter.update(|progress| progress.phase = Phase::Finishing);
+        // What is flushed now cannot follow what is cut.
+        self.metrics.flush()?;
+        self.metrics = Metrics::resume(self.directory, self.saved.metrics.clone(), &self.disk)?;
+        self.metrics.flush()?;
+        Ok(self.saved.clone())
+    }
+
+    /// Finishes the checkpoint being written, lets the actors go, and sums up how the run ended and how far it came.
+    pub(super) fn conclude(self, end: Result<(Ending, Progress), TrainingError>) -> Result<Summary, TrainingError> {
+        let written = self.checkpoints.finish();
+        self.reception.finish();
+        let (ending, progress) = match (end, written) {
+            (Ok(end), Ok(())) => end,
+            (Ok(_), Err(error)) => return Err(error.into()),
+            (Err(error), written) => {
+                if let Err(error) = written {
+                    tracing::error!(%error, "the last checkpoint was not written");
+                }
+                return Err(error);
+            }
+        };
+        pass(FaultPoint::LearnerBeforeSummary);
+        let summary = summary(self.identity, self.config, ending, &progress, self.resumes);
+        let path = self.directory.summary_json();
+        self.disk
+            .with_room(&path, || summary.save(&path))
+            .map_err(file_error(&path))?;
+        Ok(summary)
+    }
+}
+
+/// A run that has not begun.
+fn start(config: &Config, trainer: &Trainer) -> Progress {
+    Progress {
+        policy_sha256: trainer.snapshot(PolicyVersion(0)).sha256(),
+        ..Progress::start(config.evaluation.window_flights as usize)
+    }
+}
+
+/// Takes a checkpoint's state over into `trainer`; what remains of it is returned.
+fn restore(
+    trainer: &mut Trainer,
+    checkpoint: CheckpointState,
+) -> Result<(Progress, BTreeMap<PolicyVersion, Snapshot>), TrainingError> {
+    let CheckpointState {
+        progress,
+        tensors,
+        replay,
+        snapshots,
+    } = checkpoint;
+    let flights = progress.flights;
+    trainer
+        .restore(&progress, &tensors, replay)
+        .map_err(|source| TrainingError::Restore { flights, source })?;
+    let version = progress.version();
+    // The parameters are there twice, in the tensors and in the snapshot: a restored trainer that would publish another snapshot is not the one stored.
+    if trainer.snapshot(version).sha256() != progress.policy_sha256 {
+        return Err(TrainingError::RestoredSnapshot {
+            flights,
+            version: version.0,
+            problem: "is not that of its tensors",
+        });
+    }
+    let snapshots = snapshots
+        .into_iter()
+        .map(|snapshot| (snapshot.version, snapshot))
+        .collect();
+    Ok((progress, snapshots))
+}
+
+/// What is reported before anything has happened in this life.
+fn first_line(config: &Config, saved: &Progress) -> progress::Progress {
+    let windows = &saved.metrics.windows;
+    progress::Progress {
+        flights: saved.flights,
+        steps: saved.environment_steps,
+        updates: saved.sac_updates,
+        vae_updates: saved.vae_steps,
+        walls_passed: windows.walls_passed.mean(),
+        mean_return: windows.total_reward.mean(),
+        elapsed_secs: saved.spent.wall_secs,
+        ..progress::Progress::start(config.run.flights)
+    }
+}
+
+fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &Progress, resumes: u64) -> Summary {
+    let best = progress.best.as_ref();
+    Summary {
+        skein_version: env!("CARGO_PKG_VERSION").to_owned(),
+        run: identity.run,
+        seed: config.run.seed,
+        ending,
+        policy_sha256: progress.policy_sha256.clone(),
+        final_version: progress.version(),
+        best_version: best.map(|best| PolicyVersion(best.policy_version)),
+        best_confirmed_walls_passed: best.map(|best| best.confirmed_walls_passed),
+        flights: progress.flights,
+        steps: progress.environment_steps,
+        updates: progress.sac_updates,
+        vae_updates: progress.vae_steps,
+        evaluation_flights: progress.evaluation_flights,
+        tickets_reissued: progress.spent.tickets_reissued,
+        records_refused: progress.spent.records_refused,
+        resumes,
+        wall_secs: progress.spent.wall_secs,
+        phase_secs: progress.spent.phase_secs.clone(),
+    }
+}
+
+fn remove(path: &Path) -> io::Result<()> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        result => result,
+    }
+}
+
+fn file_error(path: &Path) -> impl FnOnce(io::Error) -> TrainingError {
+    let path = path.to_owned();
+    move |source| TrainingError::File { path, source }
+}
