@@ -8,8 +8,11 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use clap::error::ErrorKind;
 use clap::{Args, CommandFactory, Parser, Subcommand};
+use rustix::fs::Mode;
+use rustix::process::umask;
 use skein_launch::conclusion::conclusion;
 use skein_launch::display::Display;
+use skein_launch::prepare::room::{check_shared_memory_for_more, scarce_disk};
 use skein_launch::prepare::{Prepared, ideal_walls_passed, load_courses, prepare};
 use skein_launch::reports;
 use skein_launch::resume::resume;
@@ -121,6 +124,8 @@ fn main() -> ExitCode {
 }
 
 fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
+    // Whatever the processes of a run write is their user's alone.
+    umask(Mode::RWXG | Mode::RWXO);
     let programs = Programs::beside_this()?;
     let actors = match arguments.actors {
         Some(actors) => actors as usize,
@@ -141,7 +146,11 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         identity,
         config,
         courses,
+        new,
     } = &prepared;
+    if let Some(warning) = scarce_disk(config, run.root()) {
+        eprintln!("skein: {warning}");
+    }
 
     let claims = claim_actors(run, actors)?;
     let plan = Plan {
@@ -161,12 +170,24 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     drop(presence);
     sweep();
 
+    let outcome = outcome?;
+    if let (Some(new), Err(error)) = (new, &outcome)
+        && error.tells_all()
+        && run.newest_checkpoint().is_none()
+    {
+        // The run never began; its directory would only be in the way of the next attempt.
+        if let Err(error) = new.take_back() {
+            eprintln!("skein: {} remains: {error}", run.root().display());
+        }
+        return Ok(outcome?);
+    }
+
     // Plots are a service: a run that failed may have left something worth looking at, and one that succeeded has, plots or not.
     let window = config.evaluation.window_flights as usize;
     if let Err(error) = reports::draw_all(run, courses, window, ideal_walls_passed(config)?) {
         eprintln!("skein: not all plots could be drawn: {error}");
     }
-    let ended = outcome?.map_err(|source| Unfinished {
+    let ended = outcome.map_err(|source| Unfinished {
         run: run.clone(),
         source,
     })?;
@@ -240,6 +261,8 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     if run.claim_supervisor()?.is_some() && !identity.is_learner_alive()? {
         bail!("the run in {} is not under way on this machine", run.root().display());
     }
+    umask(Mode::RWXG | Mode::RWXO);
+    check_shared_memory_for_more(&config, arguments.count as usize)?;
     let claims = claim_actors(&run, arguments.count as usize)?;
     let actors: Vec<_> = claims.iter().map(ActorClaim::id).collect();
     let names: Vec<_> = actors.iter().map(ToString::to_string).collect();

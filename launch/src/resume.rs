@@ -8,6 +8,7 @@ use skein_protocol::claims::SupervisorClaim;
 use skein_protocol::run::{PlaceError, RunDirectory, RunError};
 use skein_protocol::summary::{Ending, Summary};
 
+use crate::prepare::room::check_shared_memory;
 use crate::prepare::{PrepareError, Prepared, check, load_courses};
 
 /// Between two looks whether an earlier learner is gone.
@@ -91,6 +92,7 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
         });
     }
     check(&run.config(), &config, actors)?;
+    check_shared_memory(&config, actors).map_err(PrepareError::from)?;
     let courses = load_courses(&config).map_err(PrepareError::from)?;
     Ok((
         Prepared {
@@ -98,6 +100,7 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
             identity,
             config,
             courses,
+            new: None,
         },
         claim,
     ))

@@ -41,3 +41,13 @@ pub enum SupervisorError {
     #[error("no actor is left: {0}")]
     NoActors(String),
 }
+
+impl SupervisorError {
+    /// Whether nobody needs to look into a log to know more: a process could not be started, or said itself why it could not begin.
+    pub fn tells_all(&self) -> bool {
+        match self {
+            Self::Missing(_) | Self::Setup(_) | Self::Start { .. } | Self::LearnerCannotStart(_) => true,
+            Self::LearnerFailed { .. } | Self::LearnerGone(_) | Self::NoActors(_) => false,
+        }
+    }
+}

@@ -1,6 +1,5 @@
 //! The learner of a run, through all its lives.
 
-use std::path::Path;
 use std::time::Duration;
 
 use skein_protocol::progress::Progress;
@@ -235,7 +234,7 @@ impl<'a> Learner<'a> {
 
     /// What its next life begins from.
     fn whence(&self) -> String {
-        match newest_checkpoint(&self.plan.run.checkpoints()) {
+        match self.plan.run.newest_checkpoint() {
             Some(flights) => format!("from its checkpoint after flight {flights}"),
             None => "from the beginning: there is no checkpoint yet".to_owned(),
         }
@@ -258,12 +257,4 @@ async fn listen(mut lines: Lines<BufReader<ChildStdout>>, events: mpsc::Sender<E
             return;
         }
     }
-}
-
-/// Flights committed in the newest of the checkpoints in `directory`, by their names.
-fn newest_checkpoint(directory: &Path) -> Option<u64> {
-    std::fs::read_dir(directory)
-        .ok()?
-        .filter_map(|entry| entry.ok()?.file_name().to_str()?.strip_prefix("flight-")?.parse().ok())
-        .max()
 }

@@ -90,6 +90,15 @@ impl RunDirectory {
         self.logs().join(format!("actor-{actor}.log"))
     }
 
+    /// Flights committed in the newest of the run's checkpoints, by their names; whether one is sound, only reading it can tell.
+    pub fn newest_checkpoint(&self) -> Option<u64> {
+        let flights = |entry: fs::DirEntry| entry.file_name().to_str()?.strip_prefix("flight-")?.parse().ok();
+        fs::read_dir(self.checkpoints())
+            .ok()?
+            .filter_map(|entry| flights(entry.ok()?))
+            .max()
+    }
+
     /// Creates the directory with its folders, for this user alone, and writes the resolved configuration and a new identity.
     ///
     /// # Errors

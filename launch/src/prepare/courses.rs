@@ -1,0 +1,39 @@
+//! The courses of a run, as its reports name them.
+
+use std::path::PathBuf;
+
+use skein_protocol::config::{Config, CoursesSection};
+use skein_simulator::course::{Course, CourseError};
+
+/// A course of the final evaluation, under the name it has in the run's reports.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NamedCourse {
+    /// [`CoursesSection::name_of`] its file.
+    pub name: String,
+    /// The course.
+    pub course: Course,
+}
+
+/// The courses of the final evaluation.
+///
+/// # Errors
+/// [`CourseError`] names the file, the wall and the key.
+pub fn load_courses(config: &Config) -> Result<Vec<NamedCourse>, CourseError> {
+    let load = |path: &PathBuf| {
+        Ok(NamedCourse {
+            name: CoursesSection::name_of(path),
+            course: Course::load(path)?,
+        })
+    };
+    config.courses.evaluation.iter().map(load).collect()
+}
+
+/// Walls that an agent which passes every wall of the training course would pass a flight, on average over all start levels.
+///
+/// # Errors
+/// [`CourseError`] names the file, the wall and the key.
+pub fn ideal_walls_passed(config: &Config) -> Result<f64, CourseError> {
+    let walls = Course::load(&config.courses.training)?.levels();
+    // From level l, all but the first l - 1 walls lie ahead.
+    Ok(f64::from(walls) - (f64::from(config.learning.levels) - 1.0) / 2.0)
+}

@@ -1,0 +1,105 @@
+//! The directory of a new run: created, filled with copies, and taken back if the run does not come to life.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::fs::{self, DirBuilder, Permissions};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+use skein_protocol::config::{Config, CoursesSection};
+use skein_protocol::run::RunDirectory;
+
+use super::PrepareError;
+
+/// What is in a run is its user's alone.
+const OWNER_ONLY: u32 = 0o700;
+
+/// A directory that was made for a run, or was there and empty.
+#[derive(Debug)]
+pub struct NewDirectory {
+    root: PathBuf,
+    origin: Origin,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Origin {
+    Made,
+    Found,
+}
+
+impl NewDirectory {
+    /// Makes `directory` unless it is there and empty. Nobody but its owner can look into it then.
+    ///
+    /// # Errors
+    /// [`PrepareError::NotEmpty`], or [`PrepareError::Io`] with its path.
+    pub(super) fn make(directory: &Path) -> Result<Self, PrepareError> {
+        let io = |source| PrepareError::Io {
+            path: directory.to_owned(),
+            source,
+        };
+        if let Some(parent) = directory.parent() {
+            fs::create_dir_all(parent).map_err(io)?;
+        }
+        let origin = match DirBuilder::new().mode(OWNER_ONLY).create(directory) {
+            Ok(()) => Origin::Made,
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Origin::Found,
+            Err(error) => return Err(io(error)),
+        };
+        if fs::read_dir(directory).map_err(io)?.next().is_some() {
+            return Err(PrepareError::NotEmpty(directory.to_owned()));
+        }
+        fs::set_permissions(directory, Permissions::from_mode(OWNER_ONLY)).map_err(io)?;
+        let root = directory.canonicalize().map_err(io)?;
+        Ok(Self { root, origin })
+    }
+
+    /// Its absolute path.
+    pub(super) fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// Leaves everything as it was before: nothing in it is worth keeping.
+    ///
+    /// # Errors
+    /// When something cannot be removed.
+    pub fn take_back(&self) -> io::Result<()> {
+        if self.origin == Origin::Made {
+            return fs::remove_dir_all(&self.root);
+        }
+        for entry in fs::read_dir(&self.root)? {
+            let entry = entry?;
+            if entry.file_type()?.is_dir() {
+                fs::remove_dir_all(entry.path())?;
+            } else {
+                fs::remove_file(entry.path())?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Copies the course files into the run's directory and has the configuration name the copies: what was flown stays known when the originals change.
+pub(super) fn copy_courses(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
+    let folder = RunDirectory::new(root).courses();
+    fs::create_dir_all(&folder).map_err(|source| PrepareError::Io {
+        path: folder.clone(),
+        source,
+    })?;
+    let mut copies: BTreeMap<OsString, PathBuf> = BTreeMap::new();
+    for path in config.courses.paths_mut() {
+        let stem = CoursesSection::name_of(path);
+        let mut name = OsString::from(format!("{stem}.toml"));
+        for number in 2.. {
+            if copies.get(&name).is_none_or(|original| original == path) {
+                break;
+            }
+            name = format!("{stem}_{number}.toml").into();
+        }
+        let copy = folder.join(&name);
+        fs::copy(&*path, &copy).map_err(|source| PrepareError::Io { path: copy, source })?;
+        let relative = Path::new("courses").join(&name);
+        copies.insert(name, std::mem::replace(path, relative));
+    }
+    Ok(())
+}

@@ -1,0 +1,168 @@
+//! Whether the machine has room for a run: shared memory that is used up ends a process with SIGBUS in the middle of a flight, a full disk stops the
+//! learner until there is room again. Both can be foreseen.
+
+use std::path::{Path, PathBuf};
+
+use rustix::fs::statvfs;
+use skein_protocol::config::Config;
+use skein_protocol::snapshot::SnapshotLayout;
+use skein_protocol::transition::TransitionRecord;
+use skein_protocol::{ACTION, IMAGE_PIXELS};
+
+/// Where iceoryx2's segments lie.
+const SHARED_MEMORY: &str = "/dev/shm";
+const MIB: u64 = 1 << 20;
+/// Snapshots in shared memory: the history, and one in the making.
+const SNAPSHOTS: usize = 6;
+/// Queues and book-keeping of the learner's services, in bytes.
+const LEARNER_OVERHEAD: usize = 4 << 20;
+/// Queues and book-keeping for an actor, in bytes.
+const ACTOR_OVERHEAD: usize = 1 << 19;
+/// Everything that is trained, its target and its moments, in snapshots of the same configuration. Measured: `tensors.safetensors` of a checkpoint, beside
+/// `snapshots/latest.safetensors`.
+const CHECKPOINT_SNAPSHOTS: u64 = 12;
+
+/// There is less shared memory than a run needs.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "{} has {} MiB free, but {actors} actors need {} MiB: start fewer with --actors, remove what others left there, or make it larger: sudo mount -o remount,size={}M {}, in a container docker run --shm-size={}m",
+    path.display(),
+    free / MIB,
+    needed.div_ceil(MIB),
+    enough.div_ceil(MIB),
+    path.display(),
+    enough.div_ceil(MIB)
+)]
+pub struct SharedMemoryTooSmall {
+    path: PathBuf,
+    actors: usize,
+    /// Bytes.
+    needed: u64,
+    /// Bytes.
+    free: u64,
+    /// Bytes that it should hold altogether.
+    enough: u64,
+}
+
+/// Checks that there is shared memory for a learner and `actors` actors with `config`. Where it cannot be asked for, nothing is foreseen.
+///
+/// # Errors
+/// [`SharedMemoryTooSmall`] names what is needed, what there is, and the remedy.
+pub fn check_shared_memory(config: &Config, actors: usize) -> Result<(), SharedMemoryTooSmall> {
+    check_memory_in(Path::new(SHARED_MEMORY), actors, shared_memory_needed(config, actors))
+}
+
+/// Checks that there is shared memory for `actors` more actors of a run with `config` that is under way.
+///
+/// # Errors
+/// [`SharedMemoryTooSmall`] names what is needed, what there is, and the remedy.
+pub fn check_shared_memory_for_more(config: &Config, actors: usize) -> Result<(), SharedMemoryTooSmall> {
+    let needed = shared_memory_needed(config, actors) - shared_memory_needed(config, 0);
+    check_memory_in(Path::new(SHARED_MEMORY), actors, needed)
+}
+
+fn check_memory_in(path: &Path, actors: usize, needed: u64) -> Result<(), SharedMemoryTooSmall> {
+    let Some(Space { free, total }) = space(path) else {
+        return Ok(());
+    };
+    if free >= needed {
+        return Ok(());
+    }
+    Err(SharedMemoryTooSmall {
+        path: path.to_owned(),
+        actors,
+        needed,
+        free,
+        enough: total - free + needed,
+    })
+}
+
+/// A warning, if the disk that `directory` lies on has no room for the checkpoints of a run with `config`.
+pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
+    let free = space(directory)?.free;
+    // The one being written lies beside those that are kept.
+    let needed = checkpoint_bytes(config) * (config.checkpoints.keep as u64 + 1);
+    (free < needed).then(|| {
+        format!(
+            "the disk of {} has {} MiB free, and {} checkpoints may come to {} MiB: if it fills up, the learner waits until there is room",
+            directory.display(),
+            free / MIB,
+            config.checkpoints.keep + 1,
+            needed.div_ceil(MIB)
+        )
+    })
+}
+
+/// Bytes of shared memory that a learner and `actors` actors touch at most. Measured: `du -s /dev/shm` during a run.
+fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
+    let transport = &config.transport;
+    // Flights of all tickets, what either side has in hand, and one more in the making.
+    let records = transport.max_records_per_flight * transport.tickets_per_actor + 8;
+    let of_actor = records * size_of::<TransitionRecord>() + ACTOR_OVERHEAD;
+    let snapshots = SNAPSHOTS * 4 * SnapshotLayout::of(config).values();
+    (actors * of_actor + snapshots + LEARNER_OVERHEAD) as u64
+}
+
+/// Bytes of a checkpoint when the replay buffer is as full as it can become, with the depth images that are needed while the VAE is trained.
+fn checkpoint_bytes(config: &Config) -> u64 {
+    let records = config.transport.max_records_per_flight as u64;
+    let rows = (config.replay.capacity as u64).min(config.run.flights.saturating_mul(records));
+    let row = 4 * (2 * config.learning.observation.len() + ACTION + 2) as u64;
+    let images = 2 * config.vae.train_steps as u64 + config.learning.flights_per_epoch * records;
+    let images = images.min(config.run.flights.saturating_mul(records));
+    let snapshot = 4 * SnapshotLayout::of(config).values() as u64;
+    rows * row + images * IMAGE_PIXELS as u64 + CHECKPOINT_SNAPSHOTS * snapshot
+}
+
+/// Bytes of a file system.
+struct Space {
+    free: u64,
+    total: u64,
+}
+
+fn space(path: &Path) -> Option<Space> {
+    let stat = statvfs(path).ok()?;
+    Some(Space {
+        free: stat.f_bavail * stat.f_frsize,
+        total: stat.f_blocks * stat.f_frsize,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn too_little_memory_is_told_with_figures_and_remedies() {
+        let directory = tempfile::tempdir().unwrap();
+        assert_eq!(check_memory_in(directory.path(), 1, 0), Ok(()));
+        let too_small = check_memory_in(directory.path(), 64, u64::MAX / 2).unwrap_err();
+        let told = too_small.to_string();
+        for part in [
+            "64 actors",
+            "--actors",
+            "remount,size=",
+            "--shm-size=",
+            &format!("{} MiB free", too_small.free / MIB),
+        ] {
+            assert!(told.contains(part), "`{part}` is missing in {told}");
+        }
+        assert!(too_small.enough >= too_small.needed);
+    }
+
+    #[test]
+    fn what_cannot_be_asked_is_not_foreseen() {
+        assert_eq!(check_memory_in(Path::new("/nowhere"), 1, u64::MAX), Ok(()));
+        assert_eq!(scarce_disk(&Config::default(), Path::new("/nowhere")), None);
+    }
+
+    #[test]
+    fn a_disk_too_small_for_the_checkpoints_is_told() {
+        let mut config = Config::default();
+        let directory = tempfile::tempdir().unwrap();
+        assert_eq!(scarce_disk(&config, directory.path()), None);
+        config.checkpoints.keep = 1 << 40;
+        let told = scarce_disk(&config, directory.path()).unwrap();
+        assert!(told.contains("checkpoints may come to"), "{told}");
+    }
+}
