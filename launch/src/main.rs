@@ -28,8 +28,8 @@ use tokio::sync::mpsc;
 
 /// Status of a process that was interrupted, as shells report it: 128 + SIGINT.
 const INTERRUPTED: u8 = 130;
-/// How long a learner may still be saving whose supervisor was killed, before its run is resumed.
-const PATIENCE: Duration = Duration::from_secs(30);
+/// How long a learner that nobody supervises may still be ending, before its run is resumed.
+const PATIENCE: Duration = Duration::from_secs(10);
 
 /// Trains a drone to avoid obstacles from its depth camera.
 #[derive(Parser)]
@@ -258,7 +258,8 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let run = open(&arguments.run)?;
     let (identity, config) = run.open()?;
     // Between two lives of its learner, a run is under way as long as somebody sees to it that there will be another.
-    if run.claim_supervisor()?.is_some() && !identity.is_learner_alive()? {
+    let is_under_way = || Ok::<_, anyhow::Error>(run.claim_supervisor()?.is_none() || identity.is_learner_alive()?);
+    if !is_under_way()? {
         bail!("the run in {} is not under way on this machine", run.root().display());
     }
     umask(Mode::RWXG | Mode::RWXO);
@@ -272,7 +273,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
         run.root().display()
     );
     let plan = Plan {
-        run,
+        run: run.clone(),
         programs,
         actors,
         learner_threads: config.run.learner_threads,
@@ -281,7 +282,8 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let mut display = Display::new();
     runtime()?.block_on(async {
         let mut interrupts = interrupts()?;
-        Ok(supervisor::attach(&plan, &mut interrupts, &mut display).await?)
+        let is_under_way = || is_under_way().unwrap_or(false);
+        Ok(supervisor::attach(&plan, is_under_way, &mut interrupts, &mut display).await?)
     })
 }
 

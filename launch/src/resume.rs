@@ -58,8 +58,8 @@ pub enum ResumeError {
     Place(#[from] PlaceError),
 }
 
-/// Checks that the run in `directory` can be gone on with by `actors` actors, and claims it. A learner that its supervisor left behind is given `patience`
-/// to save what it learned.
+/// Checks that the run in `directory` can be gone on with by `actors` actors, and claims it. A learner that nobody supervises is given `patience`
+/// to end.
 ///
 /// # Errors
 /// [`ResumeError`]; nothing was changed then.
@@ -73,16 +73,13 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
         return Err(not_a_run(Path::new("run.json")));
     }
     let (identity, config) = run.open()?;
-    let claim = run
-        .claim_supervisor()?
-        .ok_or_else(|| ResumeError::UnderWay(run.root().to_owned()))?;
-    let deadline = Instant::now() + patience;
-    while identity.is_learner_alive()? {
-        if Instant::now() > deadline {
-            return Err(ResumeError::UnderWay(run.root().to_owned()));
-        }
-        sleep(LOOK);
-    }
+    let under_way = || ResumeError::UnderWay(run.root().to_owned());
+    // Whoever only looks whether it is taken holds it for a moment.
+    let claim = in_time(LOOK * 5, || run.claim_supervisor())?.ok_or_else(under_way)?;
+    in_time(patience, || {
+        Ok::<_, PlaceError>((!identity.is_learner_alive()?).then_some(()))
+    })?
+    .ok_or_else(under_way)?;
     if let Some(summary) = Summary::of(&run)
         && summary.ending == Ending::Completed
     {
@@ -104,6 +101,17 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
         },
         claim,
     ))
+}
+
+/// Looks again and again for what `look` may find, for so long.
+fn in_time<T, E>(patience: Duration, look: impl Fn() -> Result<Option<T>, E>) -> Result<Option<T>, E> {
+    let deadline = Instant::now() + patience;
+    loop {
+        match look()? {
+            None if Instant::now() < deadline => sleep(LOOK),
+            found => return Ok(found),
+        }
+    }
 }
 
 #[cfg(test)]

@@ -4,8 +4,9 @@
 
 use std::fs;
 use std::path::Path;
+use std::process::Command;
 
-use skein_tests::{Output, Recipe, repository, run_program};
+use skein_tests::{Output, Recipe, program, repository, run_program};
 use tempfile::TempDir;
 
 /// `skein run` with a configuration of its own, which must not come to life.
@@ -116,6 +117,10 @@ fn a_device_that_this_machine_does_not_have() {
     let run = Recipe::small().set("run.device=cuda:7").start().wait();
     assert_eq!(run.output.code, Some(1));
     run.output.assert_refused(&["cuda:7", "cpu"]);
+    assert!(
+        !run.directory.root().exists(),
+        "the directory of a run that never began is left"
+    );
     run.assert_nothing_is_left();
 }
 
@@ -128,6 +133,66 @@ fn an_actor_for_a_run_that_is_not_there_or_over() {
     let over = Recipe::small().set("run.flights=1").finish();
     let directory = over.directory.root().to_str().unwrap();
     run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory, "not under way"]);
+}
+
+#[test]
+fn shared_memory_that_is_too_small() {
+    // A mount of our own, which nobody else sees: not every machine lets us.
+    let attempt = Attempt::new("");
+    let (config, run) = (attempt.path().join("mine.toml"), attempt.path().join("run"));
+    let script = format!(
+        "mount -t tmpfs -o size=8m tmpfs /dev/shm || exit 77; exec {} run --config {} --run-dir {} --actors 2",
+        program("skein").display(),
+        config.display(),
+        run.display()
+    );
+    let output = Command::new("unshare")
+        .args(["--mount", "--map-root-user", "sh", "-c", &script])
+        .output();
+    let Ok(output) = output else {
+        eprintln!("skipped: there is no unshare");
+        return;
+    };
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    if output.status.code() == Some(77) || stderr.contains("unshare") {
+        eprintln!("skipped: nothing can be mounted here: {stderr}");
+        return;
+    }
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    for part in [
+        "/dev/shm has 8 MiB free",
+        "2 actors",
+        "--actors",
+        "remount,size=",
+        "--shm-size=",
+    ] {
+        assert!(stderr.contains(part), "`{part}` is missing in {stderr}");
+    }
+    assert!(!run.exists());
+}
+
+#[test]
+fn a_resumption_of_what_cannot_be_gone_on_with() {
+    let empty = tempfile::tempdir().unwrap();
+    let directory = empty.path().to_str().unwrap();
+    run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "run.json"]);
+    let with_config = run_program("skein", &["run", "--resume", directory, "--set", "run.seed=2"]);
+    assert_eq!(with_config.code, Some(2));
+    assert!(
+        with_config
+            .stderr
+            .contains("with the configuration it was started with"),
+        "{}",
+        with_config.stderr
+    );
+
+    let mut running = Recipe::small().start();
+    running.until_flights(1);
+    let root = running.directory().root().to_owned();
+    let directory = root.to_str().unwrap();
+    run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "under way", "attach_actor.sh"]);
+    let _complete = running.finish();
+    run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "complete", "40 flights"]);
 }
 
 #[test]

@@ -1,18 +1,25 @@
 //! Actors that were added to a run under way. Its learner is none of their supervisor's business: they find it, and its next lives, by themselves.
 
+use skein_protocol::summary::Summary;
 use tokio::sync::mpsc;
+use tokio::time::{Duration, Instant, interval};
 
 use super::crew::{Crew, GivenUp};
 use super::dismissal::dismiss;
 use super::process::Order;
 use super::{EVENTS, Ended, Event, Plan, SupervisorError, Watcher};
 
-/// Supervises actors that join a run under way, until they end.
+/// Between two looks whether the run is still under way.
+const LOOK: Duration = Duration::from_secs(1);
+
+/// Supervises actors that join a run under way, until they end. They do so by themselves when the run does; those that cannot are ended when
+/// `is_under_way` has said no for [`Deadlines::actor_silence`](super::Deadlines).
 ///
 /// # Errors
 /// As [`run`](super::run).
 pub async fn attach(
     plan: &Plan,
+    is_under_way: impl Fn() -> bool,
     interrupts: &mut mpsc::Receiver<()>,
     watcher: &mut impl Watcher,
 ) -> Result<Ended, SupervisorError> {
@@ -23,6 +30,7 @@ pub async fn attach(
         return Err(error);
     }
     let mut ended = Ended::Finished;
+    let (mut look, mut last_under_way) = (interval(LOOK), Instant::now());
     while crew.is_alive() && ended == Ended::Finished {
         tokio::select! {
             Some(event) = inbox.recv() => match event {
@@ -34,6 +42,13 @@ pub async fn attach(
                 crew.order(Order::Terminate);
                 ended = Ended::Interrupted;
             }
+            _ = look.tick() => {
+                if is_under_way() {
+                    last_under_way = Instant::now();
+                } else if last_under_way.elapsed() > plan.deadlines.actor_silence {
+                    break;
+                }
+            }
         }
         while let Some(warning) = crew.next_warning() {
             watcher.warn(&warning);
@@ -41,6 +56,8 @@ pub async fn attach(
     }
     dismiss(&mut crew, &mut inbox, interrupts).await;
     match crew.last_failure() {
+        // Whoever came or was started again as the run ended heard nothing of its end.
+        Some(GivenUp::LearnerGone) if Summary::of(&plan.run).is_some() => Ok(ended),
         Some(reason) if ended == Ended::Finished => Err(match reason {
             GivenUp::LearnerGone => SupervisorError::LearnerGone(plan.run.root().to_owned()),
             GivenUp::KeepsDying(_) => SupervisorError::NoActors(reason.to_string()),

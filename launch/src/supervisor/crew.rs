@@ -12,7 +12,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep};
 
 use super::log_tail::log_tail;
-use super::process::{Exit, Launch, Order, Orphaned, Output, reap};
+use super::process::{Exit, Launch, Order, Output, reap};
 use super::restarts::{ActorDeaths, Life, Verdict};
 use super::work::Work;
 use super::{Event, SupervisorError};
@@ -165,7 +165,6 @@ impl<'a> Crew<'a> {
             threads: 1,
             log: self.run.actor_log(member.id),
             output: Output::Logged,
-            orphaned: Orphaned::Kill,
         };
         let child = launch.start()?;
         let (orders, receiver) = watch::channel(Order::Run);

@@ -9,7 +9,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep, timeout};
 
 use super::log_tail::{last_words, log_tail};
-use super::process::{Exit, Launch, Order, Orphaned, Output, reap};
+use super::process::{Exit, Launch, Order, Output, reap};
 use super::restarts::{LearnerDeaths, Verdict};
 use super::work::Work;
 use super::{Event, Plan, SupervisorError};
@@ -89,7 +89,6 @@ impl<'a> Learner<'a> {
             threads: self.plan.learner_threads,
             log: self.plan.run.learner_log(),
             output: Output::Piped,
-            orphaned: Orphaned::Terminate,
         };
         let mut child = launch.start().map_err(|source| SupervisorError::Start {
             program: self.plan.programs.learner.clone(),

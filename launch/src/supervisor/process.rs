@@ -79,15 +79,6 @@ impl fmt::Display for Exit {
     }
 }
 
-/// What is done when the supervisor dies without being able to end its children.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Orphaned {
-    /// SIGTERM: it still has something to save.
-    Terminate,
-    /// SIGKILL: nobody needs it any more.
-    Kill,
-}
-
 /// Where a process writes its standard output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Output {
@@ -106,14 +97,13 @@ pub(super) struct Launch<'a> {
     pub(super) threads: usize,
     pub(super) log: PathBuf,
     pub(super) output: Output,
-    pub(super) orphaned: Orphaned,
 }
 
 impl Launch<'_> {
     /// Starts the program.
     ///
-    /// It leads a process group of its own, so that Ctrl-C in the terminal reaches only the supervisor, which knows the order of things. It ends
-    /// when the *thread* that started it ends: to be called on the main thread.
+    /// It leads a process group of its own, so that Ctrl-C in the terminal reaches only the supervisor, which knows the order of things. The
+    /// kernel kills it when the *thread* that started it ends, however that comes about: to be called on the main thread.
     ///
     /// # Errors
     /// When its log cannot be opened or the program cannot be started.
@@ -122,10 +112,6 @@ impl Launch<'_> {
         let output = match self.output {
             Output::Piped => Stdio::piped(),
             Output::Logged => log.try_clone()?.into(),
-        };
-        let signal = match self.orphaned {
-            Orphaned::Terminate => Signal::TERM,
-            Orphaned::Kill => Signal::KILL,
         };
         let supervisor = rustix::process::getpid();
         let mut command = Command::new(self.program);
@@ -145,7 +131,7 @@ impl Launch<'_> {
         // SAFETY: between fork and exec only system calls are made (prctl, getppid), no memory is allocated and no lock is taken.
         unsafe {
             command.pre_exec(move || {
-                set_parent_process_death_signal(Some(signal))?;
+                set_parent_process_death_signal(Some(Signal::KILL))?;
                 // The supervisor may have died before the call above: then no signal would ever come.
                 if getppid() == Some(supervisor) {
                     Ok(())

@@ -106,7 +106,8 @@ impl Stage {
             .unwrap();
         let mut seen = Seen::default();
         let (_sender, mut interrupts) = mpsc::channel(1);
-        let result = runtime.block_on(attach(&self.plan, &mut interrupts, &mut seen));
+        let is_under_way = || !self.has("over");
+        let result = runtime.block_on(attach(&self.plan, is_under_way, &mut interrupts, &mut seen));
         self.assert_nothing_is_left();
         (result, seen)
     }
@@ -429,6 +430,14 @@ fn actors_that_find_no_learner_are_not_started_again() {
         format!("the learner of {} is gone", stage.directory.path().display())
     );
     assert_eq!(stage.processes(), 2);
+}
+
+#[test]
+fn attached_actors_that_cannot_leave_are_ended_after_the_run() {
+    let mut stage = Stage::new("", "touch $dir/over; kill -STOP $$");
+    stage.plan.deadlines.actor_silence = Duration::from_millis(100);
+    let (result, _) = stage.attach();
+    assert_eq!(result.unwrap(), Ended::Finished);
 }
 
 /// A learner that goes on reporting for a second after it is told to stop, with `$n` counting up, and then saves.
