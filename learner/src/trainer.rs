@@ -11,7 +11,7 @@ use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::Exploration;
 use skein_protocol::{IMAGE_PIXELS, LATENT};
-use tch::{Device, Kind, Tensor};
+use tch::{Device, Kind, TchError, Tensor};
 
 use crate::checkpoint::{NamedTensor, Progress, TensorValues};
 use crate::device::{self, DeviceError};
@@ -33,6 +33,15 @@ pub enum TrainerRestoreError {
     /// Of the networks.
     #[error(transparent)]
     Networks(#[from] state::RestoreError),
+    /// A tensor of a shape that there cannot be.
+    #[error("the stored tensor {name} is none: {source}")]
+    Tensor {
+        /// Its name.
+        name: String,
+        /// What the tensor library says of it.
+        #[source]
+        source: TchError,
+    },
     /// Of the replay buffer.
     #[error(transparent)]
     Replay(#[from] replay::RestoreError),
@@ -89,7 +98,7 @@ impl Trainer {
         tensors: &[NamedTensor],
         replay: ReplayState,
     ) -> Result<(), TrainerRestoreError> {
-        let tensors: NamedTensors = tensors.iter().map(restored).collect();
+        let tensors: NamedTensors = tensors.iter().map(restored).collect::<Result<_, _>>()?;
         self.vae.load_named(&tensors)?;
         self.sac.load_named(&tensors)?;
         self.replay = Replay::restore(&self.config, replay)?;
@@ -309,14 +318,12 @@ fn stored(name: String, tensor: &Tensor) -> NamedTensor {
     }
 }
 
-fn restored(stored: &NamedTensor) -> (String, Tensor) {
-    let flat = match &stored.values {
-        TensorValues::F32(values) => Tensor::from_slice(values),
-        TensorValues::F64(values) => Tensor::from_slice(values),
-        TensorValues::I64(values) => Tensor::from_slice(values),
-    };
-    let shape: Vec<i64> = stored.shape.iter().map(|&size| size as i64).collect();
-    (stored.name.clone(), flat.reshape(shape))
+fn restored(stored: &NamedTensor) -> Result<(String, Tensor), TrainerRestoreError> {
+    let name = stored.name.clone();
+    match stored.to_tensor() {
+        Ok(tensor) => Ok((name, tensor)),
+        Err(source) => Err(TrainerRestoreError::Tensor { name, source }),
+    }
 }
 
 /// Means of the metrics of an epoch's updates.

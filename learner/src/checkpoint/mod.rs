@@ -27,6 +27,7 @@ use serde::{Deserialize, Serialize};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::ticket::Exploration;
+use tch::{TchError, Tensor};
 
 use crate::flights::assembly::Keep;
 use crate::metrics::MetricsState;
@@ -142,6 +143,25 @@ pub struct NamedTensor {
     pub shape: Vec<usize>,
     /// Its values in row-major order, as many as the shape says.
     pub values: TensorValues,
+}
+
+impl NamedTensor {
+    /// In the tensor library's memory.
+    ///
+    /// # Errors
+    /// What the library says of a shape that it cannot count, or that is not one of so many values.
+    pub fn to_tensor(&self) -> Result<Tensor, TchError> {
+        let flat = match &self.values {
+            TensorValues::F32(values) => Tensor::from_slice(values),
+            TensorValues::F64(values) => Tensor::from_slice(values),
+            TensorValues::I64(values) => Tensor::from_slice(values),
+        };
+        let size = |&size: &usize| {
+            i64::try_from(size).map_err(|_| TchError::Shape(format!("{size} elements cannot be counted")))
+        };
+        let shape: Vec<i64> = self.shape.iter().map(size).collect::<Result<_, _>>()?;
+        flat.f_reshape(shape)
+    }
 }
 
 /// A tensor's values.

@@ -83,8 +83,7 @@ impl CheckpointStore {
         durable::create_private_directory(aside).map_err(CheckpointError::io("create", aside))?;
         pass(FaultPoint::CheckpointCreated);
         files::write(aside, state, &self.config.portable())?;
-        let manifest = Manifest::of(aside, &files::NAMES, state.progress.flights, self.config.digest())?;
-        files::write_bytes(&aside.join(manifest::NAME), manifest.to_text().as_bytes())?;
+        self.seal(aside, state.progress.flights)?;
         pass(FaultPoint::CheckpointManifest);
         for name in files::NAMES.iter().chain([&manifest::NAME]) {
             sync(&aside.join(name))?;
@@ -94,6 +93,15 @@ impl CheckpointStore {
         let folders: BTreeSet<&Path> = relied_on.iter().filter_map(|path| path.parent()).collect();
         let mut all = relied_on.iter().map(PathBuf::as_path).chain(folders);
         all.try_for_each(sync_once)
+    }
+
+    /// Writes the manifest of the files in `directory` as they are now, and so makes them a checkpoint after `flights` flights.
+    ///
+    /// # Errors
+    /// [`CheckpointError::Io`] names the file.
+    pub fn seal(&self, directory: &Path, flights: u64) -> Result<(), CheckpointError> {
+        let manifest = Manifest::of(directory, &files::NAMES, flights, self.config.digest())?;
+        files::write_bytes(&directory.join(manifest::NAME), manifest.to_text().as_bytes())
     }
 
     /// Gives the checkpoint at `place`, if there is a sound one, the name under which it is still found until the new one is in its place.
@@ -168,6 +176,13 @@ impl CheckpointStore {
                     problem: format!("it is of flight {}, but {what} says {found}", state.progress.flights),
                 });
             }
+        }
+        let window = self.config.evaluation.window_flights;
+        if !state.progress.metrics.windows.are_over(window as usize) {
+            return Err(CheckpointError::Content {
+                path: place.path.clone(),
+                problem: format!("its averages are not over evaluation.window_flights = {window} flights"),
+            });
         }
         Ok(state)
     }

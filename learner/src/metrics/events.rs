@@ -58,6 +58,11 @@ impl EventWriter {
     pub fn resume(directory: &Path, files: Vec<EventFile>, first_step: u64, disk: &Disk) -> Result<Self, EventError> {
         let at = |path: PathBuf| move |source| EventError { path, source };
         fs::create_dir_all(directory).map_err(at(directory.to_owned()))?;
+        let (files, others): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| Begun::of(&file.name).is_some());
+        // Whatever a damaged list names elsewhere is not for us to cut.
+        for EventFile { name, .. } in others {
+            tracing::warn!(name, "not the name of an event file of ours: left alone");
+        }
         let (path, file) = begin(directory, cut_back(directory, &files)?);
         let file = BufWriter::new(disk.patient(&path, file.map_err(at(path.clone()))?));
         let mut writer = Self { files, path, file };
@@ -132,7 +137,7 @@ fn begin(directory: &Path, latest: Option<Begun>) -> (PathBuf, io::Result<File>)
     let now = now_secs() as u64;
     let first = match latest {
         Some(latest) if latest.second >= now => Begun {
-            number: latest.number + 1,
+            number: latest.number.saturating_add(1),
             ..latest
         },
         _ => Begun { second: now, number: 0 },
@@ -381,6 +386,21 @@ mod tests {
             file.bytes,
             fs::metadata(directory.path().join(&file.name)).unwrap().len()
         );
+    }
+
+    #[test]
+    fn a_file_elsewhere_is_left_alone_whatever_a_list_says() {
+        let directory = tempfile::tempdir().unwrap();
+        let outside = directory.path().join("outside");
+        fs::write(&outside, "untouched").unwrap();
+        let files = ["../outside", &outside.display().to_string()].map(|name| EventFile {
+            name: name.to_owned(),
+            bytes: 0,
+        });
+        let curves = directory.path().join("tensorboard");
+        let writer = EventWriter::resume(&curves, files.to_vec(), 0, &Disk::new(Default::default())).unwrap();
+        assert_eq!(fs::read_to_string(outside).unwrap(), "untouched");
+        assert_eq!(writer.files().len(), 1);
     }
 
     #[test]

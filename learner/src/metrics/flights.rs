@@ -4,7 +4,7 @@
 //! file never says more than what was learned from, and never twice.
 
 use std::fs::{File, OpenOptions};
-use std::io;
+use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -36,6 +36,19 @@ pub struct FlightRow {
     /// `collided`, `reached_end` or `timed_out`.
     pub outcome: Outcome,
 }
+
+/// The columns in order: what is continued has the same.
+const COLUMNS: [&str; 9] = [
+    "flight",
+    "epoch",
+    "policy_version",
+    "actor",
+    "level",
+    "steps",
+    "walls_passed",
+    "return",
+    "outcome",
+];
 
 impl From<&CommittedFlight> for FlightRow {
     fn from(flight: &CommittedFlight) -> Self {
@@ -124,7 +137,7 @@ impl FlightsCsv {
         let mut file = OpenOptions::new().read(true).write(true).open(path).map_err(io)?;
         let end = end_of_rows(path, &file, flights)?;
         file.set_len(end).map_err(io)?;
-        io::Seek::seek(&mut file, io::SeekFrom::End(0)).map_err(io)?;
+        end_line(&mut file).map_err(io)?;
         let writer = csv::WriterBuilder::new()
             .has_headers(false)
             .from_writer(disk.patient(path, file));
@@ -157,6 +170,17 @@ impl FlightsCsv {
     }
 }
 
+/// Goes to the end of the file, and of its last line: a file that was cut there by other hands would have the next row on the same line.
+fn end_line(file: &mut File) -> io::Result<()> {
+    let mut last = [0];
+    file.seek(SeekFrom::End(-1))?;
+    file.read_exact(&mut last)?;
+    if last != *b"\n" {
+        file.write_all(b"\n")?;
+    }
+    Ok(())
+}
+
 /// Byte after the first `flights` rows, which must be flights 0, 1, 2, …
 fn end_of_rows(path: &Path, file: &File, flights: u64) -> Result<u64, FlightsError> {
     let content = |problem| FlightsError::Content {
@@ -170,6 +194,9 @@ fn end_of_rows(path: &Path, file: &File, flights: u64) -> Result<u64, FlightsErr
     };
     let mut reader = csv::Reader::from_reader(file);
     let headers = reader.headers().map_err(row_error)?.clone();
+    if headers != COLUMNS[..] {
+        return Err(content(format!("its columns are {headers:?}")));
+    }
     let mut record = csv::StringRecord::new();
     for expected in 0..flights {
         if !reader.read_record(&mut record).map_err(row_error)? {
@@ -229,6 +256,32 @@ mod tests {
             let read: FlightRow = csv::Reader::from_path(&path).unwrap().deserialize().next().unwrap().unwrap();
             prop_assert_eq!(read.total_reward.to_bits(), bits);
         }
+    }
+
+    #[test]
+    fn a_file_that_lost_the_end_of_its_last_line_is_continued_on_the_next() {
+        let directory = tempfile::tempdir().unwrap();
+        let (whole, cut) = (directory.path().join("whole.csv"), directory.path().join("cut.csv"));
+        write(&mut FlightsCsv::create(&whole, &disk()).unwrap(), 0..5);
+        write(&mut FlightsCsv::create(&cut, &disk()).unwrap(), 0..4);
+        let text = fs::read_to_string(&cut).unwrap();
+        fs::write(&cut, text.trim_end()).unwrap();
+        write(&mut FlightsCsv::resume(&cut, 4, &disk()).unwrap(), 4..5);
+        assert_eq!(fs::read(&whole).unwrap(), fs::read(&cut).unwrap());
+    }
+
+    #[test]
+    fn a_file_of_other_columns_is_not_continued() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("flights.csv");
+        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 0..4);
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, text.replacen("flight,epoch", "epoch,flight", 1)).unwrap();
+        let error = FlightsCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
+        assert!(
+            error.contains("flights.csv") && error.contains("its columns are"),
+            "{error}"
+        );
     }
 
     #[test]

@@ -38,6 +38,11 @@ impl Windows {
             walls_passed: MovingAverage::new(flights),
         }
     }
+
+    /// Whether they are over `flights` flights, see [`MovingAverage::is_over`].
+    pub fn are_over(&self, flights: usize) -> bool {
+        self.total_reward.is_over(flights) && self.walls_passed.is_over(flights)
+    }
 }
 
 /// How far the metrics of a run are; part of a checkpoint.

@@ -22,6 +22,11 @@ impl MovingAverage {
         }
     }
 
+    /// Whether it is over `window` values and holds no more: one that was read from a file may say anything.
+    pub fn is_over(&self, window: usize) -> bool {
+        self.window == window.max(1) && self.values.len() <= self.window
+    }
+
     /// Takes in the latest value; the oldest leaves when the window is full.
     pub fn push(&mut self, value: f32) {
         if self.values.len() == self.window {
@@ -45,6 +50,15 @@ impl MovingAverage {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_average_over_another_window_is_told_from_one_over_this() {
+        let mut average = MovingAverage::new(3);
+        (0..5).for_each(|value| average.push(value as f32));
+        assert!(average.is_over(3) && !average.is_over(4));
+        average.values.push_back(1.0);
+        assert!(!average.is_over(3), "it holds more than its window");
+    }
 
     #[test]
     fn the_mean_is_over_the_latest_values_only() {

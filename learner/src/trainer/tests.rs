@@ -53,7 +53,7 @@ fn state(trainer: &Trainer, epochs: u64) -> CheckpointState {
             environment_steps: trainer.steps(),
             vae_steps: trainer.vae_updates(),
             sac_updates: trainer.updates(),
-            ..Progress::start(5)
+            ..Progress::start(config().evaluation.window_flights as usize)
         },
         tensors: trainer.tensors(),
         replay: trainer.replay().state(),

@@ -1,4 +1,4 @@
-//! A folder for readers that take files only: one a thread, in `TMPDIR`, which `launch/fuzz.sh` puts into memory.
+//! Folders for readers that take files only, in memory where the machine has it: thousands of files a second are no load for a disk.
 
 use std::fs;
 use std::path::Path;
@@ -6,7 +6,17 @@ use std::path::Path;
 use tempfile::TempDir;
 
 thread_local! {
-    static FOLDER: TempDir = tempfile::tempdir().unwrap();
+    static FOLDER: TempDir = folder();
+}
+
+/// An empty folder that is removed with the value. `launch/fuzz.sh`, whose processes end without a word, names one of its own to remove.
+pub(crate) fn folder() -> TempDir {
+    let memory = Path::new("/dev/shm");
+    if std::env::var_os("TMPDIR").is_none() && memory.is_dir() {
+        tempfile::tempdir_in(memory).unwrap()
+    } else {
+        tempfile::tempdir().unwrap()
+    }
 }
 
 /// Calls `read` with the thread's folder, in which `files` lie and nothing else that an earlier call did not put there under another name.

@@ -94,6 +94,16 @@ fn places_far_beyond_any_course_are_refused() {
     recall("report_pictures", "flown_to_infinity");
 }
 
+#[test]
+fn a_file_of_flights_that_lost_its_last_line_end_is_continued_on_the_next_line() {
+    recall("flights_csv", "last_line_without_end");
+}
+
+#[test]
+fn an_event_file_outside_the_folder_is_left_alone() {
+    recall("event_files", "name_outside_the_folder");
+}
+
 macro_rules! drive {
     ($($claim:ident => $target:literal),* $(,)?) => {
         $(#[test] fn $claim() { drive($target); })*
@@ -117,7 +127,10 @@ drive! {
     no_signal_panics_and_what_is_believed_says_the_same_again => "signals",
     no_snapshot_file_panics_and_what_is_accepted_is_finite => "snapshot_file",
     no_received_snapshot_panics_and_what_is_accepted_is_what_was_sent => "snapshot_received",
+    no_checkpoint_file_panics_and_what_is_loaded_can_be_used => "checkpoint",
     no_replay_content_panics_and_what_is_restored_goes_on => "replay",
+    no_flights_csv_panics_and_what_is_continued_can_be_continued_again => "flights_csv",
+    no_list_of_event_files_reaches_beyond_their_folder => "event_files",
     no_run_identity_panics_and_what_is_accepted_is_of_its_configuration => "run_identity",
     no_announcement_panics_and_what_may_be_joined_is_what_we_would_say => "announcement",
     no_result_file_panics_the_conclusion => "results",

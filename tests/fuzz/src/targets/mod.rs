@@ -1,5 +1,6 @@
 //! What reads bytes from outside, one module a subject.
 
+mod checkpoints;
 mod configuration;
 mod courses;
 mod records;
@@ -44,7 +45,7 @@ impl Target {
 const USUAL: usize = 100;
 
 /// All of them.
-pub static TARGETS: [Target; 18] = [
+pub static TARGETS: [Target; 21] = [
     configuration::CONFIG,
     configuration::OVERRIDES,
     configuration::SIMULATOR,
@@ -55,7 +56,10 @@ pub static TARGETS: [Target; 18] = [
     signals::SIGNALS,
     snapshots::FILE,
     snapshots::RECEIVED,
+    checkpoints::FILES,
     replay::REPLAY,
+    checkpoints::FLIGHTS_CSV,
+    checkpoints::EVENT_FILES,
     runs::IDENTITY,
     runs::ANNOUNCEMENT,
     runs::RESULTS,

@@ -26,7 +26,7 @@ pub(super) const REPLAY: Target = Target {
 /// Values in a row of the smallest buffer: two observations, an action, a reward, an end.
 const ROW: usize = 2 * LATENT + ACTION + 2;
 
-fn config() -> Config {
+pub(super) fn config() -> Config {
     let mut config = Config::default();
     config.replay.capacity = 256;
     config.vae.train_steps = 16;
@@ -89,7 +89,7 @@ fn ring(script: &mut Script<'_>, capacity: usize) -> RingState {
     }
 }
 
-fn flight() -> CommittedFlight {
+pub(super) fn flight() -> CommittedFlight {
     let seen = StepObservation {
         latent: [0.0; LATENT],
         velocity_mps: [0.0; 3],

@@ -1,0 +1,321 @@
+//! What a learner resumes from: each file of a checkpoint under a manifest that matches it, so that what stands behind the checksums is reached; and the
+//! metrics that it goes on with.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, LazyLock};
+
+use skein_learner::checkpoint::{
+    CheckpointState, CheckpointStore, EpochOrder, NamedTensor, Progress, TensorValues, checkpoint_directory,
+};
+use skein_learner::disk::Disk;
+use skein_learner::flights::assembly::Keep;
+use skein_learner::metrics::{EventFile, EventWriter, FlightRow, FlightsCsv};
+use skein_learner::replay::Replay;
+use skein_learner::state::{NamedTensors, Stateful};
+use skein_protocol::config::Config;
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::snapshot::Snapshot;
+use skein_protocol::ticket::Exploration;
+use skein_protocol::transition::Outcome;
+use tch::Tensor;
+use tempfile::TempDir;
+
+use super::replay::{config, flight};
+use super::{Target, USUAL, tagged};
+use crate::scratch::{folder, with_files};
+
+pub(super) const FILES: Target = Target {
+    name: "checkpoint",
+    reads: "the files of a checkpoint, which one says the first byte, of tensors the header only; then what is loaded is used",
+    longest_bytes: 4096,
+    weight: USUAL / 2,
+    samples,
+    run: checkpoint,
+};
+
+pub(super) const FLIGHTS_CSV: Target = Target {
+    name: "flights_csv",
+    reads: "flights.csv, after a byte that says after how many flights it is to be continued",
+    longest_bytes: 2048,
+    weight: USUAL / 2,
+    samples: csv_samples,
+    run: flights_csv,
+};
+
+pub(super) const EVENT_FILES: Target = Target {
+    name: "event_files",
+    reads: "names and lengths of the event files that a checkpoint counts on, one a line",
+    longest_bytes: 256,
+    weight: USUAL / 5,
+    samples: || {
+        vec![
+            b"events.out.tfevents.1.skein.000000 4\nevents.out.tfevents.2.skein.000000 1".to_vec(),
+            b"../outside 0".to_vec(),
+        ]
+    },
+    run: event_files,
+};
+
+/// Flights that the checkpoint is of.
+const FLIGHTS: u64 = 7;
+/// What the first byte of an input counts through. The configuration is read only to say what differs, the manifest before all else.
+const FILE_NAMES: [&str; 6] = [
+    "tensors.safetensors",
+    "replay.safetensors",
+    "snapshots.safetensors",
+    "progress.bin",
+    "config.toml",
+    "manifest.json",
+];
+
+/// A small state with everything in it.
+fn state() -> CheckpointState {
+    let mut replay = Replay::new(&config());
+    replay.insert(flight()).unwrap();
+    let tensor = |name: &str, shape: &[usize], values| NamedTensor {
+        name: name.to_owned(),
+        shape: shape.to_vec(),
+        values,
+    };
+    CheckpointState {
+        progress: Progress {
+            flights: FLIGHTS,
+            epochs: 2,
+            in_the_air: vec![EpochOrder {
+                epoch: 2,
+                policy_version: 1,
+                exploration: Exploration::Sample,
+                keep: Keep::Depth,
+            }],
+            latest_candidate: Some(5),
+            ..Progress::start(config().evaluation.window_flights as usize)
+        },
+        tensors: vec![
+            tensor("single", &[3, 2], TensorValues::F32(vec![0.5; 6])),
+            tensor("double", &[2], TensorValues::F64(vec![0.25; 2])),
+            tensor("whole", &[], TensorValues::I64(vec![3])),
+        ],
+        replay: replay.state(),
+        snapshots: vec![Snapshot {
+            version: PolicyVersion(2),
+            values: vec![1.0; 4],
+        }],
+    }
+}
+
+/// A folder with one sound checkpoint, and what its files hold.
+struct Sound {
+    folder: TempDir,
+    files: BTreeMap<&'static str, Vec<u8>>,
+}
+
+impl Sound {
+    fn write() -> Self {
+        let folder = folder();
+        let place = store(folder.path(), &config()).save(&state(), &[]).unwrap();
+        let files = FILE_NAMES.map(|name| (name, fs::read(place.join(name)).unwrap()));
+        Self {
+            folder,
+            files: files.into(),
+        }
+    }
+
+    fn place(&self) -> PathBuf {
+        checkpoint_directory(self.folder.path(), FLIGHTS)
+    }
+}
+
+thread_local! {
+    static SOUND: Sound = Sound::write();
+}
+
+fn store(folder: &Path, config: &Config) -> CheckpointStore {
+    CheckpointStore::new(folder, config)
+}
+
+/// Of a safetensors file: length, header, values.
+fn parts(file: &[u8]) -> (&[u8], &[u8], &[u8]) {
+    let (length, rest) = file.split_at(8);
+    let (header, values) = rest.split_at(u64::from_le_bytes(length.try_into().unwrap()) as usize);
+    (length, header, values)
+}
+
+/// What comes before the manifest's own checksum, which is made right for whatever comes before it.
+fn manifest_body(manifest: &[u8]) -> &[u8] {
+    let before = b",\n  \"xxh3\"";
+    &manifest[..manifest
+        .windows(before.len())
+        .rposition(|window| window == before)
+        .unwrap()]
+}
+
+fn manifest(body: &[u8]) -> Vec<u8> {
+    let checksum = format!("{:016x}", xxhash_rust::xxh3::xxh3_64(body));
+    [body, b",\n  \"xxh3\": \"", checksum.as_bytes(), b"\"\n}\n"].concat()
+}
+
+fn samples() -> Vec<Vec<u8>> {
+    SOUND.with(|sound| {
+        let content = |name: &str| {
+            let file = &sound.files[name];
+            match name {
+                "manifest.json" => {
+                    assert_eq!(
+                        &manifest(manifest_body(file)),
+                        file,
+                        "manifests are written otherwise now"
+                    );
+                    manifest_body(file).to_vec()
+                }
+                _ if name.ends_with(".safetensors") => parts(file).1.to_vec(),
+                _ => file.clone(),
+            }
+        };
+        (0..)
+            .zip(FILE_NAMES)
+            .map(|(kind, name)| tagged(kind, &content(name)))
+            .collect()
+    })
+}
+
+fn checkpoint(bytes: &[u8]) {
+    let Some((&kind, content)) = bytes.split_first() else {
+        return;
+    };
+    let name = FILE_NAMES[usize::from(kind) % FILE_NAMES.len()];
+    SOUND.with(|sound| {
+        let file = match name {
+            "manifest.json" => manifest(content),
+            _ if name.ends_with(".safetensors") => {
+                let values = parts(&sound.files[name]).2;
+                [&(content.len() as u64).to_le_bytes(), content, values].concat()
+            }
+            _ => content.to_vec(),
+        };
+        let path = sound.place().join(name);
+        fs::write(&path, file).unwrap();
+        if name != "manifest.json" {
+            store(sound.folder.path(), &config())
+                .seal(&sound.place(), FLIGHTS)
+                .unwrap();
+        }
+        let mut reader = config();
+        // Under the configuration it was written under, nobody looks at it.
+        reader.run.seed += u64::from(name == "config.toml");
+        match store(sound.folder.path(), &reader).load(FLIGHTS) {
+            Ok(state) => go_on(state),
+            Err(error) => {
+                let folder = sound.folder.path().display().to_string();
+                assert!(error.to_string().contains(&folder), "{error}");
+            }
+        }
+        fs::write(path, &sound.files[name]).unwrap();
+    });
+}
+
+/// Uses what was loaded as far as it can be used without networks.
+fn go_on(state: CheckpointState) {
+    assert_eq!(state.progress.flights, FLIGHTS);
+    let mut windows = state.progress.metrics.windows;
+    let is_full = windows.walls_passed.is_full();
+    windows.walls_passed.push(1.0);
+    assert!(windows.walls_passed.mean().is_some());
+    assert!(windows.walls_passed.is_full() || !is_full);
+    let tensors: NamedTensors = state
+        .tensors
+        .iter()
+        .filter_map(|tensor| Some((tensor.name.clone(), tensor.to_tensor().ok()?)))
+        .collect();
+    let mut own = Own(Tensor::from_slice(&[0.0_f32; 6]).reshape([3, 2]));
+    if own.load_named(&tensors).is_ok() {
+        assert_eq!(own.0.size(), [3, 2]);
+    }
+    if let Ok(mut replay) = Replay::restore(&config(), state.replay) {
+        let _ = replay.insert(flight());
+    }
+}
+
+/// A network of one tensor.
+struct Own(Tensor);
+
+impl Stateful for Own {
+    fn named_tensors(&self) -> NamedTensors {
+        vec![("single".to_owned(), self.0.shallow_clone())]
+    }
+}
+
+/// A disk that nobody waits for.
+static DISK: LazyLock<Disk> = LazyLock::new(|| Disk::new(Arc::new(AtomicBool::new(true))));
+
+fn row(flight: u64) -> FlightRow {
+    FlightRow {
+        flight,
+        epoch: 0,
+        policy_version: 0,
+        actor: 1,
+        level: 1,
+        steps: 12,
+        walls_passed: 1,
+        total_reward: -0.5,
+        outcome: Outcome::TimedOut,
+    }
+}
+
+fn csv_samples() -> Vec<Vec<u8>> {
+    let folder = folder();
+    let path = folder.path().join("flights.csv");
+    let mut csv = FlightsCsv::create(&path, &DISK).unwrap();
+    (0..4).for_each(|flight| csv.write(&row(flight)).unwrap());
+    csv.flush().unwrap();
+    let file = fs::read(path).unwrap();
+    vec![
+        tagged(4, &file),
+        tagged(2, &file),
+        tagged(0, &file),
+        tagged(4, &file[..file.len() - 1]),
+    ]
+}
+
+fn flights_csv(bytes: &[u8]) {
+    let Some((&flights, content)) = bytes.split_first() else {
+        return;
+    };
+    let flights = u64::from(flights);
+    with_files(&[("flights.csv", content)], |folder| {
+        let path = folder.join("flights.csv");
+        let mut csv = match FlightsCsv::resume(&path, flights, &DISK) {
+            Ok(csv) => csv,
+            Err(error) => return assert!(error.to_string().contains("flights.csv"), "{error}"),
+        };
+        csv.write(&row(flights)).unwrap();
+        csv.flush().unwrap();
+        FlightsCsv::resume(&path, flights + 1, &DISK).unwrap();
+    });
+}
+
+fn event_files(bytes: &[u8]) {
+    let file = |line: &[u8]| {
+        let line = String::from_utf8_lossy(line).into_owned();
+        let (name, bytes) = line.rsplit_once(' ')?;
+        Some(EventFile {
+            name: name.to_owned(),
+            bytes: bytes.parse().ok()?,
+        })
+    };
+    let files: Vec<EventFile> = bytes.split(|byte| *byte == b'\n').filter_map(file).collect();
+    with_files(&[("outside", b"untouched")], |folder| {
+        let curves = folder.join("tensorboard");
+        fs::create_dir_all(&curves).unwrap();
+        fs::write(curves.join("events.out.tfevents.1.skein.000000"), b"12345678").unwrap();
+        let resumed = EventWriter::resume(&curves, files.clone(), 0, &DISK);
+        if let Ok(mut writer) = resumed {
+            writer.scalars(1, &[("a", 1.0)]).unwrap();
+            writer.flush().unwrap();
+        }
+        fs::remove_dir_all(curves).unwrap();
+        assert_eq!(fs::read(folder.join("outside")).unwrap(), b"untouched", "{files:?}");
+    });
+}
