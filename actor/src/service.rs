@@ -62,6 +62,8 @@ enum Parting {
     LearnerGone,
     /// This process was stopped for so long that the learner has given it up: its tickets are others' now.
     Overslept,
+    /// The learner hears nothing of what this actor flies.
+    AskedToRejoin,
 }
 
 impl<'a> Service<'a> {
@@ -99,6 +101,7 @@ impl<'a> Service<'a> {
                 Ok(Parting::Leave(ending)) => return Ok(ending),
                 Ok(Parting::LearnerGone) => warn!("the learner is gone; looking for its next life"),
                 Ok(Parting::Overslept) => warn!("this process was stopped for too long; joining anew"),
+                Ok(Parting::AskedToRejoin) => warn!("nothing that was flown has arrived; joining anew"),
                 Err(error) => {
                     warn!(%error, "the line to the learner is broken; joining anew");
                     sleep(SEEK_INTERVAL);

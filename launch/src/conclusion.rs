@@ -119,6 +119,8 @@ mod tests {
             evaluation_flights: 0,
             tickets_reissued: 0,
             records_refused: 0,
+            reissued_by_reason: Default::default(),
+            refused_by_reason: Default::default(),
             resumes: 0,
             wall_secs: 75.0,
             phase_secs: BTreeMap::new(),

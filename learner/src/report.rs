@@ -67,6 +67,9 @@ fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared, di
         let mut line = progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
         line.elapsed_secs += started.elapsed().as_secs_f64();
         line.stalled = disk.waiting();
+        let faults = reception.faults();
+        line.reissued = faults.reissued_by_reason();
+        line.refused = faults.refused_by_reason();
         line.live_actors = reception.live_actors();
         line.actors = line.live_actors.len();
         marks.push((line.elapsed_secs, line.steps, line.updates));

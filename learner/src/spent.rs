@@ -1,7 +1,6 @@
 //! What a run has cost: time by what it was spent on, and what was lost on the way.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
@@ -15,10 +14,10 @@ pub struct Spent {
     pub wall_secs: f64,
     /// Seconds of the training thread by what it did.
     pub phase_secs: BTreeMap<String, f64>,
-    /// Tickets issued again.
-    pub tickets_reissued: u64,
-    /// Records refused.
-    pub records_refused: u64,
+    /// Tickets issued again, by reason.
+    pub tickets_reissued: BTreeMap<String, u64>,
+    /// Records refused, by reason.
+    pub records_refused: BTreeMap<String, u64>,
 }
 
 impl Spent {
@@ -29,11 +28,20 @@ impl Spent {
 
     /// With what the present life, begun at `started`, has come to. Its phases are in already.
     pub fn with_this_life(&self, started: Instant, shared: &Shared) -> Self {
+        let faults = shared.faults();
         Self {
             wall_secs: self.wall_secs + started.elapsed().as_secs_f64(),
             phase_secs: self.phase_secs.clone(),
-            tickets_reissued: self.tickets_reissued + shared.reissued.load(Ordering::Relaxed),
-            records_refused: self.records_refused + shared.refused.load(Ordering::Relaxed),
+            tickets_reissued: sum(&self.tickets_reissued, faults.reissued_by_reason()),
+            records_refused: sum(&self.records_refused, faults.refused_by_reason()),
         }
     }
+}
+
+fn sum(before: &BTreeMap<String, u64>, more: BTreeMap<String, u64>) -> BTreeMap<String, u64> {
+    let mut sum = before.clone();
+    for (why, count) in more {
+        *sum.entry(why).or_default() += count;
+    }
+    sum
 }

@@ -222,6 +222,8 @@ impl Training<'_> {
             (Scalar::StepsPerSec, steps_per_sec),
         ];
         self.metrics.scalars(self.last_flight(), &sizes)?;
+        self.metrics
+            .scalars(self.last_flight(), &self.reception.shared().faults().scalars())?;
         self.progress.spent.add("take flights in", started);
         Ok(())
     }

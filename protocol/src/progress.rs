@@ -1,5 +1,7 @@
 //! How far a run has come: one line of JSON on the learner's standard output for each report, for whoever watches it.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
 /// A report of the learner.
@@ -36,6 +38,12 @@ pub struct Progress {
     /// Their numbers, in ascending order.
     #[serde(default)]
     pub live_actors: Vec<u32>,
+    /// Tickets issued again since the learner's start, by reason; without reasons that did not occur.
+    #[serde(default)]
+    pub reissued: BTreeMap<String, u64>,
+    /// Records refused since the learner's start, by reason; without reasons that did not occur.
+    #[serde(default)]
+    pub refused: BTreeMap<String, u64>,
     /// Who waits for whom, when nothing has moved for a while.
     #[serde(default)]
     pub stalled: Option<String>,
@@ -62,6 +70,8 @@ impl Progress {
             vae_loss: None,
             actors: 0,
             live_actors: Vec::new(),
+            reissued: BTreeMap::new(),
+            refused: BTreeMap::new(),
             stalled: None,
             elapsed_secs: 0.0,
         }

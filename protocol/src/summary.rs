@@ -43,6 +43,12 @@ pub struct Summary {
     pub tickets_reissued: u64,
     /// Records that were refused.
     pub records_refused: u64,
+    /// [`Summary::tickets_reissued`] by reason; without reasons that did not occur.
+    #[serde(default)]
+    pub reissued_by_reason: BTreeMap<String, u64>,
+    /// [`Summary::records_refused`] by reason; without reasons that did not occur.
+    #[serde(default)]
+    pub refused_by_reason: BTreeMap<String, u64>,
     /// Times the learner was started again, whether it went on from a checkpoint or from the first flight.
     #[serde(default)]
     pub resumes: u64,
@@ -104,6 +110,8 @@ mod tests {
             evaluation_flights: 6,
             tickets_reissued: 0,
             records_refused: 0,
+            reissued_by_reason: BTreeMap::new(),
+            refused_by_reason: BTreeMap::new(),
             resumes: 2,
             wall_secs: 1.5,
             phase_secs: BTreeMap::from([("publish".to_owned(), 0.5)]),

@@ -61,6 +61,8 @@ pub enum Control {
     Heartbeat,
     /// The run is over: stop flying and exit.
     Stop,
+    /// Nothing of what this actor flies arrives: join anew.
+    Rejoin,
 }
 
 /// [`Control`] on the wire, addressed to one actor or, for heartbeats and the stop, to all.
@@ -127,6 +129,15 @@ impl ControlRecord {
         Self::to_everyone(run, 2)
     }
 
+    /// The request to one life of one actor to join anew.
+    pub fn rejoin(run: RunId, actor: ActorId, incarnation: Incarnation) -> Self {
+        Self {
+            to_actor: actor.0,
+            to_incarnation: incarnation.0,
+            ..Self::to_everyone(run, 3)
+        }
+    }
+
     fn to_everyone(run: RunId, kind: u8) -> Self {
         Self {
             run: run.0,
@@ -162,6 +173,7 @@ impl ControlRecord {
             0 => Ok(Control::Heartbeat),
             1 => self.ticket(run).map(Control::Fly),
             2 => Ok(Control::Stop),
+            3 => Ok(Control::Rejoin),
             kind => Err(ControlFault::Field {
                 name: "kind",
                 value: kind,
@@ -268,6 +280,9 @@ mod tests {
         assert!(!record.is_for(ActorId(4), Incarnation(9)));
         assert!(!record.is_for(ActorId(5), Incarnation(8)));
         assert!(ControlRecord::stop(RunId(3)).is_for(ActorId(5), Incarnation(1)));
+        let rejoin = ControlRecord::rejoin(RunId(3), ActorId(4), Incarnation(8));
+        assert_eq!(rejoin.read(RunId(3)), Ok(Control::Rejoin));
+        assert!(rejoin.is_for(ActorId(4), Incarnation(8)) && !rejoin.is_for(ActorId(4), Incarnation(9)));
     }
 
     #[test]

@@ -212,6 +212,13 @@ impl TransitionRecord {
         finite("action", &self.action)?;
         finite("reward", &[self.reward])?;
         finite("reward_terms", &self.reward_terms)?;
+        let terms = self.reward_terms;
+        // Added up as the actor does, so that the sums are the same to the last bit.
+        if self.reward != terms[0] + terms[1] + terms[2] + terms[3] {
+            return Err(RecordFault::Contradiction {
+                what: "the reward is not the sum of its terms",
+            });
+        }
         if self.action.iter().any(|value| value.abs() > 1.0) {
             return Err(RecordFault::ActionOutOfRange { action: self.action });
         }
@@ -224,13 +231,18 @@ impl TransitionRecord {
                 return Err(RecordFault::Code { name, value });
             }
         }
+        if self.terminated == 1 && self.truncated == 1 {
+            return Err(RecordFault::Contradiction {
+                what: "the flight was terminated and truncated in one step",
+            });
+        }
         Ok(())
     }
 
     fn check_ending(&self) -> Result<(), RecordFault> {
         let (name, value) = if Outcome::from_code(self.outcome).is_none() {
             ("outcome", self.outcome)
-        } else if self.walls_passed > self.course_walls {
+        } else if u32::from(self.start_level) + u32::from(self.walls_passed) > u32::from(self.course_walls) + 1 {
             ("walls_passed", self.walls_passed)
         } else {
             return Ok(());
@@ -279,6 +291,12 @@ pub enum RecordFault {
     TooLong {
         /// Records of the longest flight.
         most: usize,
+    },
+    /// It contradicts itself or the records before it.
+    #[error("{what}")]
+    Contradiction {
+        /// What cannot be.
+        what: &'static str,
     },
     /// An action no policy of ours chooses.
     #[error("action {action:?} is outside [-1, 1]")]
@@ -346,6 +364,8 @@ mod tests {
         assert!(check(|r| r.velocity_mps[1] = -1e8).contains("velocity_mps holds -100000000"));
         assert!(check(|r| r.action = [0.0, 1.5]).contains("action"));
         assert!(check(|r| r.terminated = 2).contains("terminated"));
+        assert!(check(|r| r.reward = 0.5).contains("not the sum of its terms"));
+        assert!(check(|r| (r.terminated, r.truncated) = (1, 1)).contains("terminated and truncated"));
         let closes = |r: &mut TransitionRecord| {
             r.kind = RecordKind::Closing.code();
             r.outcome = Outcome::ReachedEnd.code();

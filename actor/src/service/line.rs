@@ -155,6 +155,9 @@ impl<'a> LearnerLine<'a> {
     fn obey(&mut self, said: Control) {
         match said {
             Control::Heartbeat => {}
+            Control::Rejoin => {
+                self.parting.get_or_insert(Parting::AskedToRejoin);
+            }
             Control::Stop => self.parting = Some(Parting::Leave(Ending::Stopped)),
             Control::Fly(ticket) => {
                 // A flight issued again replaces its earlier ticket.

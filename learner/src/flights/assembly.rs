@@ -27,6 +27,19 @@ pub struct Assembly {
     flight: CommittedFlight,
     keep: Keep,
     longest_records: usize,
+    /// How the last step left the flight; its walls passed are in `flight`.
+    last_step: StepEnd,
+}
+
+/// How a step left its flight.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum StepEnd {
+    /// It goes on.
+    Onward,
+    /// It ended in a state without a future.
+    Terminated { level_up: bool },
+    /// It was cut off.
+    Truncated,
 }
 
 /// What a record did to its flight.
@@ -73,12 +86,18 @@ impl Assembly {
             flight,
             keep,
             longest_records,
+            last_step: StepEnd::Onward,
         }
     }
 
     /// Whether nothing has arrived yet.
     pub fn is_empty(&self) -> bool {
         self.flight.observations.is_empty()
+    }
+
+    /// Records that have arrived.
+    pub fn records(&self) -> usize {
+        self.flight.observations.len()
     }
 
     /// Takes the next record in.
@@ -94,6 +113,10 @@ impl Assembly {
         if self.flight.observations.len() == self.longest_records {
             let most = self.longest_records;
             return Err(RecordFault::TooLong { most });
+        }
+        match kind {
+            RecordKind::Closing => self.check_ending(record)?,
+            RecordKind::Step | RecordKind::Failed => self.check_step(record)?,
         }
         self.flight.observations.push(StepObservation {
             latent: record.latent,
@@ -111,7 +134,45 @@ impl Assembly {
         self.flight.rewards.push(record.reward);
         self.flight.reward_terms.push(record.reward_terms);
         self.flight.level_up.push(record.level_up == 1);
+        self.flight.walls_passed = record.walls_passed;
+        self.last_step = StepEnd::of(record);
         Ok(Assembled::Step)
+    }
+
+    /// Whether the flight goes on, and walls are passed as the step says.
+    fn check_step(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
+        let passed_before = self.flight.walls_passed;
+        let passes = record.walls_passed > passed_before;
+        let levels_up = record.level_up == 1;
+        // Reaching the end wall is a level-up too, and terminates the flight.
+        let may_level_up = passes || record.terminated == 1;
+        refuse_contradictions([
+            ("a step after the flight's end", self.last_step != StepEnd::Onward),
+            ("walls passed grow fewer", record.walls_passed < passed_before),
+            ("a wall passed without a level-up", passes && !levels_up),
+            ("a level-up without a wall passed", levels_up && !may_level_up),
+        ])
+    }
+
+    /// Whether the last step ended the flight as the closing record says.
+    fn check_ending(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
+        if self.is_empty() {
+            // It is told from one that is out of its place.
+            return Ok(());
+        }
+        let outcome = Outcome::from_code(record.outcome);
+        let fits = match self.last_step {
+            StepEnd::Onward => false,
+            StepEnd::Truncated => outcome == Some(Outcome::TimedOut),
+            StepEnd::Terminated { level_up } => {
+                outcome == Some(Outcome::Collided) || (outcome == Some(Outcome::ReachedEnd) && level_up)
+            }
+        };
+        let passed = self.flight.walls_passed;
+        refuse_contradictions([
+            ("the flight did not end as it closes", !fits),
+            ("walls passed after the last step", record.walls_passed != passed),
+        ])
     }
 
     fn close(&mut self, record: &TransitionRecord) -> Result<CommittedFlight, RecordFault> {
@@ -139,6 +200,26 @@ impl Assembly {
             self.incarnation,
         );
         Ok(std::mem::replace(self, empty).flight)
+    }
+}
+
+impl StepEnd {
+    fn of(record: &TransitionRecord) -> Self {
+        match (record.terminated, record.truncated) {
+            (1, _) => Self::Terminated {
+                level_up: record.level_up == 1,
+            },
+            (_, 1) => Self::Truncated,
+            _ => Self::Onward,
+        }
+    }
+}
+
+/// Refuses the first of the contradictions that is there.
+fn refuse_contradictions<const N: usize>(contradictions: [(&'static str, bool); N]) -> Result<(), RecordFault> {
+    match contradictions.into_iter().find(|(_, is_there)| *is_there) {
+        Some((what, _)) => Err(RecordFault::Contradiction { what }),
+        None => Ok(()),
     }
 }
 
@@ -178,6 +259,7 @@ mod tests {
         let mut record = TransitionRecord::zeroed();
         record.begin(&ticket(), ACTOR, LIFE, step);
         record.depth.fill(step as u8);
+        record.truncated = u8::from(step == STEPS - 1);
         if step == STEPS {
             record.kind = RecordKind::Closing.code();
             record.outcome = Outcome::TimedOut.code();
@@ -215,14 +297,15 @@ mod tests {
     #[test]
     fn a_flight_that_never_ends_is_refused_at_its_limit() {
         let mut assembly = assembly(Keep::Depth);
-        for step in 0..STEPS {
-            assembly.push(&record(step)).unwrap();
-        }
         let onward = |step| {
             let mut record = record(step);
             record.kind = RecordKind::Step.code();
+            record.truncated = 0;
             record
         };
+        for step in 0..STEPS {
+            assembly.push(&onward(step)).unwrap();
+        }
         assert!(matches!(assembly.push(&onward(STEPS)), Ok(Assembled::Step)));
         let fault = assembly.push(&onward(STEPS + 1)).unwrap_err();
         assert_eq!(
@@ -239,5 +322,57 @@ mod tests {
         let kept = assemble(Keep::Depth).depth.unwrap();
         let images: Vec<_> = kept.chunks_exact(IMAGE_PIXELS).map(|image| image.to_vec()).collect();
         assert_eq!(images, (0..=3).map(|step| vec![step; IMAGE_PIXELS]).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_flight_that_contradicts_itself_is_refused() {
+        // A change of one record, by its step, and what is said of it or of the first one that shows it.
+        type Case = (u32, fn(&mut TransitionRecord), &'static str);
+        let cases: [Case; 9] = [
+            (0, |r| r.truncated = 1, "a step after the flight's end"),
+            (0, |r| r.terminated = 1, "a step after the flight's end"),
+            (2, |r| r.truncated = 0, "the flight did not end as it closes"),
+            (
+                3,
+                |r| r.outcome = Outcome::Collided.code(),
+                "the flight did not end as it closes",
+            ),
+            (
+                2,
+                |r| (r.truncated, r.terminated) = (0, 1),
+                "the flight did not end as it closes",
+            ),
+            (1, |r| r.walls_passed = 1, "a wall passed without a level-up"),
+            (1, |r| r.level_up = 1, "a level-up without a wall passed"),
+            (1, |r| (r.walls_passed, r.level_up) = (1, 1), "walls passed grow fewer"),
+            (3, |r| r.walls_passed = 1, "walls passed after the last step"),
+        ];
+        for (step, change, expected) in cases {
+            let mut assembly = assembly(Keep::Latents);
+            let fault = (0..=STEPS).find_map(|at| {
+                let mut record = record(at);
+                record.course_walls = 5;
+                if at == step {
+                    change(&mut record);
+                }
+                assembly.push(&record).err()
+            });
+            assert_eq!(fault, Some(RecordFault::Contradiction { what: expected }), "{expected}");
+        }
+    }
+
+    #[test]
+    fn the_end_wall_is_reached_by_a_level_up_that_passes_no_wall() {
+        for (level_up, is_refused) in [(1, false), (0, true)] {
+            let mut assembly = assembly(Keep::Latents);
+            let mut last = record(0);
+            (last.terminated, last.level_up) = (1, level_up);
+            assembly.push(&last).unwrap();
+            let mut closing = record(1);
+            closing.kind = RecordKind::Closing.code();
+            closing.outcome = Outcome::ReachedEnd.code();
+            closing.course_walls = 5;
+            assert_eq!(assembly.push(&closing).is_err(), is_refused);
+        }
     }
 }

@@ -10,16 +10,21 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use skein_protocol::config::TransportSection;
-use skein_protocol::ids::{ActorId, Attempt, Epoch, FlightId, Incarnation};
+use skein_protocol::ids::{ActorId, Attempt, Epoch, FlightId, Incarnation, RunId};
 use skein_protocol::status::{ActorState, ActorStatus};
 use skein_protocol::ticket::{ControlRecord, Ticket};
 use skein_protocol::transition::{RecordFault, TransitionRecord};
 
 use super::assembly::{Assembled, Assembly, Keep};
+use super::failures::Failures;
+use super::faults::{Faults, Refusal, Reissue};
+use super::situation::{FlightOut, Situation};
 use crate::flight::CommittedFlight;
 
-/// Times a flight may fail, in the simulator or by numbers that make no sense: it is a function of its ticket, so it will fail again.
-const MOST_FAILURES: u32 = 3;
+pub use super::failures::HopelessFlight;
+
+/// Flights that an actor may spoil one after the other before others are preferred to it.
+const MOST_SPOILED: u32 = 3;
 
 /// A flight to be flown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,36 +48,18 @@ pub struct Place {
     pub index: usize,
 }
 
-/// Counts of what went wrong and was made good.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Faults {
-    /// Tickets issued again.
-    pub reissued: u64,
-    /// Records that belonged to no ticket, or made no sense.
-    pub refused: u64,
-}
-
-/// A flight that no actor can fly.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("flight {flight} failed {failures} times, at last because {why}; the logs of learner and actors say more")]
-pub struct HopelessFlight {
-    /// The flight.
-    pub flight: FlightId,
-    /// Its failures.
-    pub failures: u32,
-    /// What went wrong the last time.
-    pub why: String,
-}
-
 /// The book-keeping.
 #[derive(Debug)]
 pub struct Desk {
+    run: RunId,
     limits: TransportSection,
     /// Orders without an actor, first to be flown first.
     waiting: VecDeque<Order>,
     actors: BTreeMap<ActorId, Actor>,
-    failures: BTreeMap<FlightId, u32>,
+    failures: Failures,
     faults: Faults,
+    /// What is to be said to actors besides their tickets.
+    letters: Vec<ControlRecord>,
 }
 
 #[derive(Debug)]
@@ -81,6 +68,14 @@ struct Actor {
     last_sign: Instant,
     /// Tickets it holds, in the order it flies them.
     tickets: VecDeque<Issued>,
+    /// Flights it has spoiled since the last one that was committed.
+    spoiled: u32,
+}
+
+impl Actor {
+    fn is_trusted(&self) -> bool {
+        self.spoiled < MOST_SPOILED
+    }
 }
 
 #[derive(Debug)]
@@ -91,14 +86,16 @@ struct Issued {
 }
 
 impl Desk {
-    /// A desk without orders and actors.
-    pub fn new(limits: &TransportSection) -> Self {
+    /// A desk of `run` without orders and actors.
+    pub fn new(run: RunId, limits: &TransportSection) -> Self {
         Self {
+            run,
             limits: limits.clone(),
             waiting: VecDeque::new(),
             actors: BTreeMap::new(),
-            failures: BTreeMap::new(),
+            failures: Failures::default(),
             faults: Faults::default(),
+            letters: Vec::new(),
         }
     }
 
@@ -110,6 +107,32 @@ impl Desk {
     /// What went wrong so far.
     pub fn faults(&self) -> Faults {
         self.faults
+    }
+
+    /// Counts a sign of life that makes no sense.
+    pub fn refuse_status(&mut self) {
+        self.faults.refuse(Refusal::Status);
+    }
+
+    /// Who waits for whom at `now`.
+    pub fn situation(&self, now: Instant) -> Situation {
+        let since = |then| now.saturating_duration_since(then);
+        let out = self.actors.iter().flat_map(|(id, actor)| {
+            actor.tickets.iter().map(move |issued| FlightOut {
+                flight: issued.order.ticket.flight,
+                actor: *id,
+                records: issued.assembly.records(),
+                issued: since(issued.since),
+                unheard: since(actor.last_sign),
+            })
+        });
+        let mut out: Vec<_> = out.collect();
+        out.sort_by_key(|out| out.flight);
+        Situation {
+            actors: self.actors.len(),
+            waiting: self.waiting.len(),
+            out,
+        }
     }
 
     /// Orders that are not committed yet.
@@ -128,21 +151,29 @@ impl Desk {
         match status.state {
             ActorState::Leaving => {
                 if known == Some(status.incarnation) {
-                    self.dismiss(status.actor, "left");
+                    self.dismiss(status.actor, Reissue::Left);
                 }
             }
             // An older life's late word is not believed: incarnations grow.
             ActorState::Serving if known.is_some_and(|known| known > status.incarnation) => {}
             ActorState::Serving => {
                 if known.is_some_and(|known| known != status.incarnation) {
-                    self.dismiss(status.actor, "restarted");
+                    self.dismiss(status.actor, Reissue::Restarted);
                 }
+                // A bound, whatever actors say that there be: each would be given tickets.
+                if !self.actors.contains_key(&status.actor) && self.actors.len() >= self.limits.max_actors {
+                    self.faults.refuse(Refusal::Status);
+                    tracing::debug!(actor = %status.actor, limit = self.limits.max_actors, "more actors than transport.max_actors");
+                    return;
+                }
+                self.failures.heard(status.actor, now);
                 let actor = self.actors.entry(status.actor).or_insert_with(|| {
                     tracing::info!(actor = %status.actor, pid = status.pid, "actor attached");
                     Actor {
                         incarnation: status.incarnation,
                         last_sign: now,
                         tickets: VecDeque::new(),
+                        spoiled: 0,
                     }
                 });
                 actor.last_sign = now;
@@ -165,7 +196,7 @@ impl Desk {
             .get_mut(&id)
             .filter(|actor| actor.incarnation.0 == record.incarnation)
         else {
-            self.faults.refused += 1;
+            self.faults.refuse(Refusal::Stranger);
             return Ok(None);
         };
         actor.last_sign = now;
@@ -174,12 +205,12 @@ impl Desk {
         };
         let Some(position) = actor.tickets.iter().position(is_of) else {
             // The rest of a flight that was given up.
-            self.faults.refused += 1;
+            self.faults.refuse(Refusal::NoTicket);
             return Ok(None);
         };
         // Tickets are flown in order: those before this one never reached the actor, or their records never reached us.
         for _ in 0..position {
-            self.reissue_first(id, "skipped");
+            self.reissue_first(id, Reissue::Skipped);
         }
         self.advance(id, record, now)
     }
@@ -199,7 +230,7 @@ impl Desk {
             Ok(Assembled::Whole(flight)) => {
                 let place = issued.order.place;
                 self.remove_first(id, now);
-                self.failures.remove(&flight.flight);
+                self.failures.flown(flight.flight);
                 Ok(Some((place, *flight)))
             }
             Ok(Assembled::Failed) => {
@@ -208,7 +239,7 @@ impl Desk {
             }
             Err(fault) => {
                 let flight = issued.order.ticket.flight;
-                self.refuse(id, flight, record, fault).map(|()| None)
+                self.refuse(id, flight, record, &fault).map(|()| None)
             }
         }
     }
@@ -218,34 +249,45 @@ impl Desk {
         id: ActorId,
         flight: FlightId,
         record: &TransitionRecord,
-        fault: RecordFault,
+        fault: &RecordFault,
     ) -> Result<(), HopelessFlight> {
-        tracing::warn!(actor = %id, %flight, step = record.step, %fault, "record refused");
-        self.faults.refused += 1;
+        self.faults.refuse(fault.into());
+        if self.is_worth_telling(id) {
+            tracing::warn!(actor = %id, %flight, step = record.step, %fault, "record refused");
+        }
         match fault {
             // Something got lost on the way, which need not happen again.
             RecordFault::Mismatch { .. } => {
-                self.reissue_first(id, "has a hole");
+                self.spoil_first(id, Reissue::Hole);
                 Ok(())
             }
-            // What an actor computed makes no sense, and a flight is a function of its ticket.
+            // What an actor computed makes no sense.
             fault => self.fail(id, flight, &fault.to_string()),
         }
     }
 
     /// Has the first flight of actor `id` flown again, but not for ever.
     fn fail(&mut self, id: ActorId, flight: FlightId, why: &str) -> Result<(), HopelessFlight> {
-        let failures = self.failures.entry(flight).or_default();
-        *failures += 1;
-        if *failures >= MOST_FAILURES {
-            return Err(HopelessFlight {
-                flight,
-                failures: *failures,
-                why: why.to_owned(),
-            });
-        }
-        self.reissue_first(id, "failed");
+        self.failures.failed(flight, id, why)?;
+        self.spoil_first(id, Reissue::Failed);
         Ok(())
+    }
+
+    /// Has the first flight of actor `id` flown again, and remembers it of the actor.
+    fn spoil_first(&mut self, id: ActorId, why: Reissue) {
+        self.reissue_first(id, why);
+        if let Some(actor) = self.actors.get_mut(&id) {
+            actor.spoiled += 1;
+            if actor.spoiled == MOST_SPOILED {
+                tracing::warn!(actor = %id, flights = actor.spoiled, "actor spoils every flight; others are preferred to it");
+            }
+        }
+    }
+
+    /// An actor that spoils flights for ever must not fill the log: every doubling is told.
+    fn is_worth_telling(&self, id: ActorId) -> bool {
+        let spoiled = self.actors.get(&id).map_or(0, |actor| actor.spoiled);
+        spoiled == 0 || spoiled.is_power_of_two()
     }
 
     /// Gives up actors that are silent and tickets that take too long.
@@ -256,24 +298,33 @@ impl Desk {
         for id in ids {
             let actor = &self.actors[&id];
             if now.saturating_duration_since(actor.last_sign) > silence {
-                self.dismiss(id, "is silent");
-            } else if actor
-                .tickets
-                .front()
-                .is_some_and(|issued| now.saturating_duration_since(issued.since) > deadline)
+                self.dismiss(id, Reissue::Silent);
+            } else if let Some(issued) = actor.tickets.front()
+                && now.saturating_duration_since(issued.since) > deadline
             {
-                self.reissue_first(id, "took too long");
+                // Of an actor that speaks, not one record came: its line may be broken in one direction. A new one is not.
+                if issued.assembly.is_empty() {
+                    self.letters
+                        .push(ControlRecord::rejoin(self.run, id, actor.incarnation));
+                }
+                self.spoil_first(id, Reissue::Late);
                 self.restart_clock(id, now);
             }
         }
+        self.failures.on_time(now);
     }
 
-    /// Hands out tickets as far as there are orders and actors with credit: each actor its first before any its second. Returns what to send.
+    /// Hands out tickets as far as there are orders and actors with credit: each actor its first before any its second, and none to an actor that spoils
+    /// every flight while there are others. Returns what to send.
     pub fn issue(&mut self, now: Instant) -> Vec<ControlRecord> {
-        let mut messages = Vec::new();
+        let mut messages = std::mem::take(&mut self.letters);
+        let credit = self.limits.tickets_per_actor;
+        let any_trusted = self.actors.values().any(Actor::is_trusted);
         while !self.waiting.is_empty() {
-            let credit = self.limits.tickets_per_actor;
-            let with_credit = self.actors.iter_mut().filter(|(_, actor)| actor.tickets.len() < credit);
+            let with_credit = self
+                .actors
+                .iter_mut()
+                .filter(|(_, actor)| actor.tickets.len() < credit && (actor.is_trusted() || !any_trusted));
             let Some((&id, actor)) = with_credit.min_by_key(|(_, actor)| actor.tickets.len()) else {
                 break;
             };
@@ -293,19 +344,21 @@ impl Desk {
     }
 
     /// Forgets an actor; its tickets are issued again.
-    fn dismiss(&mut self, id: ActorId, why: &str) {
+    fn dismiss(&mut self, id: ActorId, why: Reissue) {
         while self.actors.get(&id).is_some_and(|actor| !actor.tickets.is_empty()) {
             self.reissue_last(id, why);
         }
         if self.actors.remove(&id).is_some() {
-            tracing::info!(actor = %id, "actor {why}");
+            tracing::info!(actor = %id, "actor {}", why.name());
         }
     }
 
-    fn remove_first(&mut self, id: ActorId, now: Instant) -> Option<Issued> {
-        let issued = self.actors.get_mut(&id)?.tickets.pop_front();
+    fn remove_first(&mut self, id: ActorId, now: Instant) {
+        if let Some(actor) = self.actors.get_mut(&id) {
+            actor.tickets.pop_front();
+            actor.spoiled = 0;
+        }
         self.restart_clock(id, now);
-        issued
     }
 
     /// A ticket's time runs from when the actor could begin it.
@@ -315,23 +368,25 @@ impl Desk {
         }
     }
 
-    fn reissue_first(&mut self, id: ActorId, why: &str) {
+    fn reissue_first(&mut self, id: ActorId, why: Reissue) {
         if let Some(issued) = self.actors.get_mut(&id).and_then(|actor| actor.tickets.pop_front()) {
             self.reissue(issued, id, why);
         }
     }
 
-    fn reissue_last(&mut self, id: ActorId, why: &str) {
+    fn reissue_last(&mut self, id: ActorId, why: Reissue) {
         if let Some(issued) = self.actors.get_mut(&id).and_then(|actor| actor.tickets.pop_back()) {
             self.reissue(issued, id, why);
         }
     }
 
-    fn reissue(&mut self, issued: Issued, id: ActorId, why: &str) {
+    fn reissue(&mut self, issued: Issued, id: ActorId, why: Reissue) {
         let mut order = issued.order;
-        tracing::warn!(actor = %id, flight = %order.ticket.flight, attempt = %order.ticket.attempt, "ticket issued again: it or its actor {why}");
-        order.ticket.attempt = Attempt(order.ticket.attempt.0 + 1);
-        self.faults.reissued += 1;
+        if self.is_worth_telling(id) {
+            tracing::warn!(actor = %id, flight = %order.ticket.flight, attempt = %order.ticket.attempt, "ticket issued again: it or its actor {}", why.name());
+        }
+        order.ticket.attempt = Attempt(order.ticket.attempt.0.wrapping_add(1));
+        self.faults.reissue(why);
         // Others wait for the oldest flights: back to the front.
         self.waiting.push_front(order);
     }

@@ -4,10 +4,11 @@ use std::collections::BTreeMap;
 
 use bytemuck::Zeroable;
 use proptest::prelude::*;
-use skein_protocol::ids::{PolicyVersion, RunId};
+use skein_protocol::ids::PolicyVersion;
 use skein_protocol::ticket::{Control, CourseChoice, Exploration};
 use skein_protocol::transition::{Outcome, RecordKind};
 
+use super::super::failures;
 use super::*;
 
 const RUN: RunId = RunId(1);
@@ -74,6 +75,8 @@ fn records(ticket: &Ticket, actor: u32, life: Incarnation) -> Vec<TransitionReco
             let mut record = TransitionRecord::zeroed();
             record.begin(ticket, ActorId(actor), life, step);
             record.reward = ticket.flight.0 as f32 + step as f32;
+            record.reward_terms = [record.reward, 0.0, 0.0, 0.0];
+            record.terminated = u8::from(step == steps - 1);
             if step == steps {
                 record.kind = RecordKind::Closing.code();
                 record.outcome = Outcome::Collided.code();
@@ -92,7 +95,7 @@ fn feed(desk: &mut Desk, records: &[TransitionRecord], now: Instant) -> Vec<(Pla
 
 /// A desk with one actor that holds tickets 0 and 1 of three orders.
 fn desk(now: Instant) -> (Desk, Vec<Ticket>) {
-    let mut desk = Desk::new(&limits());
+    let mut desk = Desk::new(RUN, &limits());
     (0..3).for_each(|flight| desk.order(order(flight)));
     attach(&mut desk, 0, LIFE, now);
     let tickets = tickets_for(&desk.issue(now), 0, LIFE);
@@ -112,7 +115,7 @@ fn credit_bounds_what_is_in_the_air_and_returns_with_each_flight() {
 #[test]
 fn every_actor_gets_its_first_ticket_before_any_its_second() {
     let now = Instant::now();
-    let mut desk = Desk::new(&limits());
+    let mut desk = Desk::new(RUN, &limits());
     (0..3).for_each(|flight| desk.order(order(flight)));
     attach(&mut desk, 0, LIFE, now);
     attach(&mut desk, 1, LIFE, now);
@@ -128,7 +131,7 @@ fn a_flight_with_a_hole_is_discarded_whole_and_flown_again() {
     let mut sent = records(&tickets[0], 0, LIFE);
     sent.remove(1);
     assert!(feed(&mut desk, &sent, now).is_empty());
-    assert_eq!(desk.faults().reissued, 1);
+    assert_eq!(desk.faults().reissued(), 1);
     let again = tickets_for(&desk.issue(now), 0, LIFE)[0];
     assert_eq!((again.flight, again.attempt), (FlightId(0), Attempt(1)));
     // The actor flies on with what it holds: flight 1, then flight 0 again.
@@ -199,37 +202,121 @@ fn a_ticket_that_takes_too_long_is_issued_again_though_its_actor_lives() {
         attach(&mut desk, 0, LIFE, now);
         desk.on_time(now);
     }
-    assert_eq!(desk.faults().reissued, 1);
+    let letters = desk.issue(now);
+    assert!(
+        letters
+            .iter()
+            .any(|letter| letter.is_for(ActorId(0), LIFE) && letter.read(RUN) == Ok(Control::Rejoin)),
+        "nothing at all came of it: its line is broken"
+    );
+    assert_eq!(desk.faults().reissued(), 1);
     assert!(feed(&mut desk, &records(&tickets[0], 0, LIFE), now).is_empty());
 }
 
-/// Lets flight 0 fail as often as it may, by `damage` to its first record.
-fn fail_for_ever(damage: fn(&mut TransitionRecord)) -> HopelessFlight {
+/// Has an actor fail what is its first flight, again and again, by `damage` to its first record, until the desk gives up; at most `most` times.
+fn fail_for_ever(
+    desk: &mut Desk,
+    actor: u32,
+    most: usize,
+    damage: fn(&mut TransitionRecord),
+) -> Result<(), HopelessFlight> {
     let now = Instant::now();
-    let (mut desk, tickets) = desk(now);
-    let mut ticket = tickets[0];
-    for _ in 1..MOST_FAILURES {
-        let mut record = records(&ticket, 0, LIFE)[0];
+    for _ in 0..most {
+        desk.issue(now);
+        let issued = desk.actors[&ActorId(actor)].tickets.front();
+        let Some(ticket) = issued.map(|issued| issued.order.ticket) else {
+            return Ok(());
+        };
+        let mut record = records(&ticket, actor, LIFE)[0];
         damage(&mut record);
-        assert!(desk.on_record(&record, now).unwrap().is_none());
-        let issued = tickets_for(&desk.issue(now), 0, LIFE);
-        ticket = *issued.iter().find(|ticket| ticket.flight == FlightId(0)).unwrap();
+        assert!(desk.on_record(&record, now)?.is_none());
     }
-    let mut record = records(&ticket, 0, LIFE)[0];
-    damage(&mut record);
-    desk.on_record(&record, now).unwrap_err()
+    Ok(())
+}
+
+const NOT_A_NUMBER: fn(&mut TransitionRecord) = |record| record.reward = f32::NAN;
+
+#[test]
+fn a_flight_that_the_only_actor_always_fails_is_given_up_with_the_reason() {
+    let now = Instant::now();
+    let hopeless = |damage| fail_for_ever(&mut desk(now).0, 0, 9, damage).unwrap_err().to_string();
+    let broken_down = hopeless(|record| record.kind = RecordKind::Failed.code());
+    assert!(
+        broken_down.contains("failed 3 times, at last because the simulator broke down"),
+        "{broken_down}"
+    );
+    assert!(hopeless(NOT_A_NUMBER).contains("reward is not finite"));
 }
 
 #[test]
-fn a_flight_that_always_fails_is_given_up_with_the_reason() {
-    let broken_down = fail_for_ever(|record| record.kind = RecordKind::Failed.code());
+fn an_actor_that_sends_garbage_for_ever_fails_no_run_while_another_flies() {
+    let now = Instant::now();
+    let mut desk = Desk::new(RUN, &limits());
+    (0..6).for_each(|flight| desk.order(order(flight)));
+    attach(&mut desk, 0, LIFE, now);
+    desk.issue(now);
+    attach(&mut desk, 1, LIFE, now);
+    fail_for_ever(&mut desk, 0, 1000, NOT_A_NUMBER).unwrap();
     assert!(
-        broken_down
-            .to_string()
-            .contains("flight 0 failed 3 times, at last because the simulator broke down")
+        desk.actors[&ActorId(0)].tickets.is_empty(),
+        "others are preferred to it"
     );
-    let senseless = fail_for_ever(|record| record.reward = f32::NAN);
-    assert!(senseless.to_string().contains("reward is not finite"), "{senseless}");
+    let mut committed = 0;
+    while desk.open_orders() > 0 {
+        desk.issue(now);
+        let ticket = desk.actors[&ActorId(1)].tickets[0].order.ticket;
+        committed += feed(&mut desk, &records(&ticket, 1, LIFE), now).len();
+    }
+    assert_eq!(committed, 6);
+    assert!(desk.faults().refused_by_reason()["not finite"] >= u64::from(MOST_SPOILED));
+}
+
+#[test]
+fn a_flight_that_two_actors_fail_is_given_up() {
+    let now = Instant::now();
+    let mut desk = Desk::new(RUN, &limits());
+    desk.order(order(0));
+    attach(&mut desk, 0, LIFE, now);
+    desk.issue(now);
+    attach(&mut desk, 1, LIFE, now);
+    fail_for_ever(&mut desk, 0, 1000, NOT_A_NUMBER).unwrap();
+    let hopeless = fail_for_ever(&mut desk, 1, 1, NOT_A_NUMBER).unwrap_err();
+    assert_eq!(hopeless.flight, FlightId(0));
+}
+
+#[test]
+fn an_actor_that_may_come_back_is_waited_for_before_a_flight_is_given_up() {
+    let start = Instant::now();
+    let (mut desk, _) = desk(start);
+    attach(&mut desk, 1, LIFE, start);
+    let gone = start + Duration::from_secs(6);
+    attach(&mut desk, 0, LIFE, gone);
+    desk.on_time(gone);
+    assert_eq!(desk.actors().collect::<Vec<_>>(), [ActorId(0)]);
+    fail_for_ever(&mut desk, 0, 1000, NOT_A_NUMBER).unwrap();
+    let later = start + Duration::from_secs(31);
+    attach(&mut desk, 0, LIFE, later);
+    desk.on_time(later);
+    fail_for_ever(&mut desk, 0, 1, NOT_A_NUMBER).unwrap_err();
+}
+
+#[test]
+fn actors_beyond_the_limit_get_no_tickets_until_there_is_room() {
+    let start = Instant::now();
+    let mut desk = Desk::new(
+        RUN,
+        &TransportSection {
+            max_actors: 2,
+            ..limits()
+        },
+    );
+    (0..3).for_each(|actor| attach(&mut desk, actor, LIFE, start));
+    assert_eq!(desk.actors().count(), 2);
+    let later = start + Duration::from_secs(6);
+    attach(&mut desk, 1, LIFE, later);
+    desk.on_time(later);
+    attach(&mut desk, 2, LIFE, later);
+    assert_eq!(desk.actors().collect::<Vec<_>>(), [ActorId(1), ActorId(2)]);
 }
 
 /// What may happen next to one of three actors.
@@ -265,13 +352,13 @@ proptest! {
     fn every_order_is_committed_exactly_once_and_whole(events in prop::collection::vec(event(), 0..60)) {
         const ORDERS: u64 = 12;
         let mut now = Instant::now();
-        let mut desk = Desk::new(&limits());
+        let mut desk = Desk::new(RUN, &limits());
         (0..ORDERS).for_each(|flight| desk.order(order(flight)));
         let mut lives = [LIFE; 3];
         let mut held: [VecDeque<Ticket>; 3] = Default::default();
         let mut committed: BTreeMap<u64, CommittedFlight> = BTreeMap::new();
         // More than that, and the flight is given up: another test.
-        let mut poisonings: BTreeMap<FlightId, u32> = BTreeMap::new();
+        let mut poisonings: BTreeMap<FlightId, usize> = BTreeMap::new();
         let calm = (0..3 * ORDERS as usize).map(|turn| ((turn % 3) as u32, Event::FlyNext));
         let quiet = calm.clone().chain([(0, Event::Silence)]).chain(calm);
         for (actor, event) in events.into_iter().chain(quiet) {
@@ -294,7 +381,7 @@ proptest! {
                 Event::Poison(at) if at < sent.len() => {
                     let poisoned = poisonings.entry(FlightId(sent[at].flight)).or_default();
                     *poisoned += 1;
-                    if *poisoned < MOST_FAILURES {
+                    if *poisoned < failures::MOST_FAILURES {
                         sent[at].reward = f32::NAN;
                     }
                 }

@@ -3,7 +3,7 @@
 //! The training thread speaks to it through [`Reception`]: it orders batches of flights, publishes snapshots, and takes flights out of a [`Batch`] one by
 //! one. While the training thread updates the networks, records are taken in, tickets handed out and signs of life given here.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::thread::{self, JoinHandle};
@@ -18,8 +18,10 @@ use skein_protocol::snapshot::Snapshot;
 use skein_protocol::ticket::Ticket;
 
 use super::assembly::Keep;
-use super::desk::{Desk, Faults, HopelessFlight};
+use super::desk::{Desk, HopelessFlight};
+use super::faults::Faults;
 use super::server::Server;
+use super::situation::Situation;
 use crate::flight::CommittedFlight;
 
 /// How long the services may take to be opened.
@@ -44,10 +46,8 @@ pub struct Reception {
 pub struct Shared {
     /// Actors that live, in ascending order.
     live_actors: RwLock<Vec<u32>>,
-    /// Tickets issued again.
-    pub reissued: AtomicU64,
-    /// Records refused.
-    pub refused: AtomicU64,
+    faults: RwLock<Faults>,
+    situation: RwLock<Option<(Instant, Situation)>>,
     /// Why the receiving thread ended before it was told to.
     failure: RwLock<Option<ReceptionError>>,
 }
@@ -192,6 +192,19 @@ impl Shared {
         self.live_actors.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
+    /// What went wrong since the learner's start, and was made good.
+    pub fn faults(&self) -> Faults {
+        *self.faults.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Where the flights are, as of the receiving thread's last heartbeat, and how long ago that was; `None` before the first.
+    pub fn situation(&self) -> Option<(Duration, Situation)> {
+        let situation = self.situation.read().unwrap_or_else(PoisonError::into_inner);
+        situation
+            .as_ref()
+            .map(|(at, situation)| (at.elapsed(), situation.clone()))
+    }
+
     /// Why the receiving thread has ended. A panic leaves no word, and comes from a transport that is out of order: nothing else there may panic.
     fn failed(&self) -> ReceptionError {
         let failure = self.failure.read().unwrap_or_else(PoisonError::into_inner);
@@ -206,13 +219,15 @@ impl Shared {
     }
 
     pub(super) fn update(&self, desk: &Desk) {
-        let Faults { reissued, refused } = desk.faults();
         let mut live = self.live_actors.write().unwrap_or_else(PoisonError::into_inner);
         if !desk.actors().map(|actor| actor.0).eq(live.iter().copied()) {
             *live = desk.actors().map(|actor| actor.0).collect();
         }
-        self.reissued.store(reissued, Ordering::Relaxed);
-        self.refused.store(refused, Ordering::Relaxed);
+        *self.faults.write().unwrap_or_else(PoisonError::into_inner) = desk.faults();
+    }
+
+    pub(super) fn update_situation(&self, situation: Situation, now: Instant) {
+        *self.situation.write().unwrap_or_else(PoisonError::into_inner) = Some((now, situation));
     }
 }
 

@@ -67,7 +67,7 @@ impl Server {
     pub(super) fn new(identity: &RunIdentity, config: &Config, ports: LearnerPorts) -> Self {
         Self {
             run: identity.run,
-            desk: Desk::new(&config.transport),
+            desk: Desk::new(identity.run, &config.transport),
             deliveries: BTreeMap::new(),
             ports,
             outbox: VecDeque::new(),
@@ -88,7 +88,7 @@ impl Server {
             let next = self.take_records(now)?;
             self.desk.on_time(now);
             self.hand_out(now);
-            self.give_sign_of_life(now);
+            self.give_sign_of_life(now, shared);
             self.send_out();
             shared.update(&self.desk);
             if let Some(error) = self.trouble.lasting(now) {
@@ -140,7 +140,10 @@ impl Server {
         while let Some(record) = self.trouble.unless(self.ports.receive_status()).flatten() {
             match record.read(self.run) {
                 Some(status) => self.desk.on_status(&status, now),
-                None => tracing::warn!(?record, "status record refused"),
+                None => {
+                    tracing::debug!(?record, "status record refused");
+                    self.desk.refuse_status();
+                }
             }
         }
     }
@@ -200,12 +203,13 @@ impl Server {
         }
     }
 
-    fn give_sign_of_life(&mut self, now: Instant) {
+    fn give_sign_of_life(&mut self, now: Instant, shared: &Shared) {
         let last = self.last_heartbeat;
         if last.is_some_and(|last| now.duration_since(last) < self.heartbeat) {
             return;
         }
         self.last_heartbeat = Some(now);
+        shared.update_situation(self.desk.situation(now), now);
         self.trouble.unless(self.ports.maintain());
         let heartbeat = ControlRecord::heartbeat(self.run);
         self.trouble.unless(self.ports.send_control(heartbeat));

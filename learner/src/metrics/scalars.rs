@@ -63,6 +63,36 @@ scalars! {
     UpdatesPerSec => "rate/updates_per_sec",
     /// Walls passed in the flights that confirmed a candidate for the best snapshot, on average.
     EvaluationWallsPassed => "evaluation/walls_passed",
+    /// Tickets issued again because records of a later one came first, since the learner's start.
+    ReissuedSkipped => "reissued/skipped",
+    /// Tickets issued again because a record of their flight got lost.
+    ReissuedHole => "reissued/hole",
+    /// Tickets issued again because what came of them makes no sense, or the simulator broke down.
+    ReissuedFailed => "reissued/failed",
+    /// Tickets issued again because they took too long.
+    ReissuedLate => "reissued/late",
+    /// Tickets issued again because their actor fell silent.
+    ReissuedSilent => "reissued/silent",
+    /// Tickets issued again because their actor began another life.
+    ReissuedRestarted => "reissued/restarted",
+    /// Tickets issued again because their actor left.
+    ReissuedLeft => "reissued/left",
+    /// Records refused because no living actor is their sender, since the learner's start.
+    RefusedStranger => "refused/stranger",
+    /// Records refused because their actor holds no ticket for them.
+    RefusedNoTicket => "refused/no_ticket",
+    /// Records refused because they do not follow the one before.
+    RefusedOutOfOrder => "refused/out_of_order",
+    /// Records refused because a field has a value that no flight gives it.
+    RefusedImpossible => "refused/impossible",
+    /// Records refused because a number is infinite or none.
+    RefusedNotFinite => "refused/not_finite",
+    /// Records refused because a number, an action or the flight is too large.
+    RefusedTooLarge => "refused/too_large",
+    /// Records refused because they contradict themselves or those before.
+    RefusedContradiction => "refused/contradiction",
+    /// Signs of life refused.
+    RefusedStatus => "refused/status",
 }
 
 #[cfg(test)]

@@ -52,7 +52,8 @@ fn samples() -> Vec<Vec<u8>> {
     const ATTACH: [u8; 3] = [1, 0, 1];
     const ISSUE: [u8; 1] = [2];
     const STEP: [u8; 3] = [3, 0, 0];
-    const CLOSE: [u8; 3] = [3, 0, 1];
+    // The last step, and the closing record after it.
+    const CLOSE: [u8; 6] = [3, 0, 2, 3, 0, 1];
     let changed = |place: u8, value: u8| [4, 0, 0, 1, place, value];
     vec![
         [&ATTACH[..], &ISSUE, &STEP, &STEP, &CLOSE, &ISSUE, &STEP, &CLOSE].concat(),
@@ -112,7 +113,7 @@ impl Learner {
             max_records_per_flight: LONGEST_FLIGHT,
             ..TransportSection::default()
         };
-        let mut desk = Desk::new(&limits);
+        let mut desk = Desk::new(RUN, &limits);
         for flight in 0..FLIGHTS {
             desk.order(Order {
                 ticket: sample_ticket(flight),
@@ -175,8 +176,10 @@ impl Learner {
 
     fn issue(&mut self) {
         for message in self.desk.issue(self.now) {
-            let Ok(Control::Fly(ticket)) = message.read(RUN) else {
-                panic!("the desk sends tickets");
+            let ticket = match message.read(RUN) {
+                Ok(Control::Fly(ticket)) => ticket,
+                Ok(Control::Rejoin) => continue,
+                other => panic!("the desk sends tickets and letters, not {other:?}"),
             };
             let lives = (0..3).flat_map(|actor| (0..4).map(move |life| (ActorId(actor), Incarnation(life))));
             // Other actors came by records of random bytes and hold theirs for ever.
@@ -193,7 +196,7 @@ impl Learner {
 
     /// The next record of a ticket, as it should be but for what `change` makes of it.
     fn send(&mut self, script: &mut Script<'_>, change: fn(&mut TransitionRecord, &mut Script<'_>)) {
-        let (which, end) = (usize::from(script.u8()), script.u8() % 4 == 1);
+        let (which, end) = (usize::from(script.u8()), script.u8() % 4);
         let count = self.held.len();
         let Some(held) = self.held.get_mut(which % count.max(1)) else {
             return;
@@ -201,7 +204,8 @@ impl Learner {
         let mut record = TransitionRecord::zeroed();
         record.begin(&held.ticket, held.actor, held.life, held.step);
         held.step += 1;
-        if end {
+        record.truncated = u8::from(end == 2);
+        if end == 1 {
             record.kind = RecordKind::Closing.code();
             record.outcome = Outcome::TimedOut.code();
             record.course_walls = 5;

@@ -35,6 +35,7 @@ fn signal_samples() -> Vec<Vec<u8>> {
         bytes_of(&ControlRecord::fly(&sample_ticket(5), ActorId(3), Incarnation(7))).to_vec(),
         bytes_of(&ControlRecord::heartbeat(run)).to_vec(),
         bytes_of(&ControlRecord::stop(run)).to_vec(),
+        bytes_of(&ControlRecord::rejoin(run, ActorId(3), Incarnation(7))).to_vec(),
     ]
 }
 

@@ -1,0 +1,166 @@
+//! What went wrong on the way from ticket to committed flight and was made good, counted by reason.
+
+use std::collections::BTreeMap;
+
+use skein_protocol::transition::RecordFault;
+
+use crate::metrics::Scalar;
+
+macro_rules! reasons {
+    ($(#[$doc:meta])* $name:ident { $($(#[$variant_doc:meta])* $variant:ident => $text:literal, $scalar:ident),* $(,)? }) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+        pub enum $name { $($(#[$variant_doc])* $variant),* }
+
+        impl $name {
+            /// All of them.
+            pub const ALL: &[Self] = &[$(Self::$variant),*];
+
+            /// In logs, reports and the summary.
+            pub const fn name(self) -> &'static str {
+                match self { $(Self::$variant => $text),* }
+            }
+
+            /// Its curve.
+            pub const fn scalar(self) -> Scalar {
+                match self { $(Self::$variant => Scalar::$scalar),* }
+            }
+        }
+    };
+}
+
+reasons! {
+    /// Why a ticket was issued again.
+    Reissue {
+        /// Records of a later ticket of the same actor came first: it, or its records, got lost.
+        Skipped => "was skipped", ReissuedSkipped,
+        /// A record of it got lost.
+        Hole => "has a hole", ReissuedHole,
+        /// What came of it makes no sense, or the simulator broke down.
+        Failed => "failed", ReissuedFailed,
+        /// It took longer than `transport.flight_deadline_secs`.
+        Late => "took too long", ReissuedLate,
+        /// Its actor gave no sign of life for `transport.actor_silence_secs`.
+        Silent => "is silent", ReissuedSilent,
+        /// Its actor began another life.
+        Restarted => "restarted", ReissuedRestarted,
+        /// Its actor left.
+        Left => "left", ReissuedLeft,
+    }
+}
+
+reasons! {
+    /// Why a record was refused.
+    Refusal {
+        /// It is of no actor that lives, or of a former life of one.
+        Stranger => "of no living actor", RefusedStranger,
+        /// It belongs to no ticket that its actor holds: the rest of a flight that was given up.
+        NoTicket => "of no ticket", RefusedNoTicket,
+        /// It does not follow the one before, or belongs to something else.
+        OutOfOrder => "out of order", RefusedOutOfOrder,
+        /// A field has a value that no flight gives it.
+        Impossible => "impossible value", RefusedImpossible,
+        /// A number is infinite or none.
+        NotFinite => "not finite", RefusedNotFinite,
+        /// A number, an action or the flight is larger than any can be.
+        TooLarge => "too large", RefusedTooLarge,
+        /// It contradicts itself or the records before it.
+        Contradiction => "contradiction", RefusedContradiction,
+        /// A sign of life that makes no sense.
+        Status => "status", RefusedStatus,
+    }
+}
+
+impl From<&RecordFault> for Refusal {
+    fn from(fault: &RecordFault) -> Self {
+        match fault {
+            RecordFault::Mismatch { .. } => Self::OutOfOrder,
+            RecordFault::Code { .. } => Self::Impossible,
+            RecordFault::NotFinite { .. } => Self::NotFinite,
+            RecordFault::TooLarge { .. } | RecordFault::TooLong { .. } | RecordFault::ActionOutOfRange { .. } => {
+                Self::TooLarge
+            }
+            RecordFault::Contradiction { .. } => Self::Contradiction,
+        }
+    }
+}
+
+/// Counts of what went wrong and was made good.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Faults {
+    reissued: [u64; Reissue::ALL.len()],
+    refused: [u64; Refusal::ALL.len()],
+}
+
+impl Faults {
+    /// Counts a ticket that is issued again.
+    pub fn reissue(&mut self, why: Reissue) {
+        self.reissued[why as usize] += 1;
+    }
+
+    /// Counts a record that is refused.
+    pub fn refuse(&mut self, why: Refusal) {
+        self.refused[why as usize] += 1;
+    }
+
+    /// Tickets issued again, for whatever reason.
+    pub fn reissued(&self) -> u64 {
+        self.reissued.iter().sum()
+    }
+
+    /// Records refused, for whatever reason.
+    pub fn refused(&self) -> u64 {
+        self.refused.iter().sum()
+    }
+
+    /// Tickets issued again by reason; without reasons that did not occur.
+    pub fn reissued_by_reason(&self) -> BTreeMap<String, u64> {
+        occurred(Reissue::ALL.iter().map(|why| why.name()).zip(self.reissued))
+    }
+
+    /// Records refused by reason; without reasons that did not occur.
+    pub fn refused_by_reason(&self) -> BTreeMap<String, u64> {
+        occurred(Refusal::ALL.iter().map(|why| why.name()).zip(self.refused))
+    }
+
+    /// A point of each curve.
+    pub fn scalars(&self) -> Vec<(Scalar, f64)> {
+        let reissued = Reissue::ALL.iter().map(|why| why.scalar()).zip(self.reissued);
+        let refused = Refusal::ALL.iter().map(|why| why.scalar()).zip(self.refused);
+        reissued
+            .chain(refused)
+            .map(|(scalar, count)| (scalar, count as f64))
+            .collect()
+    }
+}
+
+fn occurred(counts: impl Iterator<Item = (&'static str, u64)>) -> BTreeMap<String, u64> {
+    counts
+        .filter(|(_, count)| *count > 0)
+        .map(|(why, count)| (why.to_owned(), count))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_reason_is_counted_in_its_own_place_and_has_a_curve_of_its_own() {
+        let mut faults = Faults::default();
+        for (count, why) in (1..).zip(Reissue::ALL) {
+            (0..count).for_each(|_| faults.reissue(*why));
+        }
+        faults.refuse(Refusal::Status);
+        let by_reason = faults.reissued_by_reason();
+        assert_eq!(by_reason["was skipped"], 1);
+        assert_eq!(by_reason["left"], Reissue::ALL.len() as u64);
+        assert_eq!(by_reason.values().sum::<u64>(), faults.reissued());
+        assert_eq!(faults.refused_by_reason(), [("status".to_owned(), 1)].into());
+        let mut tags: Vec<_> = faults.scalars().iter().map(|(scalar, _)| scalar.tag()).collect();
+        assert_eq!(tags.len(), Reissue::ALL.len() + Refusal::ALL.len());
+        tags.sort_unstable();
+        tags.dedup();
+        assert_eq!(tags.len(), Reissue::ALL.len() + Refusal::ALL.len());
+    }
+}
