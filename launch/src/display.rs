@@ -244,23 +244,18 @@ mod tests {
 
     fn progress(elapsed_secs: f64, flights: u64) -> Progress {
         Progress {
-            phase: Phase::Flying,
             flights,
-            total_flights: 2000,
-            evaluation_flights: (0, 0),
             steps: 10_000,
             updates: 4000,
             vae_updates: 100,
             steps_per_sec: 151.6,
             updates_per_sec: 63.2,
             walls_passed: Some(1.234),
-            mean_return: None,
             temperature: Some(0.0512),
-            vae_loss: None,
             actors: 1,
             live_actors: vec![0],
-            stalled: None,
             elapsed_secs,
+            ..Progress::start(2000)
         }
     }
 

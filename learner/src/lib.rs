@@ -25,5 +25,6 @@ pub mod state;
 pub mod trainer;
 pub mod training;
 pub mod vae;
+pub mod watchdog;
 
 pub use error::UpdateError;

@@ -10,9 +10,12 @@ use skein_protocol::progress::Progress;
 
 use crate::disk::Disk;
 use crate::flights::reception::Shared;
+use crate::watchdog::Watchdog;
 
 /// Time between two lines.
 const INTERVAL: Duration = Duration::from_millis(500);
+/// How long the last line may take.
+const LAST_LINE_PATIENCE: Duration = Duration::from_secs(2);
 /// Rates are averaged over this many intervals.
 const RATE_INTERVALS: usize = 10;
 
@@ -52,7 +55,13 @@ impl Reporter {
 impl Drop for Reporter {
     fn drop(&mut self) {
         self.ended.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
+        let Some(thread) = self.thread.take() else { return };
+        // Whoever reads the lines may be frozen, and the pipe full: then the last lines are lost, and the thread ends with the process.
+        let deadline = Instant::now() + LAST_LINE_PATIENCE;
+        while !thread.is_finished() && Instant::now() < deadline {
+            thread::sleep(Duration::from_millis(5));
+        }
+        if thread.is_finished() {
             // A panic of that thread was logged by the hook; it has no result that could be lost.
             let _ = thread.join();
         }
@@ -61,12 +70,13 @@ impl Drop for Reporter {
 
 fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared, disk: &Disk) {
     let started = Instant::now();
+    let mut watchdog = Watchdog::new(started);
     let mut marks: Vec<(f64, u64, u64)> = Vec::new();
     loop {
         let last = ended.load(Ordering::Relaxed);
         let mut line = progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
         line.elapsed_secs += started.elapsed().as_secs_f64();
-        line.stalled = disk.waiting();
+        line.stalled = watchdog.look(Instant::now(), &line, disk.waiting(), reception.situation());
         let faults = reception.faults();
         line.reissued = faults.reissued_by_reason();
         line.refused = faults.refused_by_reason();

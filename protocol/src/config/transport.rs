@@ -38,9 +38,10 @@ impl Default for TransportSection {
 }
 
 impl TransportSection {
-    /// Interval of the signs of life that both sides give, well below either silence limit.
+    /// Interval of the signs of life that both sides give, well below either silence limit, and at most two seconds: all that is done at times is done
+    /// at heartbeats.
     pub fn heartbeat(&self) -> Duration {
-        Duration::from_secs_f64(self.actor_silence_secs.min(self.learner_silence_secs) / 8.0)
+        Duration::from_secs_f64((self.actor_silence_secs.min(self.learner_silence_secs) / 8.0).min(2.0))
     }
 
     pub(super) fn validate(&self) -> Result<(), Invalid> {
