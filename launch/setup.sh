@@ -13,6 +13,8 @@ readonly TORCH_VERSION=2.13.0
 readonly BUILD_VERSION="$TORCH_VERSION+cpu.1"
 # Download (540 MB, twice for a moment while pip moves it) and unpacked files (490 MB).
 readonly NEEDED_MB=1700
+# For a download, one's own or somebody else's: enough at 0.3 MB/s.
+readonly LONGEST_WAIT_SECS=1800
 
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 readonly repository
@@ -85,17 +87,19 @@ END
     # Errors are held in memory: on a full disk there is no file to put them in.
     local errors
     { errors=$(TMPDIR="$work/tmp" PYTHONDONTWRITEBYTECODE=1 PIP_REQUIRE_VIRTUALENV=0 \
-        python3 -m pip download --disable-pip-version-check --no-cache-dir --no-deps --require-hashes \
+        timeout "$LONGEST_WAIT_SECS" python3 -m pip download --disable-pip-version-check --no-cache-dir --no-deps --require-hashes \
         --only-binary=:all: --implementation cp --python-version 311 --abi cp311 --abi none \
         --platform manylinux_2_28_x86_64 --platform manylinux_2_25_x86_64 \
         --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 \
         --requirement "$work/requirements.txt" --dest "$work/wheels" 2>&1 >&3) ||
-        explain_failed_download "$errors"; } 3>&2
+        explain_failed_download "$?" "$errors"; } 3>&2
     rm -rf "$work/tmp"
 }
 
 explain_failed_download() {
-    local errors=$1
+    local status=$1 errors=$2
+    ((status != 124)) ||
+        fail "the download was not done after $((LONGEST_WAIT_SECS / 60)) minutes: run again on a faster connection, or set LIBTORCH to your own libtorch $TORCH_VERSION"
     case $errors in
         *"DO NOT MATCH THE HASHES"*)
             fail "a downloaded wheel does not have the pinned hash; it was thrown away: run again, and if it happens again look at what your proxy or package mirror serves" ;;
@@ -174,7 +178,11 @@ main() {
 
     # One at a time; the lock goes with the process. What an earlier, killed run left aside is then nobody's and is removed.
     exec 9<"$repository"
-    flock --nonblock 9 || { say "another set-up is under way, waiting for it"; flock 9; }
+    flock --nonblock 9 || {
+        say "another set-up is under way, waiting for it"
+        flock --timeout "$LONGEST_WAIT_SECS" 9 ||
+            fail "another set-up has been under way for $((LONGEST_WAIT_SECS / 60)) minutes: see what it does (fuser $repository), end it, and run again"
+    }
     if is_complete; then
         return
     fi

@@ -1,7 +1,7 @@
 //! A run of the real programs: started, watched, ended, and cleared away.
 
 use std::fs::{self, File};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread::sleep;
@@ -15,7 +15,7 @@ use skein_protocol::summary::Summary;
 use tempfile::TempDir;
 
 use crate::flights::{Flight, Learned, flights};
-use crate::leftovers::{leftovers, processes_of};
+use crate::leftovers::{Process, leftovers, processes_of};
 use crate::programs::{Output, program, repository};
 
 /// No run here takes a fifth of it on an idle machine.
@@ -82,21 +82,14 @@ impl Recipe {
         let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().canonicalize().unwrap().join("run");
-        let mut command = Command::new(program("skein"));
+        let mut command = skein_run(folder.path(), self.actors);
         command
-            .arg("run")
             .arg("--config")
             .arg(&self.config)
             .arg("--run-dir")
             .arg(&root)
-            .args(["--actors", &self.actors.to_string()])
             .args(self.overrides.iter().flat_map(|setting| ["--set", setting]))
-            .env_remove("RUST_LOG")
-            .env_remove("SKEIN_LOG_FORMAT")
-            .envs(self.environment)
-            .stdin(Stdio::null())
-            .stdout(File::create(folder.path().join("stdout")).unwrap())
-            .stderr(File::create(folder.path().join("stderr")).unwrap());
+            .envs(self.environment);
         Running {
             supervisor: command.spawn().unwrap(),
             attached: Vec::new(),
@@ -114,6 +107,19 @@ impl Recipe {
     pub fn finish(self) -> Ended {
         self.start().finish()
     }
+}
+
+/// `skein run` with so many actors, saying what it says to files in `folder`.
+fn skein_run(folder: &Path, actors: u32) -> Command {
+    let mut command = Command::new(program("skein"));
+    command
+        .args(["run", "--actors", &actors.to_string()])
+        .env_remove("RUST_LOG")
+        .env_remove("SKEIN_LOG_FORMAT")
+        .stdin(Stdio::null())
+        .stdout(File::create(folder.join("stdout")).unwrap())
+        .stderr(File::create(folder.join("stderr")).unwrap());
+    command
 }
 
 /// A run under way. Its processes and all they left are cleared away when it goes out of scope.
@@ -189,6 +195,44 @@ impl Running {
     pub fn signal(&self, signal: Signal) {
         let pid = Pid::from_raw(self.supervisor.id().cast_signed()).unwrap();
         kill_process(pid, signal).unwrap();
+    }
+
+    /// The process of this run that runs `program`, the first of several.
+    ///
+    /// # Panics
+    /// When there is none.
+    pub fn process(&self, program: &str) -> Process {
+        let processes = processes_of(&self.directory);
+        let found = processes.into_iter().find(|process| process.runs(program));
+        found.unwrap_or_else(|| panic!("no {program} is there:\n{}", self.stderr()))
+    }
+
+    /// Kills all its processes at once, as a power cut does.
+    ///
+    /// # Panics
+    /// When one of them does not end.
+    pub fn cut_off(&mut self) {
+        processes_of(&self.directory)
+            .iter()
+            .for_each(|process| process.signal(Signal::KILL));
+        self.supervisor.wait().unwrap();
+        while !processes_of(&self.directory).is_empty() {
+            assert!(Instant::now() < self.deadline, "{:?}", processes_of(&self.directory));
+            sleep(LOOK);
+        }
+    }
+
+    /// Goes on with it, with so many actors, once its supervisor has ended, however it did.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    pub fn resume(&mut self, actors: u32) {
+        self.supervisor.wait().unwrap();
+        let folder = self.folder.as_ref().expect("it is taken only at the end");
+        let mut command = skein_run(folder.path(), actors);
+        command.arg("--resume").arg(self.directory.root());
+        self.supervisor = command.spawn().unwrap();
+        self.deadline = Instant::now() + LIMIT;
     }
 
     /// Waits for the end of the supervisor and of those attached, which must succeed.

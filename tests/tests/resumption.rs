@@ -1,0 +1,121 @@
+//! Runs that are cut off, and what becomes of them and of what they left.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::process::{Command, Stdio};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+use skein_protocol::run::RunDirectory;
+use skein_tests::{Recipe, flights, leftovers, processes_of, program, repository};
+
+fn recipe() -> Recipe {
+    Recipe::small().set("run.flights=80")
+}
+
+#[test]
+fn a_run_cut_off_and_resumed_with_other_numbers_of_actors_comes_to_the_same() {
+    let calm = recipe().finish().learned();
+
+    let mut run = recipe().start();
+    run.until_flights(30);
+    run.cut_off();
+    run.resume(1);
+    run.until_flights(50);
+    run.signal(Signal::INT);
+    run.resume(3);
+    let ended = run.finish();
+    ended.learned().assert_same(&calm, "a run cut off and interrupted");
+    assert!(
+        ended.output.stdout.contains("Completed after"),
+        "{}",
+        ended.output.stdout
+    );
+    for actor in ["actor-0", "actor-1", "actor-2"] {
+        let log = ended.directory.logs().join(format!("{actor}.log"));
+        assert!(log.is_file(), "{} should have been claimed", log.display());
+    }
+    assert!(
+        !ended.directory.logs().join("actor-3.log").exists(),
+        "numbers of dead actors were not used again"
+    );
+}
+
+#[test]
+fn a_run_whose_processes_die_one_after_the_other_comes_to_the_same() {
+    let calm = recipe().finish().learned();
+
+    let mut run = recipe().start();
+    run.until_flights(10);
+    run.process("skein-learner").signal(Signal::KILL);
+    run.until_flights(30);
+    run.process("skein-actor").signal(Signal::KILL);
+    run.until_flights(50);
+    // Noticed by nobody but the learner: its tickets go to the other one.
+    run.process("skein-actor").signal(Signal::STOP);
+    run.until_flights(60);
+    run.process("skein-learner").signal(Signal::KILL);
+    let ended = run.finish();
+    ended.learned().assert_same(&calm, "a run with deaths in it");
+    assert_eq!(
+        ended
+            .output
+            .stderr
+            .matches("the learner was killed by signal 9")
+            .count(),
+        2,
+        "{}",
+        ended.output.stderr
+    );
+}
+
+#[test]
+fn the_next_start_removes_what_a_killed_run_left_and_nothing_of_a_run_beside_it() {
+    let mut beside = Recipe::small().set("run.flights=1000000").start();
+    beside.until_flights(1);
+
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path().canonicalize().unwrap();
+    let killed = RunDirectory::new(folder.join("killed"));
+    let start = |directory: &RunDirectory, flights: u64| {
+        Command::new(program("skein"))
+            .arg("run")
+            .arg("--config")
+            .arg(repository().join("tests/small.toml"))
+            .arg("--run-dir")
+            .arg(directory.root())
+            .args(["--actors", "1", "--set", &format!("run.flights={flights}")])
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap()
+    };
+    let mut supervisor = start(&killed, 1_000_000);
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while flights(&killed).is_empty() {
+        assert!(Instant::now() < deadline, "never a flight");
+        sleep(Duration::from_millis(20));
+    }
+    for process in processes_of(&killed) {
+        process.signal(Signal::KILL);
+    }
+    supervisor.wait().unwrap();
+    while !processes_of(&killed).is_empty() {
+        sleep(Duration::from_millis(5));
+    }
+    assert!(
+        !leftovers(&killed).is_empty(),
+        "a killed run leaves something, or this shows nothing"
+    );
+
+    let flown = flights(beside.directory()).len();
+    assert!(
+        start(&RunDirectory::new(folder.join("next")), 1)
+            .wait()
+            .unwrap()
+            .success()
+    );
+    assert_eq!(leftovers(&killed), Vec::<String>::new());
+    beside.until_flights(flown + 20);
+}
