@@ -124,6 +124,7 @@ mod tests {
             resumes: 0,
             wall_secs: 75.0,
             phase_secs: BTreeMap::new(),
+            thread_cpu_secs: BTreeMap::new(),
         };
         fs::write(run.evaluation_json(), serde_json::to_string(&report).unwrap()).unwrap();
         fs::write(run.summary_json(), serde_json::to_string(&summary).unwrap()).unwrap();

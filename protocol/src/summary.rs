@@ -56,6 +56,9 @@ pub struct Summary {
     pub wall_secs: f64,
     /// Seconds of the learner's main thread by what it did, as far as `wall_secs`.
     pub phase_secs: BTreeMap<String, f64>,
+    /// Seconds of processor time in the learner's last life by those of its threads that lived until its end; `reception` receives and assembles flights.
+    #[serde(default)]
+    pub thread_cpu_secs: BTreeMap<String, f64>,
 }
 
 impl Summary {
@@ -115,6 +118,7 @@ mod tests {
             resumes: 2,
             wall_secs: 1.5,
             phase_secs: BTreeMap::from([("publish".to_owned(), 0.5)]),
+            thread_cpu_secs: BTreeMap::from([("reception".to_owned(), 0.25)]),
         };
         summary.save(&path).unwrap();
         assert_eq!(Summary::of(&run), Some(summary));

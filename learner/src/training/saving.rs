@@ -22,6 +22,7 @@ use crate::flights::reception::Reception;
 use crate::lives::begin_life;
 use crate::metrics::Metrics;
 use crate::report::Reporter;
+use crate::threads;
 use crate::trainer::Trainer;
 
 impl<'a> Training<'a> {
@@ -214,6 +215,8 @@ impl<'a> Training<'a> {
     /// Finishes the checkpoint being written, lets the actors go, and sums up how the run ended and how far it came.
     pub(super) fn conclude(self, end: Result<(Ending, Progress), TrainingError>) -> Result<Summary, TrainingError> {
         let written = self.checkpoints.finish();
+        // A thread that has ended can no longer be asked.
+        let thread_cpu_secs = threads::cpu_secs();
         self.reception.finish();
         let (ending, progress) = match (end, written) {
             (Ok(end), Ok(())) => end,
@@ -226,7 +229,10 @@ impl<'a> Training<'a> {
             }
         };
         pass(FaultPoint::LearnerBeforeSummary);
-        let summary = summary(self.identity, self.config, ending, &progress, self.resumes);
+        let summary = Summary {
+            thread_cpu_secs,
+            ..summary(self.identity, self.config, ending, &progress, self.resumes)
+        };
         let path = self.directory.summary_json();
         self.disk
             .with_room(&path, || summary.save(&path))
@@ -312,6 +318,7 @@ fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &P
         resumes,
         wall_secs: progress.spent.wall_secs,
         phase_secs: progress.spent.phase_secs.clone(),
+        thread_cpu_secs: BTreeMap::new(),
     }
 }
 
