@@ -1,0 +1,153 @@
+//! Processes that die, freeze or keep dying, and those that come in their place.
+
+use super::*;
+
+#[test]
+fn a_dead_actor_is_started_again() {
+    let actor = format!(
+        "if mkdir $dir/died-$id 2>/dev/null; then kill -9 $$; fi; touch $dir/second-life-$id; {FAITHFUL_ACTOR}"
+    );
+    let learner = "report 0; while [ ! -e $dir/second-life-0 ] || [ ! -e $dir/second-life-1 ]; do sleep 0.02; done; touch $dir/stop";
+    let (result, seen) = Stage::new(learner, &actor).run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert!(
+        seen.warnings
+            .contains("actor 1 was killed by signal 9; it is started again"),
+        "{}",
+        seen.warnings
+    );
+}
+
+/// A learner that lives as `first` once, then runs to its end.
+fn first_life(first: &str) -> String {
+    format!("report 1; if mkdir $dir/died 2>/dev/null; then {first}; fi; report 2; touch $dir/stop")
+}
+
+#[test]
+fn a_learner_that_dies_is_started_again_and_its_actors_stay() {
+    for (death, told) in [
+        (
+            "kill -9 $$",
+            "the learner was killed by signal 9; it is started again at once",
+        ),
+        ("exit 101", "the learner panicked; it is started again at once"),
+        (
+            "exit 4",
+            "the learner exited with status 4; it is started again at once",
+        ),
+    ] {
+        let stage = Stage::new(&first_life(&format!("sleep 0.1; {death}")), FAITHFUL_ACTOR);
+        fs::create_dir_all(stage.plan.run.checkpoints().join("flight-40")).unwrap();
+        fs::create_dir(stage.plan.run.checkpoints().join(".writing")).unwrap();
+        let (result, seen) = stage.run(never);
+        assert_eq!(result.unwrap(), Ended::Finished);
+        assert_eq!(
+            seen.warnings,
+            format!("{told}, from its checkpoint after flight 40\n"),
+            "{death}"
+        );
+        assert_eq!(seen.restarts, Restarts { learner: 1, actors: 0 });
+        assert_eq!(stage.processes(), 4, "two learners, two actors");
+    }
+}
+
+#[test]
+fn a_learner_that_never_gets_further_fails_the_run() {
+    let mut stage = Stage::new("report 1; echo 'always here' >&2; kill -9 $$", FAITHFUL_ACTOR);
+    stage.plan.deadlines.learner_pause = Duration::from_millis(10);
+    let (result, seen) = stage.run(never);
+    let error = result.unwrap_err().to_string();
+    assert!(
+        error.contains("died 10 times without getting any further") && error.contains("always here"),
+        "{error}"
+    );
+    assert_eq!((seen.restarts.learner, stage.processes()), (9, 12));
+}
+
+#[test]
+fn a_frozen_learner_is_killed_and_started_again() {
+    for first in ["kill -STOP $$", "trap '' TERM; while :; do sleep 0.02; done"] {
+        let mut stage = Stage::new(&first_life(first), FAITHFUL_ACTOR);
+        stage.plan.deadlines.learner_silence = Duration::from_millis(300);
+        let (result, seen) = stage.run(never);
+        assert_eq!(result.unwrap(), Ended::Finished);
+        assert!(
+            seen.warnings.contains("has not reported for 0 s: it is killed"),
+            "{}",
+            seen.warnings
+        );
+        assert_eq!(seen.restarts.learner, 1);
+    }
+}
+
+#[test]
+fn a_learner_that_hangs_before_its_first_report_is_started_again() {
+    let hangs_once = "if mkdir $dir/died 2>/dev/null; then kill -STOP $$; fi; report 2; touch $dir/stop";
+    let mut stage = Stage::new(hangs_once, FAITHFUL_ACTOR);
+    stage.plan.deadlines.learner_start = Duration::from_millis(300);
+    let (result, seen) = stage.run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert_eq!(seen.restarts.learner, 1);
+}
+
+#[test]
+fn actors_that_left_for_want_of_a_learner_come_back_with_it() {
+    // The first life of the actors ends with that of the learner, which takes a while to come back.
+    let actor = format!(
+        "while [ ! -e $dir/died ]; do sleep 0.02; done; if mkdir $dir/left-$id 2>/dev/null; then exit 3; fi; touch $dir/back-$id; {FAITHFUL_ACTOR}"
+    );
+    let learner =
+        "if mkdir $dir/died 2>/dev/null; then rmdir $dir/died; report 1; sleep 0.2; mkdir $dir/died; kill -9 $$; fi
+        while [ ! -e $dir/left-0 ] || [ ! -e $dir/left-1 ]; do sleep 0.02; done; sleep 0.2; report 1
+        while [ ! -e $dir/back-0 ] || [ ! -e $dir/back-1 ]; do sleep 0.02; done; touch $dir/stop";
+    let (result, seen) = Stage::new(learner, &actor).run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert!(
+        seen.warnings.contains("actor 0 heard nothing of the learner and left"),
+        "{}",
+        seen.warnings
+    );
+}
+
+#[test]
+fn an_actor_that_the_learner_has_not_heard_of_for_long_is_killed_and_started_again() {
+    let actor = format!(
+        "if mkdir $dir/frozen-$id 2>/dev/null; then kill -STOP $$; fi; touch $dir/second-life-$id; {FAITHFUL_ACTOR}"
+    );
+    let learner = "while [ ! -e $dir/second-life-0 ] || [ ! -e $dir/second-life-1 ]; do report 1 []; sleep 0.05; done; report 1; touch $dir/stop";
+    let mut stage = Stage::new(learner, &actor);
+    stage.plan.deadlines.actor_silence = Duration::from_millis(400);
+    let (result, seen) = stage.run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert!(
+        seen.warnings
+            .contains("actor 1 is there, but the learner has not heard of it"),
+        "{}",
+        seen.warnings
+    );
+    assert_eq!(seen.restarts.actors, 2);
+}
+
+#[test]
+fn actors_that_are_of_use_are_started_again_as_often_as_they_die() {
+    // Five deaths of one actor while the run gets on: one that is of no use is given up after as many.
+    let actor = format!("if [ $id = 0 ]; then sleep 0.1; kill -9 $$; fi; {FAITHFUL_ACTOR}");
+    let learner =
+        "n=0; while [ $(wc -l < $dir/pids) -lt 8 ]; do n=$((n+1)); report $n; sleep 0.05; done; touch $dir/stop";
+    let stage = Stage::new(learner, &actor);
+    let (result, seen) = stage.run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert!(
+        stage.processes() >= 8 && !seen.warnings.contains("given up"),
+        "{}",
+        seen.warnings
+    );
+}
+
+#[test]
+fn a_stall_is_told_once() {
+    let learner = r#"report 1; for i in 1 2 3; do report 1 '[0,1],"stalled":"the learner waits for a disk"'; done; report 2; touch $dir/stop"#;
+    let (result, seen) = Stage::new(learner, FAITHFUL_ACTOR).run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert_eq!(seen.warnings, "nothing moves: the learner waits for a disk\n");
+}
