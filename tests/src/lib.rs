@@ -5,11 +5,10 @@
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
 
 mod flights;
-mod leftovers;
 mod programs;
 mod run;
 
 pub use flights::{Flight, Learned, flights};
-pub use leftovers::{Process, leftovers, processes_of};
 pub use programs::{Output, program, repository, run_program};
 pub use run::{Ended, Recipe, Running};
+pub use skein_launch::inspection::{Process, Role, leftovers, processes_of};

@@ -9,13 +9,13 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde::de::DeserializeOwned;
+use skein_launch::inspection::{Process, Role, compare, leftovers, processes_of};
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::run::{RunDirectory, sweep_leftovers};
 use skein_protocol::summary::Summary;
 use tempfile::TempDir;
 
 use crate::flights::{Flight, Learned, flights};
-use crate::leftovers::{Process, leftovers, processes_of};
 use crate::programs::{Output, program, repository};
 
 /// No run here takes a fifth of it on an idle machine.
@@ -80,6 +80,18 @@ impl Recipe {
     /// When it cannot be started.
     pub fn start(self) -> Running {
         let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+        self.start_in_turn(Some(turn))
+    }
+
+    /// Starts it while `_other` is under way.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    pub fn start_beside(self, _other: &Running) -> Running {
+        self.start_in_turn(None)
+    }
+
+    fn start_in_turn(self, turn: Option<MutexGuard<'static, ()>>) -> Running {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().canonicalize().unwrap().join("run");
         let mut command = skein_run(folder.path(), self.actors);
@@ -130,7 +142,7 @@ pub struct Running {
     directory: RunDirectory,
     folder: Option<TempDir>,
     deadline: Instant,
-    _turn: MutexGuard<'static, ()>,
+    _turn: Option<MutexGuard<'static, ()>>,
 }
 
 impl Running {
@@ -157,6 +169,17 @@ impl Running {
             let ended = self.supervisor.try_wait().unwrap();
             assert!(ended.is_none(), "the run ended before {what}:\n{}", self.stderr());
             assert!(Instant::now() < self.deadline, "never {what}:\n{}", self.stderr());
+            sleep(LOOK);
+        }
+    }
+
+    /// Waits until the supervisor has ended, of itself or because it was told to.
+    ///
+    /// # Panics
+    /// When the time is up.
+    pub fn until_ended(&mut self) {
+        while self.supervisor.try_wait().unwrap().is_none() {
+            assert!(Instant::now() < self.deadline, "it does not end:\n{}", self.stderr());
             sleep(LOOK);
         }
     }
@@ -207,6 +230,24 @@ impl Running {
         found.unwrap_or_else(|| panic!("no {program} is there:\n{}", self.stderr()))
     }
 
+    /// Its processes of this role, oldest first.
+    pub fn processes(&self, role: Role) -> Vec<Process> {
+        let mut processes = processes_of(&self.directory);
+        processes.retain(|process| process.role() == role);
+        processes
+    }
+
+    /// Kills the supervisor alone.
+    ///
+    /// # Panics
+    /// When it had ended already.
+    pub fn kill_supervisor(&mut self) {
+        let ended = self.supervisor.try_wait().unwrap();
+        assert!(ended.is_none(), "the run ended too soon:\n{}", self.stderr());
+        self.supervisor.kill().unwrap();
+        self.supervisor.wait().unwrap();
+    }
+
     /// Kills all its processes at once, as a power cut does.
     ///
     /// # Panics
@@ -240,13 +281,8 @@ impl Running {
     /// # Panics
     /// When the time is up, or one attached failed.
     pub fn wait(mut self) -> Ended {
-        let status = loop {
-            if let Some(status) = self.supervisor.try_wait().unwrap() {
-                break status;
-            }
-            assert!(Instant::now() < self.deadline, "it does not end:\n{}", self.stderr());
-            sleep(LOOK);
-        };
+        self.until_ended();
+        let status = self.supervisor.wait().unwrap();
         for attached in &mut self.attached {
             // It ends with the run, unless it hangs: then its end is not waited for here.
             let end = Instant::now() + Duration::from_secs(20);
@@ -345,6 +381,18 @@ impl Ended {
     /// When it is malformed.
     pub fn flights(&self) -> Vec<Flight> {
         flights(&self.directory)
+    }
+
+    /// Requires that it came to the same as `calm`, in every file and every point of every curve, who flew what apart.
+    ///
+    /// # Panics
+    /// When it did not; the message names every difference.
+    pub fn assert_same_as(&self, calm: &Self) {
+        let differences: Vec<_> = compare(&calm.directory, &self.directory)
+            .into_iter()
+            .filter_map(|check| Some(format!("{}: {}", check.what, check.verdict.err()?)))
+            .collect();
+        assert!(differences.is_empty(), "{differences:#?}\n{}", self.output.stderr);
     }
 
     /// What must be the same however the run was flown.

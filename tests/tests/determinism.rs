@@ -5,7 +5,8 @@
 use std::collections::BTreeSet;
 
 use rustix::process::Signal;
-use skein_tests::{Ended, Process, Recipe, processes_of};
+use skein_protocol::run::RunDirectory;
+use skein_tests::{Ended, Process, Recipe, Role, processes_of};
 
 /// The actors that flew training flights.
 fn crew(run: &Ended) -> BTreeSet<u32> {
@@ -70,15 +71,10 @@ fn an_actor_killed_in_the_middle_changes_nothing() {
         .assert_same(&undisturbed.learned(), "an actor killed twice");
 }
 
-fn actor(run: &skein_protocol::run::RunDirectory, id: u32) -> Option<Process> {
+fn actor(run: &RunDirectory, id: u32) -> Option<Process> {
     processes_of(run)
         .into_iter()
-        .find(|process| process.runs("skein-actor") && process.command.ends_with(&arguments(id)))
-}
-
-/// The end of an actor's command line; the kernel ends it with an empty string.
-fn arguments(id: u32) -> [String; 3] {
-    ["--id".to_owned(), id.to_string(), String::new()]
+        .find(|process| process.role() == Role::Actor && process.actor() == Some(id))
 }
 
 #[test]

@@ -1,0 +1,243 @@
+//! Whoever dies, freezes or is cut off, and however often: the run comes to what it would have come to, and leaves nothing behind.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+
+use std::fs;
+use std::path::PathBuf;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+use skein_launch::inspection::{Footprint, footprint};
+use skein_protocol::summary::Ending;
+use skein_tests::{Ended, Recipe, Role, Running, flights, leftovers, processes_of, run_program};
+
+/// Long enough to be disturbed several times.
+fn recipe() -> Recipe {
+    Recipe::small().set("run.flights=100")
+}
+
+/// What it comes to when nobody disturbs it.
+fn calm() -> Ended {
+    recipe().finish()
+}
+
+#[test]
+fn a_learner_killed_three_times_goes_on_from_its_checkpoints() {
+    let calm = calm();
+    let mut run = recipe().start();
+    for flights in [10, 30, 70] {
+        run.until_flights(flights);
+        let victim = run.learner();
+        victim.signal(Signal::KILL);
+        run.until("another learner was there", |run| {
+            run.processes(Role::Learner)
+                .into_iter()
+                .find(|learner| *learner != victim)
+        });
+    }
+    let disturbed = run.finish();
+    disturbed.assert_same_as(&calm);
+    let told = disturbed.output.stderr.matches("killed by signal 9").count();
+    assert_eq!(told, 3, "{}", disturbed.output.stderr);
+}
+
+#[test]
+fn a_run_whose_supervisor_was_killed_is_resumed_with_another_number_of_actors() {
+    let calm = calm();
+    let mut run = recipe().start();
+    run.until_flights(50);
+    run.kill_supervisor();
+    run.resume(3);
+    run.finish().assert_same_as(&calm);
+}
+
+#[test]
+fn a_run_that_was_stopped_in_order_is_resumed() {
+    let calm = calm();
+    let mut run = recipe().start();
+    run.until_flights(30);
+    run.signal(Signal::INT);
+    run.until_ended("it was told to stop");
+    run.resume(1);
+    run.finish().assert_same_as(&calm);
+}
+
+#[test]
+fn after_a_power_cut_a_damaged_checkpoint_is_named_and_the_one_before_it_used() {
+    let calm = calm();
+    let mut run = recipe().start();
+    run.until("there were two checkpoints", |run| {
+        (checkpoints(run).len() >= 2).then_some(())
+    });
+    run.cut_power();
+    let newest = checkpoints(&run).pop().unwrap();
+    let file = newest.join("tensors.safetensors");
+    let mut bytes = fs::read(&file).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    fs::write(&file, bytes).unwrap();
+    run.resume(2);
+    let resumed = run.finish();
+    resumed.assert_same_as(&calm);
+    let log = fs::read_to_string(resumed.directory.learner_log()).unwrap();
+    let name = newest.file_name().unwrap().to_str().unwrap();
+    assert!(
+        log.lines().any(|line| line.contains("WARN") && line.contains(name)),
+        "nobody was warned of {name}:\n{log}"
+    );
+}
+
+/// The checkpoints that are in their place, oldest first.
+fn checkpoints(run: &Running) -> Vec<PathBuf> {
+    let number = |path: &PathBuf| -> Option<u64> { path.file_name()?.to_str()?.strip_prefix("flight-")?.parse().ok() };
+    let mut found: Vec<_> = fs::read_dir(run.directory().checkpoints())
+        .into_iter()
+        .flatten()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| number(path).is_some())
+        .collect();
+    found.sort_by_key(number);
+    found
+}
+
+#[test]
+fn an_actor_that_was_frozen_too_long_is_not_mixed_in_when_it_wakes() {
+    let calm = calm();
+    let mut run = recipe().set("transport.actor_silence_secs=0.5").start();
+    run.until_flights(10);
+    let sleeper = run.processes(Role::Actor).remove(0);
+    sleeper.signal(Signal::STOP);
+    // Whatever it was about to fly is flown by the other: else there would be no further epoch.
+    run.until_flights(30);
+    sleeper.signal(Signal::CONT);
+    let disturbed = run.finish();
+    disturbed.assert_same_as(&calm);
+    assert!(disturbed.summary().tickets_reissued > 0, "{:?}", disturbed.summary());
+}
+
+#[test]
+fn a_frozen_learner_goes_on_where_it_was() {
+    let calm = calm();
+    let mut run = recipe()
+        .set("transport.learner_silence_secs=2")
+        .set("transport.actor_silence_secs=1")
+        .start();
+    run.until_flights(30);
+    let learner = run.learner();
+    learner.signal(Signal::STOP);
+    // Longer than actors wait, so that all of them leave.
+    run.until("the actors gave the learner up", |run| {
+        run.processes(Role::Actor).is_empty().then_some(())
+    });
+    learner.signal(Signal::CONT);
+    run.finish().assert_same_as(&calm);
+}
+
+#[test]
+fn a_learner_slowed_down_ten_times_holds_the_actors_back_and_nothing_is_lost() {
+    let calm = calm();
+    let mut run = recipe().actors(4).start();
+    run.until_flights(10);
+    let learner = run.learner();
+    let end = Instant::now() + Duration::from_secs(6);
+    while Instant::now() < end {
+        learner.signal(Signal::STOP);
+        sleep(Duration::from_millis(45));
+        learner.signal(Signal::CONT);
+        sleep(Duration::from_millis(5));
+    }
+    assert!(learner.is_alive(), "it was over before it was slow");
+    let slowed = run.finish();
+    slowed.assert_same_as(&calm);
+    let summary = slowed.summary();
+    assert_eq!(
+        (summary.tickets_reissued, summary.records_refused),
+        (0, 0),
+        "{summary:?}"
+    );
+}
+
+#[test]
+fn sixty_four_actors_lose_nothing_and_take_bounded_memory() {
+    let calm = calm();
+    // Far more than this machine has cores for: patience is all they need.
+    let mut run = recipe()
+        .actors(64)
+        .set("transport.actor_silence_secs=60")
+        .set("transport.learner_silence_secs=60")
+        .set("transport.flight_deadline_secs=600")
+        .start();
+    let mut most = Footprint::default();
+    let id = run.until("the run had an identity", |run| {
+        Some(run.directory().open().ok()?.0.run)
+    });
+    run.until("all actors were there", |run| {
+        let now = footprint(id);
+        most.segment_bytes = most.segment_bytes.max(now.segment_bytes);
+        (run.processes(Role::Actor).len() == 64 && flights_begun(run)).then_some(())
+    });
+    let ended = run.finish();
+    ended.assert_same_as(&calm);
+    let summary = ended.summary();
+    assert_eq!(
+        (summary.tickets_reissued, summary.records_refused),
+        (0, 0),
+        "{summary:?}"
+    );
+    assert!(most.segment_bytes < 64 * 5_200_000 + 64_000_000, "{most:?}");
+}
+
+fn flights_begun(run: &Running) -> bool {
+    !flights(run.directory()).is_empty()
+}
+
+#[test]
+fn two_runs_side_by_side_never_meet() {
+    let calm = calm();
+    let one = recipe().start();
+    let other = recipe().set("run.seed=2").start_beside(&one);
+    let (one, other) = (one.finish(), other.finish());
+    one.assert_same_as(&calm);
+    assert_eq!(other.flights().len(), 100);
+    for run in [&one, &other] {
+        let summary = run.summary();
+        assert_eq!(
+            (summary.tickets_reissued, summary.records_refused),
+            (0, 0),
+            "{summary:?}"
+        );
+    }
+}
+
+#[test]
+fn a_second_learner_of_a_run_is_refused_and_the_first_goes_on() {
+    let calm = calm();
+    let mut run = recipe().start();
+    run.until_flights(10);
+    let second = run_program("skein-learner", &["--run", run.directory().root().to_str().unwrap()]);
+    second.assert_refused(&["another learner"]);
+    run.finish().assert_same_as(&calm);
+}
+
+#[test]
+fn what_a_killed_run_left_is_gone_after_the_next_start_and_a_living_run_is_not_touched() {
+    let mut living = Recipe::small().set("run.flights=1000000").start();
+    living.until_flights(10);
+    let mut killed = recipe().start_beside(&living);
+    killed.until_flights(10);
+    killed.cut_power();
+    assert!(
+        !leftovers(killed.directory()).is_empty(),
+        "nothing was left that could be swept"
+    );
+    recipe().set("run.flights=10").start_beside(&living).finish();
+    assert_eq!(leftovers(killed.directory()), Vec::<String>::new());
+    let before = flights(living.directory()).len();
+    living.until_flights(before + 20);
+    living.signal(Signal::INT);
+    let ended = living.wait();
+    assert_eq!(ended.summary().ending, Ending::Interrupted);
+    assert_eq!(ended.summary().tickets_reissued, 0);
+    assert!(processes_of(&ended.directory).is_empty());
+}
