@@ -23,6 +23,8 @@ const STUCK: Duration = Duration::from_secs(300);
 const RESUME: Duration = Duration::from_secs(120);
 /// Between two attempts to resume.
 const RESUME_PAUSE: Duration = Duration::from_millis(500);
+/// How long a killed process may take to be gone: the kernel gives its memory back first.
+const DEATH: Duration = Duration::from_secs(2);
 /// How long those that attached actors may outlive the run.
 const CREW_GRACE: Duration = Duration::from_secs(40);
 
@@ -210,6 +212,9 @@ impl<'a> Storm<'a> {
     fn strike(&self, role: Role, choice: u32, signal: Signal) -> Vec<i32> {
         let victim = self.choose(role, choice);
         victim.iter().for_each(|process| process.signal(signal));
+        if signal == Signal::KILL {
+            await_death(victim.as_slice());
+        }
         victim.iter().map(pid).collect()
     }
 
@@ -243,10 +248,10 @@ impl<'a> Storm<'a> {
         child.kill().context("cannot kill the supervisor")?;
         child.wait().context("cannot wait for the supervisor")?;
         if reach == Reach::Everybody {
-            for process in self.stage.processes() {
-                process.signal(Signal::KILL);
-                victims.push(pid(&process));
-            }
+            let others = self.stage.processes();
+            others.iter().for_each(|process| process.signal(Signal::KILL));
+            await_death(&others);
+            victims.extend(others.iter().map(pid));
         }
         let now = Instant::now();
         self.supervisor = Supervisor::Killed {
@@ -456,6 +461,14 @@ enum Thaw {
     Due,
     /// Everybody.
     All,
+}
+
+/// Waits until those that were killed are dead, so that nobody is killed twice; not for ever, because the kernel may have them in its hands.
+fn await_death(victims: &[Process]) {
+    let end = Instant::now() + DEATH;
+    while victims.iter().any(Process::is_alive) && Instant::now() < end {
+        sleep(Duration::from_millis(1));
+    }
 }
 
 fn pid(process: &Process) -> i32 {
