@@ -4,6 +4,7 @@
 
 use std::fs;
 use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
@@ -17,9 +18,16 @@ fn recipe() -> Recipe {
     Recipe::small().set("run.flights=100")
 }
 
-/// What it comes to when nobody disturbs it.
-fn calm() -> Ended {
-    recipe().finish()
+/// What it comes to when nobody disturbs it. Run once for all tests that are under way at a time; to be asked for before one's own run is started, which
+/// would be waited for.
+fn calm() -> Arc<Ended> {
+    static CALM: Mutex<Weak<Ended>> = Mutex::new(Weak::new());
+    let mut known = CALM.lock().unwrap_or_else(PoisonError::into_inner);
+    known.upgrade().unwrap_or_else(|| {
+        let ended = Arc::new(recipe().finish());
+        *known = Arc::downgrade(&ended);
+        ended
+    })
 }
 
 #[test]

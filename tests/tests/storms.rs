@@ -46,5 +46,5 @@ fn kills_change_nothing_where_flights_are_flown_while_the_learner_updates() {
 
 #[test]
 fn a_death_at_any_named_point_changes_nothing() {
-    storm(&["run.flights=200"], &["--points"]);
+    storm(&["run.flights=350"], &["--points"]);
 }

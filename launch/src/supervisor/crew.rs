@@ -50,7 +50,7 @@ enum State {
     Flying(Process),
     /// Died; will be started again.
     Resting,
-    /// Found no learner, or failed too often; will be started again when a learner reports for the first time.
+    /// Was sent home, found no learner, or failed too often; will be started again when a learner reports for the first time.
     Stranded,
     /// Not started, or ended.
     Gone,
@@ -225,7 +225,12 @@ impl<'a> Crew<'a> {
             State::Flying(process) => process.started.elapsed(),
             State::Resting | State::Stranded | State::Gone => Duration::ZERO,
         };
-        if self.after_death == AfterDeath::LetGo || *exit == Exit::SUCCESS {
+        if self.after_death == AfterDeath::LetGo {
+            return;
+        }
+        if *exit == Exit::SUCCESS {
+            // The learner said that the run is over. Should it die before it is, the next one needs actors again.
+            member.state = State::Stranded;
             return;
         }
         if exit.is_for_want_of_a_learner() && !learner_reports {

@@ -2,16 +2,16 @@
 
 use std::fs;
 use std::path::PathBuf;
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 use serde_json::json;
 use skein_protocol::fault::FaultPoint;
 
+use crate::plan::Disturbance;
 use crate::storm::{Script, Storm};
 
-/// After so long the next point is armed as well: some are passed seldom, and the last ones only at the end.
-const PATIENCE: Duration = Duration::from_secs(20);
+/// After this share of the run's flights the next point is armed as well: some are passed seldom, and the last ones only at the end.
+const PATIENCE: f64 = 1.0 / 6.0;
 
 /// The fault points, in the order in which they are armed.
 #[derive(Debug)]
@@ -19,9 +19,10 @@ pub(crate) struct Points {
     folder: PathBuf,
     total_flights: u64,
     to_arm: Vec<FaultPoint>,
-    armed: Vec<(FaultPoint, Instant)>,
+    /// With the flights learned from at most by then.
+    armed: Vec<(FaultPoint, u64)>,
     fired: Vec<FaultPoint>,
-    /// Flights learned from at the least since a point fired, until there are more again.
+    /// Flights learned from at most when a point fired, until there are more.
     recovering_from: Option<u64>,
 }
 
@@ -62,17 +63,17 @@ impl Points {
         for (point, _) in fired {
             storm.note("fired", &json!({ "point": point.name() }))?;
             self.fired.push(point);
-            self.recovering_from = Some(storm.flights());
+            self.recovering_from = Some(storm.highest());
         }
         Ok(())
     }
 
-    /// Whether the run has learned again since the last point fired. What comes later than its last flight, nobody can wait for.
+    /// Whether the run has come farther since the last point fired: deaths without that are answered with longer and longer pauses. What comes
+    /// after the last flight, nobody can wait for.
     fn has_recovered(&mut self, storm: &Storm<'_>) -> bool {
-        let flights = storm.flights();
-        if let Some(lowest) = self.recovering_from {
-            self.recovering_from = (flights <= lowest && flights < self.total_flights).then_some(flights.min(lowest));
-        }
+        let total = self.total_flights;
+        let recovering = |&from: &u64| storm.highest() <= from && from < total;
+        self.recovering_from = self.recovering_from.filter(recovering);
         self.recovering_from.is_none()
     }
 }
@@ -81,7 +82,11 @@ impl Script for Points {
     fn step(&mut self, storm: &mut Storm<'_>) -> Result<()> {
         self.note_fired(storm)?;
         let recovered = self.has_recovered(storm);
-        let patient = self.armed.iter().any(|(_, armed)| armed.elapsed() < PATIENCE);
+        let patience = (self.total_flights as f64 * PATIENCE) as u64;
+        let patient = self
+            .armed
+            .iter()
+            .any(|&(_, armed_at)| storm.highest() < armed_at + patience);
         let at_the_end = storm.flights() >= self.total_flights;
         if recovered
             && (!patient || at_the_end)
@@ -90,7 +95,11 @@ impl Script for Points {
             let path = self.folder.join(point.name());
             fs::write(&path, "").with_context(|| format!("cannot arm {}", path.display()))?;
             storm.note("armed", &json!({ "point": point.name() }))?;
-            self.armed.push((point, Instant::now()));
+            self.armed.push((point, storm.highest()));
+            if point == FaultPoint::LearnerStarted {
+                // Only a learner that starts comes by there.
+                storm.disturb(Disturbance::KillLearner)?;
+            }
         }
         Ok(())
     }

@@ -110,6 +110,21 @@ fn actors_that_left_for_want_of_a_learner_come_back_with_it() {
 }
 
 #[test]
+fn actors_that_were_sent_home_come_back_with_a_learner_that_died_before_the_end() {
+    let actor = "while [ ! -e $dir/stop ]; do sleep 0.02; done; touch $dir/home-$id";
+    let learner = "if mkdir $dir/died 2>/dev/null; then
+            report 1; sleep 0.1; touch $dir/stop
+            while [ ! -e $dir/home-0 ] || [ ! -e $dir/home-1 ]; do sleep 0.02; done; sleep 0.2; kill -9 $$
+        fi
+        rm $dir/stop $dir/home-*; report 1; sleep 0.2; touch $dir/stop
+        while [ ! -e $dir/home-0 ] || [ ! -e $dir/home-1 ]; do sleep 0.02; done";
+    let stage = Stage::new(learner, actor);
+    let (result, _) = stage.run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert_eq!(stage.processes(), 6, "two learners, and two actors for each");
+}
+
+#[test]
 fn an_actor_that_the_learner_has_not_heard_of_for_long_is_killed_and_started_again() {
     let actor = format!(
         "if mkdir $dir/frozen-$id 2>/dev/null; then kill -STOP $$; fi; touch $dir/second-life-$id; {FAITHFUL_ACTOR}"
