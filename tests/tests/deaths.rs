@@ -10,8 +10,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use skein_launch::inspection::{Footprint, footprint};
-use skein_protocol::summary::Ending;
-use skein_tests::{Ended, Recipe, Role, Running, flights, leftovers, processes_of, run_program};
+use skein_tests::{Ended, Recipe, Role, Running, flights, run_program};
 
 /// Long enough to be disturbed several times.
 fn recipe() -> Recipe {
@@ -36,7 +35,7 @@ fn a_learner_killed_three_times_goes_on_from_its_checkpoints() {
     let mut run = recipe().start();
     for flights in [10, 30, 70] {
         run.until_flights(flights);
-        let victim = run.learner();
+        let victim = run.process("skein-learner");
         victim.signal(Signal::KILL);
         run.until("another learner was there", |run| {
             run.processes(Role::Learner)
@@ -61,24 +60,13 @@ fn a_run_whose_supervisor_was_killed_is_resumed_with_another_number_of_actors() 
 }
 
 #[test]
-fn a_run_that_was_stopped_in_order_is_resumed() {
-    let calm = calm();
-    let mut run = recipe().start();
-    run.until_flights(30);
-    run.signal(Signal::INT);
-    run.until_ended("it was told to stop");
-    run.resume(1);
-    run.finish().assert_same_as(&calm);
-}
-
-#[test]
 fn after_a_power_cut_a_damaged_checkpoint_is_named_and_the_one_before_it_used() {
     let calm = calm();
     let mut run = recipe().start();
     run.until("there were two checkpoints", |run| {
         (checkpoints(run).len() >= 2).then_some(())
     });
-    run.cut_power();
+    run.cut_off();
     let newest = checkpoints(&run).pop().unwrap();
     let file = newest.join("tensors.safetensors");
     let mut bytes = fs::read(&file).unwrap();
@@ -132,7 +120,7 @@ fn a_frozen_learner_goes_on_where_it_was() {
         .set("transport.actor_silence_secs=1")
         .start();
     run.until_flights(30);
-    let learner = run.learner();
+    let learner = run.process("skein-learner");
     learner.signal(Signal::STOP);
     // Longer than actors wait, so that all of them leave.
     run.until("the actors gave the learner up", |run| {
@@ -147,7 +135,7 @@ fn a_learner_slowed_down_ten_times_holds_the_actors_back_and_nothing_is_lost() {
     let calm = calm();
     let mut run = recipe().actors(4).start();
     run.until_flights(10);
-    let learner = run.learner();
+    let learner = run.process("skein-learner");
     let end = Instant::now() + Duration::from_secs(6);
     while Instant::now() < end {
         learner.signal(Signal::STOP);
@@ -226,26 +214,4 @@ fn a_second_learner_of_a_run_is_refused_and_the_first_goes_on() {
     let second = run_program("skein-learner", &["--run", run.directory().root().to_str().unwrap()]);
     second.assert_refused(&["another learner"]);
     run.finish().assert_same_as(&calm);
-}
-
-#[test]
-fn what_a_killed_run_left_is_gone_after_the_next_start_and_a_living_run_is_not_touched() {
-    let mut living = Recipe::small().set("run.flights=1000000").start();
-    living.until_flights(10);
-    let mut killed = recipe().start_beside(&living);
-    killed.until_flights(10);
-    killed.cut_power();
-    assert!(
-        !leftovers(killed.directory()).is_empty(),
-        "nothing was left that could be swept"
-    );
-    recipe().set("run.flights=10").start_beside(&living).finish();
-    assert_eq!(leftovers(killed.directory()), Vec::<String>::new());
-    let before = flights(living.directory()).len();
-    living.until_flights(before + 20);
-    living.signal(Signal::INT);
-    let ended = living.wait();
-    assert_eq!(ended.summary().ending, Ending::Interrupted);
-    assert_eq!(ended.summary().tickets_reissued, 0);
-    assert!(processes_of(&ended.directory).is_empty());
 }

@@ -16,7 +16,7 @@ fn recipe() -> Recipe {
 
 #[test]
 fn a_run_cut_off_and_resumed_with_other_numbers_of_actors_comes_to_the_same() {
-    let calm = recipe().finish().learned();
+    let calm = recipe().finish();
 
     let mut run = recipe().start();
     run.until_flights(30);
@@ -26,7 +26,7 @@ fn a_run_cut_off_and_resumed_with_other_numbers_of_actors_comes_to_the_same() {
     run.signal(Signal::INT);
     run.resume(3);
     let ended = run.finish();
-    ended.learned().assert_same(&calm, "a run cut off and interrupted");
+    ended.assert_same_as(&calm);
     assert!(
         ended.output.stdout.contains("Completed after"),
         "{}",
@@ -44,7 +44,7 @@ fn a_run_cut_off_and_resumed_with_other_numbers_of_actors_comes_to_the_same() {
 
 #[test]
 fn a_run_whose_processes_die_one_after_the_other_comes_to_the_same() {
-    let calm = recipe().finish().learned();
+    let calm = recipe().finish();
 
     let mut run = recipe().start();
     run.until_flights(10);
@@ -57,7 +57,7 @@ fn a_run_whose_processes_die_one_after_the_other_comes_to_the_same() {
     run.until_flights(60);
     run.process("skein-learner").signal(Signal::KILL);
     let ended = run.finish();
-    ended.learned().assert_same(&calm, "a run with deaths in it");
+    ended.assert_same_as(&calm);
     assert_eq!(
         ended
             .output

@@ -13,7 +13,7 @@ use skein_protocol::summary::Summary;
 use super::curves::{Curves, read_curves};
 
 /// Curves that tell of the machine and of what happened to the processes, not of what was learned: their values differ between any two runs.
-const OF_THE_MACHINE: [&str; 3] = ["rate/", "time/", "transport/"];
+const OF_THE_MACHINE: [&str; 3] = ["rate/", "reissued/", "refused/"];
 /// The column of `flights.csv` that says who flew.
 const WHO_FLEW: &str = "actor";
 
