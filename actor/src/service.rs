@@ -83,7 +83,8 @@ impl<'a> Service<'a> {
     /// Flies tickets as they come, until the run is over for this actor.
     ///
     /// # Errors
-    /// [`JoinError`] when no learner of this run can be joined by this process, now or later. A lost flight or learner is none.
+    /// [`JoinError`] when no learner of this run can be joined by this process, now or later, or one that is there could not for
+    /// `transport.learner_silence_secs`. A lost flight or learner is none.
     pub fn serve(mut self, pilot: &mut Pilot) -> Result<Ending, JoinError> {
         loop {
             let ports = match self.seek()? {
@@ -112,7 +113,7 @@ impl<'a> Service<'a> {
 
     /// Looks for a learner until it has joined one, or there is a reason to leave.
     fn seek(&mut self) -> Result<Result<ActorPorts, Ending>, JoinError> {
-        let mut last_refusal = String::new();
+        let mut last_refusal = None;
         let interval = SEEK_INTERVAL.min(self.config.transport.heartbeat());
         loop {
             if self.told_to_end.load(Ordering::Relaxed) {
@@ -130,14 +131,17 @@ impl<'a> Service<'a> {
                 Err(error) if error.is_final() => return Err(error),
                 Err(error) => {
                     let refusal = error.to_string();
-                    if refusal != last_refusal {
+                    if last_refusal.as_ref() != Some(&refusal) {
                         info!(error = refusal, "no learner joined yet");
-                        last_refusal = refusal;
+                        last_refusal = Some(refusal);
+                    }
+                    if self.last_sign.elapsed() > Duration::from_secs_f64(self.config.transport.learner_silence_secs) {
+                        return match error {
+                            JoinError::NoLearner(_) => Ok(Err(Ending::LearnerSilent)),
+                            error => Err(error),
+                        };
                     }
                 }
-            }
-            if self.last_sign.elapsed() > Duration::from_secs_f64(self.config.transport.learner_silence_secs) {
-                return Ok(Err(Ending::LearnerSilent));
             }
             sleep(interval);
         }

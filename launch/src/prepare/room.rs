@@ -5,19 +5,13 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::statvfs;
 use skein_protocol::config::Config;
+use skein_protocol::services::shared_memory_needed;
 use skein_protocol::snapshot::SnapshotLayout;
-use skein_protocol::transition::TransitionRecord;
 use skein_protocol::{ACTION, IMAGE_PIXELS};
 
 /// Where iceoryx2's segments lie.
 const SHARED_MEMORY: &str = "/dev/shm";
 const MIB: u64 = 1 << 20;
-/// Snapshots in shared memory: the history, and one in the making.
-const SNAPSHOTS: usize = 6;
-/// Queues and book-keeping of the learner's services, in bytes.
-const LEARNER_OVERHEAD: usize = 4 << 20;
-/// Queues and book-keeping for an actor, in bytes.
-const ACTOR_OVERHEAD: usize = 1 << 19;
 /// All that is trained, targets and moments, in snapshots of the same configuration. 23 were measured: `tensors.safetensors` of a checkpoint of
 /// `tests/small.toml` has 73.1 MB, `latest.safetensors` 3.2 MB.
 const CHECKPOINT_SNAPSHOTS: u64 = 24;
@@ -91,16 +85,6 @@ pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
             needed.div_ceil(MIB)
         )
     })
-}
-
-/// Bytes of shared memory that a learner and `actors` actors touch when every flight is as long as flights can be.
-fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
-    let transport = &config.transport;
-    // Flights of all tickets, what either side has in hand, and one more in the making.
-    let records = transport.max_records_per_flight * transport.tickets_per_actor + 8;
-    let of_actor = records * size_of::<TransitionRecord>() + ACTOR_OVERHEAD;
-    let snapshots = SNAPSHOTS * 4 * SnapshotLayout::of(config).values();
-    (actors * of_actor + snapshots + LEARNER_OVERHEAD) as u64
 }
 
 /// Bytes of a checkpoint when the replay buffer is as full as it can become, with the depth images that are needed while the VAE is trained.

@@ -7,6 +7,7 @@
 use std::fmt;
 use std::fs;
 use std::io;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -94,7 +95,13 @@ impl RunIdentity {
     /// # Errors
     /// When the segments cannot be looked at or changed.
     pub(crate) fn close_to_others(&self, life: Life) -> io::Result<()> {
-        super::sweep::MACHINE.close_segments(&self.life_prefix(life))
+        self.segments(life)
+            .try_for_each(|segment| fs::set_permissions(segment, fs::Permissions::from_mode(0o600)))
+    }
+
+    /// The shared-memory segments of `life`.
+    pub(crate) fn segments(&self, life: Life) -> impl Iterator<Item = PathBuf> {
+        super::sweep::MACHINE.segments(&self.life_prefix(life))
     }
 
     pub(super) fn announcement_file(&self) -> PathBuf {

@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fs;
 use std::io;
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use super::identity::Life;
@@ -135,15 +135,9 @@ impl Machine {
         }
     }
 
-    /// Makes segments whose names begin with `prefix` their owner's alone.
-    pub(super) fn close_segments(&self, prefix: &str) -> io::Result<()> {
-        self.segments(prefix)
-            .try_for_each(|segment| fs::set_permissions(segment, fs::Permissions::from_mode(0o600)))
-    }
-
     /// Segments of this user whose names begin with `prefix`.
-    fn segments(&self, prefix: &str) -> impl Iterator<Item = PathBuf> {
-        let segments = Path::new(self.segments);
+    pub(super) fn segments(&self, prefix: &str) -> impl Iterator<Item = PathBuf> + use<> {
+        let (segments, prefix) = (Path::new(self.segments), prefix.to_owned());
         own_entries(segments)
             .filter(move |(name, about)| about.is_file() && name.as_encoded_bytes().starts_with(prefix.as_bytes()))
             .map(|(name, _)| segments.join(name))

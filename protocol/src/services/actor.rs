@@ -11,6 +11,7 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 
 use super::joining::{JoinError, learner_of};
+use super::memory::reserve;
 use super::opening::{Manner, Opener};
 use super::{Ipc, ServiceError, failed, node, wait};
 use crate::config::Config;
@@ -48,7 +49,9 @@ impl ActorPorts {
     /// [`JoinError::NoLearner`] when there is none to join at this moment; [`JoinError::Difference`] when this process and the learner's do not fit.
     pub fn join(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
         let life = learner_of(identity, config)?.life;
-        Ok(Self::open(identity, life, config)?)
+        let ports = Self::open(identity, life, config)?;
+        reserve(identity, life)?;
+        Ok(ports)
     }
 
     fn open(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, ServiceError> {

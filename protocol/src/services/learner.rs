@@ -11,7 +11,8 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 
 use super::joining::JoinError;
-use super::opening::{Manner, Opener};
+use super::memory::reserve;
+use super::opening::{Manner, Opener, control_slots};
 use super::{Ipc, ServiceError, failed, node, wait};
 use crate::config::Config;
 use crate::fault::{FaultPoint, pass};
@@ -26,7 +27,7 @@ use crate::transition::TransitionRecord;
 pub type ReceivedTransition = iceoryx2::sample::Sample<Ipc, TransitionRecord, ()>;
 
 /// Snapshots that exist at once in shared memory: the history, one being written, and those that slow readers still hold.
-const SNAPSHOT_SLOTS: usize = 8;
+pub(super) const SNAPSHOT_SLOTS: usize = 8;
 
 /// The learner's ends.
 #[derive(Debug)]
@@ -57,6 +58,7 @@ impl LearnerPorts {
     /// [`JoinError`] says which service and why.
     pub fn open(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, JoinError> {
         let ports = Self::create(identity, life, config)?;
+        reserve(identity, life)?;
         pass(FaultPoint::LearnerStarted);
         identity.announce(&Announcement::new(identity, life, config))?;
         Ok(ports)
@@ -70,6 +72,7 @@ impl LearnerPorts {
         let open = Opener::new(&node, Manner::Create, identity, config)?;
         let layout = SnapshotLayout::of(config);
         let weights_factory = open.weights()?;
+        let messages = control_slots(&config.transport);
         Ok(Self {
             run: identity.run,
             transitions: open
@@ -87,6 +90,7 @@ impl LearnerPorts {
                 .publisher_builder()
                 .max_loaned_samples(1)
                 .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .override_sample_preallocation(move |worst_case| worst_case.min(messages))
                 .create()
                 .map_err(failed("control", "publishing"))?,
             weights: weights_factory

@@ -19,6 +19,7 @@
 mod actor;
 mod joining;
 mod learner;
+mod memory;
 mod opening;
 #[cfg(test)]
 mod tests;
@@ -41,6 +42,7 @@ use crate::transition::TransitionRecord;
 pub use actor::{ActorPorts, LoanedTransition};
 pub use joining::JoinError;
 pub use learner::{LearnerPorts, LearnerWaker, ReceivedTransition};
+pub use memory::shared_memory_needed;
 
 type Ipc = ipc::Service;
 
@@ -77,6 +79,8 @@ fn failed<E: Debug>(service: &'static str, operation: &'static str) -> impl FnOn
             "; the learner of this run has not opened it, or is gone"
         } else if cause.contains("ExceedsMax") {
             "; no slot is free: raise transport.max_actors"
+        } else if cause.contains("StorageFull") || cause.contains("code: 28") {
+            "; /dev/shm is full: make it larger, or start fewer actors"
         } else if cause.contains("InsufficientPermissions") {
             "; the run belongs to another user"
         } else {

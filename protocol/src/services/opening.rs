@@ -6,7 +6,7 @@ use iceoryx2::service::port_factory::event;
 
 use super::{Ipc, ServiceError, failed};
 use crate::PROTOCOL_VERSION;
-use crate::config::Config;
+use crate::config::{Config, TransportSection};
 use crate::run::RunIdentity;
 use crate::snapshot::{SnapshotHeader, SnapshotLayout};
 use crate::status::StatusRecord;
@@ -100,9 +100,7 @@ impl<'a> Opener<'a> {
                 .max_subscribers(1)
                 .max_nodes(self.nodes())
                 // Every flight an actor holds a ticket for fits whole, so a record is never refused for want of room.
-                .subscriber_max_buffer_size(
-                    config.transport.max_records_per_flight * config.transport.tickets_per_actor,
-                )
+                .subscriber_max_buffer_size(transition_buffer(&config.transport))
                 .subscriber_max_borrowed_samples(BORROWED_RECORDS)
                 .history_size(0)
                 .enable_safe_overflow(false)
@@ -145,8 +143,7 @@ impl<'a> Opener<'a> {
                 .max_publishers(1)
                 .max_subscribers(self.actors)
                 .max_nodes(self.nodes())
-                // All tickets pass by every actor: room for everyone's while this one flies.
-                .subscriber_max_buffer_size(4 * config.transport.max_actors * config.transport.tickets_per_actor + 64)
+                .subscriber_max_buffer_size(control_buffer(&config.transport))
                 .subscriber_max_borrowed_samples(1)
                 .history_size(0)
                 .enable_safe_overflow(false)
@@ -194,6 +191,22 @@ impl<'a> Opener<'a> {
         };
         opened!(self, name, builder())
     }
+}
+
+/// Records of an actor that may wait for the learner: every flight it holds a ticket for fits whole.
+pub(super) fn transition_buffer(transport: &TransportSection) -> usize {
+    transport.max_records_per_flight * transport.tickets_per_actor
+}
+
+/// Messages that may wait for an actor. All tickets pass by every actor: room for everyone's, some of them twice, while this one flies.
+pub(super) fn control_buffer(transport: &TransportSection) -> usize {
+    4 * transport.max_actors * transport.tickets_per_actor + 64
+}
+
+/// Messages to actors that exist at once. As a rule all actors are left the same ones; those that were stopped at different times keep what was said then,
+/// up to as many of them as are counted here. If there are more, nothing can be said to anybody, and the learner gives the transport up.
+pub(super) fn control_slots(transport: &TransportSection) -> usize {
+    16 * control_buffer(transport)
 }
 
 fn service_name(name: &'static str) -> Result<ServiceName, ServiceError> {

@@ -11,20 +11,25 @@ use crate::run::{LearnerSeat, RunDirectory};
 use crate::snapshot::{Snapshot, SnapshotLayout};
 use crate::ticket::{CourseChoice, Exploration, Ticket};
 
-struct Run {
-    identity: RunIdentity,
-    config: Config,
-    seat: LearnerSeat,
+pub(super) struct Run {
+    pub(super) identity: RunIdentity,
+    pub(super) config: Config,
+    pub(super) seat: LearnerSeat,
     _directory: tempfile::TempDir,
 }
 
 impl Run {
     fn new() -> Self {
+        Self::with(|_| {})
+    }
+
+    pub(super) fn with(change: impl FnOnce(&mut Config)) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         let mut config = Config::default();
         config.transport.max_actors = 2;
         config.sac.hidden_width = 8;
+        change(&mut config);
         run.create(&config).unwrap();
         let (identity, config) = run.open().unwrap();
         Self {
@@ -204,14 +209,7 @@ fn there_is_nobody_to_join_before_the_services_are_open_and_after_the_learner_is
 fn everything_of_a_run_is_its_users_alone() {
     let run = Run::new();
     let (_learner, _actor) = (run.learner().unwrap(), run.actor().unwrap());
-    let prefix = run.identity.life_prefix(run.seat.life());
-    let is_ours = |entry: &std::fs::DirEntry| entry.file_name().to_string_lossy().starts_with(&prefix);
-    let segments: Vec<_> = std::fs::read_dir("/dev/shm")
-        .unwrap()
-        .map(Result::unwrap)
-        .filter(is_ours)
-        .map(|entry| entry.path())
-        .collect();
+    let segments: Vec<_> = run.identity.segments(run.seat.life()).collect();
     assert!(segments.len() > 10, "{segments:?}");
     let folders = [
         run.identity.transport_folder(),

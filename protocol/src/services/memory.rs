@@ -1,0 +1,104 @@
+//! How much shared memory the services take, and that it is there before it is used.
+//!
+//! A segment is as long as its contents may become, but the system gives it memory page by page, as it is touched. If there is none left then, whoever
+//! touches it dies of SIGBUS. So whoever has opened its ends of the services reserves what they may need.
+
+use std::fs::{self, OpenOptions};
+use std::io;
+
+use rustix::fs::FallocateFlags;
+
+use super::learner::SNAPSHOT_SLOTS;
+use super::opening::{control_buffer, control_slots, transition_buffer};
+use super::{ServiceError, failed};
+use crate::config::Config;
+use crate::run::{Life, RunIdentity};
+use crate::snapshot::SnapshotLayout;
+use crate::ticket::ControlRecord;
+use crate::transition::TransitionRecord;
+
+/// iceoryx2's header of a sample and what aligns it, generously.
+const SAMPLE_OVERHEAD: usize = 128;
+/// Queues and book-keeping of an actor's ends, besides what depends on the configuration.
+const ACTOR_OVERHEAD: usize = 96 << 10;
+/// Queues and book-keeping of the learner's ends, likewise.
+const LEARNER_OVERHEAD: usize = 256 << 10;
+/// Book-keeping for an actor that there may be.
+const SLOT_OVERHEAD: usize = 3 << 10;
+
+/// Bytes of shared memory that a learner and `actors` actors with `config` take.
+pub fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
+    let snapshot = SnapshotLayout::of(config).values() * size_of::<f32>() + SAMPLE_OVERHEAD;
+    let control = control_slots(&config.transport) * (size_of::<ControlRecord>() + SAMPLE_OVERHEAD / 2);
+    let slots = config.transport.max_actors * SLOT_OVERHEAD;
+    let learner = SNAPSHOT_SLOTS * snapshot + control + slots + LEARNER_OVERHEAD;
+    // Flights of all tickets, and what either side has in hand.
+    let records = transition_buffer(&config.transport) + 8;
+    // A queue of eight bytes a message there and back, and one byte to say who has it.
+    let queues = 2 * 8 * control_buffer(&config.transport) + control_slots(&config.transport);
+    let actor = records * (size_of::<TransitionRecord>() + SAMPLE_OVERHEAD) + queues + ACTOR_OVERHEAD;
+    (learner + actors * actor) as u64
+}
+
+/// Reserves the memory of all segments of `life`.
+///
+/// # Errors
+/// [`ServiceError`] when there is not enough.
+pub(super) fn reserve(identity: &RunIdentity, life: Life) -> Result<(), ServiceError> {
+    for segment in identity.segments(life) {
+        match reserve_segment(&segment) {
+            // Its owner has removed it meanwhile.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            reserved => reserved.map_err(failed("all", "reserving shared memory"))?,
+        }
+    }
+    Ok(())
+}
+
+fn reserve_segment(segment: &std::path::Path) -> io::Result<()> {
+    use std::os::unix::fs::MetadataExt;
+    /// Bytes in which the system counts what a file takes.
+    const BLOCK: u64 = 512;
+    let about = fs::metadata(segment)?;
+    if about.len() <= about.blocks() * BLOCK {
+        return Ok(());
+    }
+    let file = OpenOptions::new().write(true).open(segment)?;
+    Ok(rustix::fs::fallocate(&file, FallocateFlags::empty(), 0, about.len())?)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::MetadataExt;
+
+    use super::super::tests::Run;
+    use super::super::{ActorPorts, LearnerPorts};
+    use super::*;
+
+    #[test]
+    fn what_is_needed_is_what_is_taken_and_a_little_more() {
+        for (max_actors, width) in [(2, 8), (64, 256), (256, 8)] {
+            let run = Run::with(|config| {
+                config.transport.max_actors = max_actors;
+                config.sac.hidden_width = width;
+            });
+            let learner = LearnerPorts::open(&run.identity, run.seat.life(), &run.config).unwrap();
+            let taken = || -> u64 {
+                let segments = run.identity.segments(run.seat.life());
+                segments.map(|path| fs::metadata(path).unwrap().blocks() * 512).sum()
+            };
+            let mut actors = Vec::new();
+            for joined in 0..=2 {
+                let needed = shared_memory_needed(&run.config, joined);
+                let (least, most) = (needed * 80 / 100, needed);
+                let taken = taken();
+                assert!(
+                    (least..=most).contains(&taken),
+                    "{joined} of {max_actors} actors take {taken} bytes where {needed} are foreseen"
+                );
+                actors.push(ActorPorts::join(&run.identity, &run.config).unwrap());
+                learner.maintain().unwrap();
+            }
+        }
+    }
+}
