@@ -17,4 +17,4 @@ mod script;
 pub mod targets;
 
 pub use corpus::{committed, word_list};
-pub use targets::{TARGETS, Target};
+pub use targets::{TARGETS, Target, Verdict};

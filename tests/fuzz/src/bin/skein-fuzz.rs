@@ -71,7 +71,9 @@ fn begin() {
     }
 }
 
-fuzz_target!(init: begin(), |bytes: &[u8]| driven().target.exercise(bytes));
+fuzz_target!(init: begin(), |bytes: &[u8]| {
+    driven().target.exercise(bytes);
+});
 
 // Half of the time by libFuzzer's own mutations, which know what was compared with what; half by ours, which know words and numbers.
 fuzz_mutator!(|data: &mut [u8], size: usize, max_size: usize, seed: u32| {

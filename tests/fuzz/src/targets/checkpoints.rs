@@ -24,14 +24,14 @@ use tch::Tensor;
 use tempfile::TempDir;
 
 use super::replay::{config, flight};
-use super::{Target, USUAL, tagged};
+use super::{Target, USUAL, Verdict, tagged};
 use crate::scratch::{folder, with_files};
 
 pub(super) const FILES: Target = Target {
     name: "checkpoint",
     reads: "the files of a checkpoint, which one says the first byte, of tensors the header only; then what is loaded is used",
     longest_bytes: 4096,
-    weight: USUAL / 2,
+    weight: USUAL / 4,
     samples,
     run: checkpoint,
 };
@@ -181,9 +181,9 @@ fn samples() -> Vec<Vec<u8>> {
     })
 }
 
-fn checkpoint(bytes: &[u8]) {
+fn checkpoint(bytes: &[u8]) -> Verdict {
     let Some((&kind, content)) = bytes.split_first() else {
-        return;
+        return Verdict::Refused;
     };
     let name = FILE_NAMES[usize::from(kind) % FILE_NAMES.len()];
     SOUND.with(|sound| {
@@ -205,15 +205,14 @@ fn checkpoint(bytes: &[u8]) {
         let mut reader = config();
         // Under the configuration it was written under, nobody looks at it.
         reader.run.seed += u64::from(name == "config.toml");
-        match store(sound.folder.path(), &reader).load(FLIGHTS) {
-            Ok(state) => go_on(state),
-            Err(error) => {
-                let folder = sound.folder.path().display().to_string();
-                assert!(error.to_string().contains(&folder), "{error}");
-            }
-        }
+        let loaded = store(sound.folder.path(), &reader).load(FLIGHTS);
         fs::write(path, &sound.files[name]).unwrap();
-    });
+        if let Err(error) = &loaded {
+            let folder = sound.folder.path().display().to_string();
+            assert!(error.to_string().contains(&folder), "{error}");
+        }
+        Verdict::of(loaded.ok().map(go_on))
+    })
 }
 
 /// Uses what was loaded as far as it can be used without networks.
@@ -279,24 +278,28 @@ fn csv_samples() -> Vec<Vec<u8>> {
     ]
 }
 
-fn flights_csv(bytes: &[u8]) {
+fn flights_csv(bytes: &[u8]) -> Verdict {
     let Some((&flights, content)) = bytes.split_first() else {
-        return;
+        return Verdict::Refused;
     };
     let flights = u64::from(flights);
     with_files(&[("flights.csv", content)], |folder| {
         let path = folder.join("flights.csv");
         let mut csv = match FlightsCsv::resume(&path, flights, &DISK) {
             Ok(csv) => csv,
-            Err(error) => return assert!(error.to_string().contains("flights.csv"), "{error}"),
+            Err(error) => {
+                assert!(error.to_string().contains("flights.csv"), "{error}");
+                return Verdict::Refused;
+            }
         };
         csv.write(&row(flights)).unwrap();
         csv.flush().unwrap();
         FlightsCsv::resume(&path, flights + 1, &DISK).unwrap();
-    });
+        Verdict::Accepted
+    })
 }
 
-fn event_files(bytes: &[u8]) {
+fn event_files(bytes: &[u8]) -> Verdict {
     let file = |line: &[u8]| {
         let line = String::from_utf8_lossy(line).into_owned();
         let (name, bytes) = line.rsplit_once(' ')?;
@@ -310,12 +313,14 @@ fn event_files(bytes: &[u8]) {
         let curves = folder.join("tensorboard");
         fs::create_dir_all(&curves).unwrap();
         fs::write(curves.join("events.out.tfevents.1.skein.000000"), b"12345678").unwrap();
-        let resumed = EventWriter::resume(&curves, files.clone(), 0, &DISK);
-        if let Ok(mut writer) = resumed {
+        let mut resumed = EventWriter::resume(&curves, files.clone(), 0, &DISK).ok();
+        if let Some(writer) = &mut resumed {
             writer.scalars(1, &[("a", 1.0)]).unwrap();
             writer.flush().unwrap();
         }
         fs::remove_dir_all(curves).unwrap();
         assert_eq!(fs::read(folder.join("outside")).unwrap(), b"untouched", "{files:?}");
-    });
+        // The last one is the file just begun.
+        Verdict::of(resumed.filter(|writer| writer.files().len() == files.len() + 1))
+    })
 }

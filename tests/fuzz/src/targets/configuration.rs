@@ -9,7 +9,7 @@ use skein_simulator::course::Course;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 
 use super::courses::{assert_flyable, fly};
-use super::{Target, USUAL, shipped, text};
+use super::{Target, USUAL, Verdict, shipped, text};
 
 pub(super) const CONFIG: Target = Target {
     name: "config",
@@ -17,10 +17,9 @@ pub(super) const CONFIG: Target = Target {
     longest_bytes: 8192,
     weight: USUAL,
     samples: config_samples,
-    run: |bytes| {
-        if let Some(text) = text(bytes) {
-            check(Config::parse(text, file(), &[]));
-        }
+    run: |bytes| match text(bytes) {
+        Some(text) => check(Config::parse(text, file(), &[])),
+        None => Verdict::Refused,
     },
 };
 
@@ -61,7 +60,7 @@ fn config_samples() -> Vec<Vec<u8>> {
 }
 
 /// What is accepted reads back the same; what is refused is refused by its file.
-fn check(read: Result<Config, ConfigError>) {
+fn check(read: Result<Config, ConfigError>) -> Verdict {
     match read {
         Ok(config) => {
             let again = Config::parse(&config.to_toml(), file(), &[]).unwrap();
@@ -70,10 +69,12 @@ fn check(read: Result<Config, ConfigError>) {
             assert_eq!(again.digest(), config.digest());
             assert!(SnapshotLayout::of(&config).values() > 0);
             assert!(!config.transport.heartbeat().is_zero());
+            Verdict::Accepted
         }
         Err(error) => {
             let told = error.to_string();
             assert!(told.contains("fuzzed.toml") || told.contains("--set"), "{told}");
+            Verdict::Refused
         }
     }
 }
@@ -89,8 +90,10 @@ fn override_samples() -> Vec<Vec<u8>> {
     .to_vec()
 }
 
-fn overridden(bytes: &[u8]) {
-    let Some(text) = text(bytes) else { return };
+fn overridden(bytes: &[u8]) -> Verdict {
+    let Some(text) = text(bytes) else {
+        return Verdict::Refused;
+    };
     let overrides: Vec<String> = text.split('\n').take(8).map(str::to_owned).collect();
     let parse = |overrides: &[String]| Config::parse("", file(), overrides);
     let read = parse(&overrides);
@@ -99,7 +102,7 @@ fn overridden(bytes: &[u8]) {
         let told = |overrides: &[String]| parse(overrides).err().map(|error| error.to_string());
         assert!(culprit(&overrides, told).is_some());
     }
-    check(read);
+    check(read)
 }
 
 fn simulator_samples() -> Vec<Vec<u8>> {
@@ -121,14 +124,13 @@ static TRAINING: LazyLock<Arc<Course>> = LazyLock::new(|| {
 });
 
 /// Settings that are accepted can be flown with.
-fn simulated(bytes: &[u8]) {
+fn simulated(bytes: &[u8]) -> Verdict {
     let Some(Ok(settings)) = text(bytes).map(toml::from_str::<SimulatorSettings>) else {
-        return;
+        return Verdict::Refused;
     };
-    if let Ok(mut simulator) = Simulator::new(Arc::clone(&TRAINING), &settings) {
-        fly(&mut simulator, &settings, 1);
-    }
+    let simulator = Simulator::new(Arc::clone(&TRAINING), &settings).ok();
     if let Ok(course) = Course::generate(0, &settings.generator) {
         assert_flyable(course);
     }
+    Verdict::of(simulator.map(|mut simulator| fly(&mut simulator, &settings, 1)))
 }

@@ -11,7 +11,7 @@ use skein_simulator::course::{
 use skein_simulator::reward::RewardTerms;
 use skein_simulator::simulator::{Outcome, Simulator, SimulatorSettings};
 
-use super::{Target, USUAL, shipped, text};
+use super::{Target, USUAL, Verdict, shipped, text};
 use crate::script::Script;
 
 pub(super) const FILE: Target = Target {
@@ -22,8 +22,11 @@ pub(super) const FILE: Target = Target {
     samples: file_samples,
     run: |bytes| match text(bytes).map(|text| Course::parse(text, "fuzzed.toml")) {
         Some(Ok(course)) => assert_flyable(course),
-        Some(Err(error)) => assert!(error.to_string().contains("fuzzed.toml"), "{error}"),
-        None => {}
+        Some(Err(error)) => {
+            assert!(error.to_string().contains("fuzzed.toml"), "{error}");
+            Verdict::Refused
+        }
+        None => Verdict::Refused,
     },
 };
 
@@ -31,12 +34,11 @@ pub(super) const LAYOUT: Target = Target {
     name: "course_layout",
     reads: "courses of any geometry, spelt by a script of choices",
     longest_bytes: 1024,
-    weight: USUAL / 5,
+    weight: USUAL / 10,
     samples: layout_samples,
-    run: |bytes| {
-        if let Ok(course) = Course::new(layout(&mut Script::new(bytes))) {
-            assert_flyable(course);
-        }
+    run: |bytes| match Course::new(layout(&mut Script::new(bytes))) {
+        Ok(course) => assert_flyable(course),
+        Err(_) => Verdict::Refused,
     },
 };
 
@@ -45,12 +47,13 @@ pub(super) const GENERATOR: Target = Target {
     reads: "ranges of generated courses, spelt by a script of choices",
     longest_bytes: 256,
     weight: USUAL / 20,
-    samples: || vec![Vec::new(), [128; 100].to_vec(), (0..=255).collect()],
+    samples: generator_samples,
     run: |bytes| {
         let mut script = Script::new(bytes);
         let seed = script.u64();
-        if let Ok(course) = Course::generate(seed, &ranges(&mut script)) {
-            assert_flyable(course);
+        match Course::generate(seed, &ranges(&mut script)) {
+            Ok(course) => assert_flyable(course),
+            Err(_) => Verdict::Refused,
         }
     },
 };
@@ -76,13 +79,34 @@ fn layout_samples() -> Vec<Vec<u8>> {
     samples
 }
 
+/// One to four walls, each of one of three shapes, in the middle of all ranges.
+fn generator_samples() -> Vec<Vec<u8>> {
+    let numbers = |count: usize| vec![128; 3 * count];
+    (1..5_u8)
+        .map(|walls| {
+            let seed = [walls; 8];
+            let shapes = [3, walls, walls + 1, walls + 2];
+            // Before the walls: two ranges, corridor, start, gap; then the thickness and a place for each.
+            [
+                &seed[..],
+                &numbers(11),
+                &[walls],
+                &numbers(1 + usize::from(walls)),
+                &shapes,
+            ]
+            .concat()
+        })
+        .collect()
+}
+
 /// Flies the first step from the first and the last level: nothing panics, every number is finite, and a flight does not begin in a wall.
-pub(super) fn assert_flyable(course: Course) {
+pub(super) fn assert_flyable(course: Course) -> Verdict {
     let settings = SimulatorSettings::default();
     let levels = course.levels();
     let mut simulator = Simulator::new(Arc::new(course), &settings).unwrap();
     fly(&mut simulator, &settings, 1);
     fly(&mut simulator, &settings, levels);
+    Verdict::Accepted
 }
 
 /// Flies two steps from `level`.

@@ -26,7 +26,26 @@ pub struct Target {
     /// Valid inputs, made by the code that writes them or from what is shipped: no format has to be kept in step by hand.
     pub samples: fn() -> Vec<Vec<u8>>,
     /// Reads the input; panics when a promise is broken.
-    pub run: fn(&[u8]),
+    pub run: fn(&[u8]) -> Verdict,
+}
+
+/// What the reader thought of an input. A target of which nothing is ever accepted would try no promise.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// Something of it was believed.
+    Accepted,
+    /// Nothing was.
+    Refused,
+}
+
+impl Verdict {
+    /// Accepted if there is a result, and refused if there is none.
+    fn of<T>(result: Option<T>) -> Self {
+        match result {
+            Some(_) => Self::Accepted,
+            None => Self::Refused,
+        }
+    }
 }
 
 impl Target {
@@ -34,15 +53,16 @@ impl Target {
     ///
     /// # Panics
     /// When the reader does, breaks a promise, or allocates without bounds.
-    pub fn exercise(&self, bytes: &[u8]) {
+    pub fn exercise(&self, bytes: &[u8]) -> Verdict {
         allocations::forget();
-        (self.run)(bytes);
+        let verdict = (self.run)(bytes);
         allocations::check();
+        verdict
     }
 }
 
 /// Weight of a target that reads thousands of inputs a second.
-const USUAL: usize = 100;
+const USUAL: usize = 200;
 
 /// All of them.
 pub static TARGETS: [Target; 21] = [

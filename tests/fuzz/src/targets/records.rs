@@ -14,14 +14,14 @@ use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
 
 use super::signals::pod;
-use super::{Target, USUAL};
+use super::{Target, USUAL, Verdict};
 use crate::script::Script;
 
 pub(super) const RECORDS: Target = Target {
     name: "records",
     reads: "transition and status records, spelt by a script of what actors do",
     longest_bytes: 512,
-    weight: USUAL,
+    weight: 2 * USUAL,
     samples,
     run: |bytes| Learner::new().follow(&mut Script::new(bytes)),
 };
@@ -49,7 +49,8 @@ pub(super) fn sample_ticket(flight: u64) -> Ticket {
 
 /// Scripts in which flights are flown as they should be, and some in which they are not.
 fn samples() -> Vec<Vec<u8>> {
-    const ATTACH: [u8; 3] = [1, 0, 1];
+    /// Actor 0, in life 1, serves.
+    const ATTACH: [u8; 4] = [1, 0, 1, 0];
     const ISSUE: [u8; 1] = [2];
     const STEP: [u8; 3] = [3, 0, 0];
     // The last step, and the closing record after it.
@@ -70,10 +71,10 @@ fn samples() -> Vec<Vec<u8>> {
         .concat(),
         [
             &ATTACH[..],
-            &[1, 1, 1],
+            &[1, 1, 1, 0],
             &ISSUE,
             &STEP,
-            &[1, 0, 2],
+            &[1, 0, 2, 0],
             &ISSUE,
             &STEP,
             &CLOSE,
@@ -133,7 +134,7 @@ impl Learner {
         }
     }
 
-    fn follow(mut self, script: &mut Script<'_>) {
+    fn follow(mut self, script: &mut Script<'_>) -> Verdict {
         while !script.is_over() {
             match script.u8() % 7 {
                 0 => {
@@ -159,6 +160,7 @@ impl Learner {
             // A flight that was given up for good ends the run; it alone may be missing.
             assert!(open <= FLIGHTS as usize, "{open} of {FLIGHTS} flights");
         }
+        Verdict::of(self.committed.first())
     }
 
     /// An actor of three, in one of four lives, comes or goes.

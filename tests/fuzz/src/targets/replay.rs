@@ -11,7 +11,7 @@ use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
 
-use super::{Target, USUAL};
+use super::{Target, USUAL, Verdict};
 use crate::script::Script;
 
 pub(super) const REPLAY: Target = Target {
@@ -35,7 +35,7 @@ pub(super) fn config() -> Config {
     config
 }
 
-fn restore(bytes: &[u8]) {
+fn restore(bytes: &[u8]) -> Verdict {
     let (config, mut script) = (config(), Script::new(bytes));
     let state = ReplayState {
         images: images(&mut script),
@@ -43,7 +43,7 @@ fn restore(bytes: &[u8]) {
         regular: ring(&mut script, 224),
     };
     let Ok(mut replay) = Replay::restore(&config, state.clone()) else {
-        return;
+        return Verdict::Refused;
     };
     assert_eq!(replay.state(), state);
     let mut rng = Pcg64Mcg::seed_from_u64(1);
@@ -58,6 +58,7 @@ fn restore(bytes: &[u8]) {
     let encode = |images: &[u8]| Ok::<_, ()>(vec![[0.5; LATENT]; images.len() / IMAGE_PIXELS]);
     replay.freeze_latents(8, encode).unwrap();
     assert_eq!(replay.image_count(), None);
+    Verdict::Accepted
 }
 
 fn images(script: &mut Script<'_>) -> Option<Vec<Arc<Vec<u8>>>> {

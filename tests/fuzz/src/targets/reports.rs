@@ -9,7 +9,7 @@ use skein_protocol::run::RunDirectory;
 use skein_simulator::course::{Course, CourseLayout};
 
 use super::courses::layout;
-use super::{Target, USUAL, shipped, tagged};
+use super::{Target, USUAL, Verdict, shipped, tagged};
 use crate::scratch::with_files;
 use crate::script::Script;
 
@@ -17,16 +17,17 @@ pub(super) const FILES: Target = Target {
     name: "report_files",
     reads: "flights.csv (after a 0), evaluation_paths.csv (after a 1), reconstructions.safetensors (after a 2)",
     longest_bytes: 4096,
-    weight: USUAL,
+    weight: USUAL / 2,
     samples,
     run: |bytes| {
         with_run(bytes, |run| match Material::read(run) {
-            Ok(_) => {}
+            Ok(_) => Verdict::Accepted,
             Err(error) => {
                 let folder = run.root().display().to_string();
                 assert!(error.to_string().contains(&folder), "{error}");
+                Verdict::Refused
             }
-        });
+        })
     },
 };
 
@@ -44,8 +45,10 @@ pub(super) const CURVES: Target = Target {
         with_files(&[("events.out.tfevents.1", &file)], |folder| {
             if let Err(error) = read_curves(folder) {
                 assert!(error.to_string().contains("events.out.tfevents.1"), "{error}");
+                return Verdict::Refused;
             }
-        });
+            Verdict::Accepted
+        })
     },
 };
 
@@ -98,10 +101,10 @@ pub(super) const PICTURES: Target = Target {
         let mut courses = vec![TRAINING.clone()];
         courses.extend(fuzzed_course(course));
         with_run(files, |run| {
-            if let Ok(pictures) = draw_all(run, &courses, 50, 3.0) {
-                assert!(pictures.iter().all(|picture| picture.exists()));
-            }
-        });
+            let pictures = draw_all(run, &courses, 50, 3.0).ok();
+            assert!(pictures.iter().flatten().all(|picture| picture.exists()));
+            Verdict::of(pictures)
+        })
     },
 };
 
@@ -122,13 +125,13 @@ fn fuzzed_course(script: &[u8]) -> Option<NamedCourse> {
 }
 
 /// A run that left one file, of the kind that the first byte says.
-fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory)) {
+fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory) -> Verdict) -> Verdict {
     const NAMES: [&str; 3] = ["flights.csv", "evaluation_paths.csv", "reconstructions.safetensors"];
     let Some((&kind, content)) = bytes.split_first() else {
-        return;
+        return Verdict::Refused;
     };
     let name = NAMES[usize::from(kind) % NAMES.len()];
-    with_files(&[(name, content)], |folder| read(&RunDirectory::new(folder)));
+    with_files(&[(name, content)], |folder| read(&RunDirectory::new(folder)))
 }
 
 fn samples() -> Vec<Vec<u8>> {

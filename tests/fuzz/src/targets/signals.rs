@@ -6,17 +6,17 @@ use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, ControlRecord};
 
 use super::records::sample_ticket;
-use super::{Target, USUAL};
+use super::{Target, USUAL, Verdict};
 
 pub(super) const SIGNALS: Target = Target {
     name: "signals",
     reads: "status and control records",
     longest_bytes: 128,
-    weight: USUAL,
+    weight: 2 * USUAL,
     samples: signal_samples,
     run: |bytes| {
-        status(pod(bytes), run_of(bytes));
-        control(pod(bytes), run_of(bytes));
+        let run = run_of(bytes);
+        Verdict::of(status(pod(bytes), run).or(control(pod(bytes), run)))
     },
 };
 
@@ -52,18 +52,19 @@ fn run_of(bytes: &[u8]) -> RunId {
     RunId(pod(bytes))
 }
 
-fn status(record: StatusRecord, run: RunId) {
+fn status(record: StatusRecord, run: RunId) -> Option<()> {
     assert_eq!(record.read(RunId(!run.0)), None);
-    if let Some(status) = record.read(run) {
-        assert_eq!(StatusRecord::new(run, &status).read(run), Some(status));
-    }
+    let status = record.read(run)?;
+    assert_eq!(StatusRecord::new(run, &status).read(run), Some(status));
+    Some(())
 }
 
-fn control(record: ControlRecord, run: RunId) {
+fn control(record: ControlRecord, run: RunId) -> Option<()> {
     assert!(record.read(RunId(!run.0)).is_err());
-    if let Ok(Control::Fly(ticket)) = record.read(run) {
+    if let Control::Fly(ticket) = record.read(run).ok()? {
         let again = ControlRecord::fly(&ticket, ActorId(1), Incarnation(2));
         assert_eq!(again.read(run), Ok(Control::Fly(ticket)));
         assert!(ticket.start_level > 0);
     }
+    Some(())
 }

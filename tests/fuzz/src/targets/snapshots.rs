@@ -10,7 +10,7 @@ use skein_protocol::ids::{PolicyVersion, RunId};
 use skein_protocol::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 
 use super::signals::pod;
-use super::{Target, USUAL};
+use super::{Target, USUAL, Verdict};
 use crate::script::Script;
 
 pub(super) const FILE: Target = Target {
@@ -69,7 +69,7 @@ thread_local! {
 }
 
 /// The input's first eight bytes are the length of the file's header; the sound one's is right if the rest is as long.
-fn file(bytes: &[u8]) {
+fn file(bytes: &[u8]) -> Verdict {
     BUFFER.with_borrow_mut(|buffer| {
         let start = FILE.longest_bytes - bytes.len();
         buffer[start..FILE.longest_bytes].copy_from_slice(bytes);
@@ -77,13 +77,19 @@ fn file(bytes: &[u8]) {
         if let Some(length) = buffer[start..FILE.longest_bytes].first_chunk_mut::<8>() {
             *length = (bytes.len() as u64 - 8).to_le_bytes();
         }
-        for file in [&buffer[start..], bytes] {
-            match Snapshot::parse(file, Path::new("fuzzed.safetensors")) {
-                Ok((snapshot, config)) => check(&snapshot, &SnapshotLayout::of(&config)),
-                Err(error) => assert!(error.to_string().contains("fuzzed.safetensors"), "{error}"),
-            }
-        }
-    });
+        let sound =
+            [&buffer[start..], bytes].map(|file| match Snapshot::parse(file, Path::new("fuzzed.safetensors")) {
+                Ok((snapshot, config)) => {
+                    check(&snapshot, &SnapshotLayout::of(&config));
+                    Some(snapshot)
+                }
+                Err(error) => {
+                    assert!(error.to_string().contains("fuzzed.safetensors"), "{error}");
+                    None
+                }
+            });
+        Verdict::of(sound.into_iter().flatten().next())
+    })
 }
 
 fn check(snapshot: &Snapshot, layout: &SnapshotLayout) {
@@ -103,7 +109,7 @@ fn received_samples() -> Vec<Vec<u8>> {
     ]
 }
 
-fn received(bytes: &[u8]) {
+fn received(bytes: &[u8]) -> Verdict {
     let mut script = Script::new(bytes);
     let mut header: SnapshotHeader = pod(script.bytes(size_of::<SnapshotHeader>()));
     let checksum_is_made_right = script.u8() % 2 == 1;
@@ -120,9 +126,9 @@ fn received(bytes: &[u8]) {
         if checksum_is_made_right {
             header.checksum = xxhash_rust::xxh3::xxh3_64(sent);
         }
-        let read = Snapshot::receive(&header, sent, RUN, &SOUND.layout);
-        if let Ok(snapshot) = read {
-            check(&snapshot, &SOUND.layout);
+        let read = Snapshot::receive(&header, sent, RUN, &SOUND.layout).ok();
+        if let Some(snapshot) = &read {
+            check(snapshot, &SOUND.layout);
             assert_eq!(cast_slice::<f32, u8>(&snapshot.values), sent);
             assert_eq!(snapshot.version.0, header.policy_version);
         }
@@ -130,5 +136,6 @@ fn received(bytes: &[u8]) {
         for (place, value) in changed.into_iter().rev() {
             values[place] = value;
         }
-    });
+        Verdict::of(read)
+    })
 }
