@@ -1,5 +1,6 @@
 //! What the learner tells while it runs: progress lines on standard output, and where its time goes.
 
+use std::collections::VecDeque;
 use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -71,7 +72,7 @@ impl Drop for Reporter {
 fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared, disk: &Disk) {
     let started = Instant::now();
     let mut watchdog = Watchdog::new(started);
-    let mut marks: Vec<(f64, u64, u64)> = Vec::new();
+    let mut marks: VecDeque<(f64, u64, u64)> = VecDeque::new();
     loop {
         let last = ended.load(Ordering::Relaxed);
         let mut line = progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
@@ -82,8 +83,11 @@ fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared, di
         line.refused = faults.refused_by_reason();
         line.live_actors = reception.live_actors();
         line.actors = line.live_actors.len();
-        marks.push((line.elapsed_secs, line.steps, line.updates));
-        let (since, steps, updates) = marks[marks.len().saturating_sub(RATE_INTERVALS + 1)];
+        if marks.len() > RATE_INTERVALS {
+            marks.pop_front();
+        }
+        marks.push_back((line.elapsed_secs, line.steps, line.updates));
+        let (since, steps, updates) = marks[0];
         let secs = (line.elapsed_secs - since).max(1e-9);
         if line.elapsed_secs > since {
             line.steps_per_sec = (line.steps - steps) as f64 / secs;

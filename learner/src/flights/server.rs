@@ -54,6 +54,17 @@ enum Outgoing {
     Control(ControlRecord),
 }
 
+/// What the training thread wants of the receiving one, besides its commands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Wish {
+    /// That it goes on.
+    Serve,
+    /// That it sends the actors home.
+    Finish,
+    /// It is gone without a word: it panicked. The actors stay, for the learner's next life needs them.
+    Vanish,
+}
+
 /// What a round leaves to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Next {
@@ -82,7 +93,15 @@ impl Server {
     /// # Errors
     /// [`ReceptionError::Hopeless`] and [`ReceptionError::Transport`].
     pub(super) fn run(&mut self, inbox: &Receiver<Command>, shared: &Shared) -> Result<(), ReceptionError> {
-        while self.take_commands(inbox) {
+        loop {
+            match self.take_commands(inbox) {
+                Wish::Serve => {}
+                Wish::Finish => {
+                    self.say_stop();
+                    return Ok(());
+                }
+                Wish::Vanish => return Ok(()),
+            }
             let now = Instant::now();
             self.take_status(now);
             let next = self.take_records(now)?;
@@ -98,12 +117,10 @@ impl Server {
                 self.wait();
             }
         }
-        self.say_stop();
-        Ok(())
     }
 
-    /// Takes the training thread's wishes; false when the last is the end.
-    fn take_commands(&mut self, inbox: &Receiver<Command>) -> bool {
+    /// Carries out the training thread's commands; returns what it wants in the end.
+    fn take_commands(&mut self, inbox: &Receiver<Command>) -> Wish {
         loop {
             match inbox.try_recv() {
                 Ok(Command::Publish(snapshot)) => self.outbox.push_back(Outgoing::Snapshot(snapshot)),
@@ -130,8 +147,9 @@ impl Server {
                         });
                     }
                 }
-                Ok(Command::Finish) | Err(TryRecvError::Disconnected) => return false,
-                Err(TryRecvError::Empty) => return true,
+                Ok(Command::Finish) => return Wish::Finish,
+                Err(TryRecvError::Disconnected) => return Wish::Vanish,
+                Err(TryRecvError::Empty) => return Wish::Serve,
             }
         }
     }

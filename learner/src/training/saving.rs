@@ -212,33 +212,37 @@ impl<'a> Training<'a> {
         Ok(self.saved.clone())
     }
 
-    /// Finishes the checkpoint being written, lets the actors go, and sums up how the run ended and how far it came.
+    /// Finishes the checkpoint being written, sums up how the run ended and how far it came, and lets the actors go.
+    ///
+    /// In this order: a learner that dies before all is written is started again, and needs its actors still.
     pub(super) fn conclude(self, end: Result<(Ending, Progress), TrainingError>) -> Result<Summary, TrainingError> {
-        let written = self.checkpoints.finish();
         // A thread that has ended can no longer be asked.
         let thread_cpu_secs = threads::cpu_secs();
-        self.reception.finish();
-        let (ending, progress) = match (end, written) {
-            (Ok(end), Ok(())) => end,
-            (Ok(_), Err(error)) => return Err(error.into()),
-            (Err(error), written) => {
-                if let Err(error) = written {
-                    tracing::error!(%error, "the last checkpoint was not written");
-                }
-                return Err(error);
+        let written = self.checkpoints.finish();
+        let summed_up = match (end, written) {
+            (Ok((ending, progress)), Ok(())) => {
+                let summary = Summary {
+                    thread_cpu_secs,
+                    ..summary(self.identity, self.config, ending, &progress, self.resumes)
+                };
+                save_summary(self.directory, &self.disk, &summary).map(|()| summary)
+            }
+            (Ok(_), Err(error)) => Err(error.into()),
+            (Err(error), Ok(())) => Err(error),
+            (Err(error), Err(second)) => {
+                tracing::error!(error = %second, "the last checkpoint was not written");
+                Err(error)
             }
         };
-        pass(FaultPoint::LearnerBeforeSummary);
-        let summary = Summary {
-            thread_cpu_secs,
-            ..summary(self.identity, self.config, ending, &progress, self.resumes)
-        };
-        let path = self.directory.summary_json();
-        self.disk
-            .with_room(&path, || summary.save(&path))
-            .map_err(file_error(&path))?;
-        Ok(summary)
+        self.reception.finish();
+        summed_up
     }
+}
+
+fn save_summary(directory: &RunDirectory, disk: &Disk, summary: &Summary) -> Result<(), TrainingError> {
+    pass(FaultPoint::LearnerBeforeSummary);
+    let path = directory.summary_json();
+    disk.with_room(&path, || summary.save(&path)).map_err(file_error(&path))
 }
 
 /// A run that has not begun.
