@@ -96,10 +96,10 @@ fn a_resumed_trainer_goes_on_bit_for_bit_whenever_it_is_resumed() {
         let undisturbed = train(lag, &[]);
         assert!(undisturbed.progress.vae_steps > 3 && undisturbed.progress.sac_updates > 10);
         assert!(undisturbed.replay.images.is_none(), "the VAE was never frozen");
-        // While the VAE is trained, as it is frozen, after; and at all of these.
-        for after in [&[1][..], &[2], &[3], &[4], &[1, 2, 3, 4, 5]] {
+        // While the VAE is trained, as it is frozen after the third epoch, and later.
+        for after in [&[2][..], &[1, 2, 3, 4, 5]] {
             let resumed = train(lag, after);
-            assert_eq!(resumed, undisturbed, "lag {lag}, resumed after {after:?}");
+            assert!(resumed == undisturbed, "lag {lag}, resumed after {after:?}");
         }
     }
 }
