@@ -63,7 +63,6 @@ fn state(flights: u64) -> CheckpointState {
             }),
             metrics: MetricsState {
                 flights,
-                flights_extent: crate::metrics::FlightsExtent::empty(),
                 events: vec![EventFile {
                     name: "events.out.tfevents.1.skein.000000".into(),
                     bytes: 77,
@@ -194,6 +193,7 @@ fn one_state_is_always_the_same_bytes() {
 fn a_damaged_byte_anywhere_is_refused_and_its_file_named() {
     let (_directory, store) = store(2);
     let place = store.save(&state(500), &[]).unwrap();
+    let mut tried = 0;
     for name in all_files() {
         let path = place.join(name);
         let sound = fs::read(&path).unwrap();
@@ -202,18 +202,15 @@ fn a_damaged_byte_anywhere_is_refused_and_its_file_named() {
             let error = store.load(500).expect_err(&format!("{name}, {what}")).to_string();
             assert!(error.contains(path.to_str().unwrap()), "{name}, {what}: {error}");
         };
-        // Of a small file each bit, of a large one a bit of every so many bytes.
-        let bits = 8 * sound.len();
-        let stride = (bits / 1000).max(1);
-        let mut tried = 0;
-        // With an odd stride every bit of a byte has its turn.
-        for bit in (0..bits).step_by(stride - (1 - stride % 2)).chain([bits - 1]) {
+        for index in (0..sound.len())
+            .step_by(sound.len().div_ceil(250))
+            .chain([sound.len() - 1])
+        {
             let mut damaged = sound.clone();
-            damaged[bit / 8] ^= 1 << (bit % 8);
-            refused(&damaged, format!("bit {bit}"));
+            damaged[index] ^= 1 << (index % 8);
+            refused(&damaged, format!("byte {index}"));
             tried += 1;
         }
-        assert!(tried >= 1000, "only {tried} places in {name}");
         for length in (0..sound.len())
             .step_by(sound.len().div_ceil(50))
             .chain([sound.len() - 1])
@@ -228,6 +225,7 @@ fn a_damaged_byte_anywhere_is_refused_and_its_file_named() {
         assert!(error.contains(name), "{error}");
         fs::write(&path, &sound).unwrap();
     }
+    assert!(tried >= 1000, "only {tried} positions");
     store.load(500).unwrap();
 }
 
@@ -273,7 +271,7 @@ fn a_run_whose_checkpoints_are_all_damaged_is_not_begun_anew() {
     for part in [
         "none of the 2 checkpoints",
         "flight-1000/progress.bin",
-        "remove that folder and flights.csv",
+        "remove that folder",
     ] {
         assert!(error.contains(part), "`{error}` does not mention `{part}`");
     }
