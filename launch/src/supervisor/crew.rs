@@ -221,9 +221,9 @@ impl<'a> Crew<'a> {
     pub(super) fn exited(&mut self, number: usize, exit: &Exit) {
         let (work, learner_reports) = (self.work, self.work.is_some());
         let member = &mut self.members[number];
-        let age = match std::mem::replace(&mut member.state, State::Gone) {
-            State::Flying(process) => process.started.elapsed(),
-            State::Resting | State::Stranded | State::Gone => Duration::ZERO,
+        let (age, told) = match std::mem::replace(&mut member.state, State::Gone) {
+            State::Flying(process) => (process.started.elapsed(), *process.orders.borrow()),
+            State::Resting | State::Stranded | State::Gone => (Duration::ZERO, Order::Run),
         };
         if self.after_death == AfterDeath::LetGo {
             return;
@@ -243,7 +243,12 @@ impl<'a> Crew<'a> {
         if age >= GOOD_START {
             member.standing = Standing::Proven;
         }
-        match member.deaths.died(Instant::now(), member.judge(work)) {
+        let life = match member.judge(work) {
+            // Unless it was the supervisor, which kills only what no longer moves.
+            Life::InVain if exit.is_a_kill() && told == Order::Run => Life::Interrupted,
+            life => life,
+        };
+        match member.deaths.died(Instant::now(), life) {
             Verdict::RestartAfter(pause) => self.rest(number, exit, pause),
             Verdict::GiveUp => self.give_up(number, exit),
         }

@@ -10,7 +10,7 @@ use tokio::time::{Instant, sleep, timeout};
 
 use super::log_tail::{last_words, log_tail};
 use super::process::{Exit, Launch, Order, Output, reap};
-use super::restarts::{LearnerDeaths, Verdict};
+use super::restarts::{Cause, LearnerDeaths, Verdict};
 use super::work::Work;
 use super::{Event, Plan, SupervisorError};
 
@@ -199,16 +199,24 @@ impl<'a> Learner<'a> {
     /// # Errors
     /// Why it is not started again.
     pub(super) fn exited(&mut self, exit: &Exit) -> Result<String, SupervisorError> {
-        let was_starting = matches!(std::mem::replace(&mut self.state, State::Dead), State::Starting { .. });
+        let state = std::mem::replace(&mut self.state, State::Dead);
         if !exit.may_pass() {
             return Err(
                 match last_words(&self.plan.run.learner_log(), &self.plan.programs.learner) {
-                    Some(words) if was_starting => SupervisorError::LearnerCannotStart(words),
+                    Some(words) if matches!(state, State::Starting { .. }) => {
+                        SupervisorError::LearnerCannotStart(words)
+                    }
                     _ => self.failed(exit.to_string()),
                 },
             );
         }
-        match self.deaths.died() {
+        // The supervisor kills only what no longer moves: that counts as a failure.
+        let cause = if exit.is_a_kill() && !matches!(state, State::Killed) {
+            Cause::Outside
+        } else {
+            Cause::Failure
+        };
+        match self.deaths.died(cause) {
             Verdict::GiveUp => Err(self.failed(format!(
                 "died {} times without getting any further, the last time it {exit}",
                 LearnerDeaths::MAX_WITHOUT_PROGRESS

@@ -58,6 +58,13 @@ impl Exit {
         *self == Self::Status(EXIT_LEARNER_GONE.into())
     }
 
+    /// Whether somebody ended it by a signal for that purpose. Whether that was the supervisor itself does not show here.
+    pub(super) fn is_a_kill(&self) -> bool {
+        [Signal::KILL, Signal::TERM]
+            .iter()
+            .any(|signal| *self == Self::Signal(signal.as_raw()))
+    }
+
     /// Whether the same program may do better when it is started again: it was killed, it panicked, or its transport failed. An error that it
     /// told itself would come again.
     pub(super) fn may_pass(&self) -> bool {

@@ -1,6 +1,7 @@
 //! When a process that died is started again, and when it is given up.
 //!
-//! Deaths alone give nobody up: processes may be killed as often as anybody likes. What counts is whether they get anywhere in between.
+//! Being killed gives nobody up: processes may be killed as often as anybody likes, and are only started again after longer pauses. What counts is
+//! whether those that fail by themselves get anywhere in between.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -57,10 +58,19 @@ impl ActorDeaths {
 pub(super) enum Life {
     /// The learner heard of it, and the run got on meanwhile.
     Served,
-    /// There was no learner to serve: it says nothing about the actor.
+    /// There was no learner to serve, or somebody killed it: that says nothing about the actor.
     Interrupted,
     /// Neither.
     InVain,
+}
+
+/// Whose doing a death of the learner was.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Cause {
+    /// Somebody else's: it says nothing about the learner.
+    Outside,
+    /// Its own.
+    Failure,
 }
 
 /// The deaths of the learner.
@@ -69,11 +79,12 @@ pub(super) struct LearnerDeaths {
     first_pause: Duration,
     furthest: Option<Work>,
     since_progress: u32,
+    failures_since_progress: u32,
 }
 
 impl LearnerDeaths {
-    /// Deaths after which the run fails, if none of these lives got further than one before it. Not fewer, because a learner that is killed before it
-    /// has written a checkpoint gets no further by no fault of its own.
+    /// Failures after which the run fails, if none of these lives got further than one before it. Not fewer, because a learner that dies before it has
+    /// written a checkpoint may get no further by no fault of its own.
     pub(super) const MAX_WITHOUT_PROGRESS: u32 = 10;
     /// The longest pause, in first pauses.
     const LONGEST_PAUSE: u32 = 8;
@@ -84,6 +95,7 @@ impl LearnerDeaths {
             first_pause,
             furthest: None,
             since_progress: 0,
+            failures_since_progress: 0,
         }
     }
 
@@ -93,18 +105,27 @@ impl LearnerDeaths {
             // The first report of all shows where the run began, not that it gets on.
             if self.furthest.is_some() {
                 self.since_progress = 0;
+                self.failures_since_progress = 0;
             }
             self.furthest = Some(work);
         }
     }
 
     /// Notes a death and decides what follows.
-    pub(super) fn died(&mut self) -> Verdict {
-        self.since_progress += 1;
+    pub(super) fn died(&mut self, cause: Cause) -> Verdict {
+        self.since_progress = self.since_progress.saturating_add(1);
+        if cause == Cause::Failure {
+            self.failures_since_progress += 1;
+        }
+        if self.failures_since_progress >= Self::MAX_WITHOUT_PROGRESS {
+            return Verdict::GiveUp;
+        }
         match self.since_progress {
-            Self::MAX_WITHOUT_PROGRESS.. => Verdict::GiveUp,
             1 => Verdict::RestartAfter(Duration::ZERO),
-            deaths => Verdict::RestartAfter(self.first_pause * (1 << (deaths - 2)).min(Self::LONGEST_PAUSE)),
+            deaths => {
+                let pauses = 2_u32.saturating_pow(deaths - 2).min(Self::LONGEST_PAUSE);
+                Verdict::RestartAfter(self.first_pause * pauses)
+            }
         }
     }
 }
@@ -148,12 +169,24 @@ mod tests {
     #[test]
     fn a_learner_is_started_again_at_once_and_then_after_pauses() {
         let mut deaths = LearnerDeaths::new(Duration::from_secs(1));
-        let secs: Vec<_> = std::iter::from_fn(|| match deaths.died() {
+        let secs: Vec<_> = std::iter::from_fn(|| match deaths.died(Cause::Failure) {
             Verdict::RestartAfter(pause) => Some(pause.as_secs()),
             Verdict::GiveUp => None,
         })
         .collect();
         assert_eq!(secs, [0, 1, 2, 4, 8, 8, 8, 8, 8]);
+    }
+
+    #[test]
+    fn a_learner_that_is_killed_is_started_again_for_ever() {
+        let mut deaths = LearnerDeaths::new(Duration::from_secs(1));
+        for _ in 0..1000 {
+            assert_ne!(deaths.died(Cause::Outside), Verdict::GiveUp);
+        }
+        assert_eq!(
+            deaths.died(Cause::Outside),
+            Verdict::RestartAfter(Duration::from_secs(8))
+        );
     }
 
     #[test]
@@ -163,13 +196,13 @@ mod tests {
         for life in 0..1000 {
             deaths.reached(Work::test(life));
             deaths.reached(Work::test(life + 1));
-            assert_eq!(deaths.died(), Verdict::RestartAfter(Duration::ZERO));
+            assert_eq!(deaths.died(Cause::Failure), Verdict::RestartAfter(Duration::ZERO));
         }
         // It dies at the same place again and again, having done the same work each time.
         let again: Vec<_> = (0..LearnerDeaths::MAX_WITHOUT_PROGRESS - 1)
             .map(|_| {
                 (990..=1000).for_each(|updates| deaths.reached(Work::test(updates)));
-                deaths.died()
+                deaths.died(Cause::Failure)
             })
             .collect();
         assert_eq!(again.last(), Some(&Verdict::GiveUp));

@@ -53,7 +53,7 @@ fn a_learner_that_dies_is_started_again_and_its_actors_stay() {
 
 #[test]
 fn a_learner_that_never_gets_further_fails_the_run() {
-    let mut stage = Stage::new("report 1; echo 'always here' >&2; kill -9 $$", FAITHFUL_ACTOR);
+    let mut stage = Stage::new("report 1; echo 'always here' >&2; exit 101", FAITHFUL_ACTOR);
     stage.plan.deadlines.learner_pause = Duration::from_millis(10);
     let (result, seen) = stage.run(never);
     let error = result.unwrap_err().to_string();
@@ -62,6 +62,28 @@ fn a_learner_that_never_gets_further_fails_the_run() {
         "{error}"
     );
     assert_eq!((seen.restarts.learner, stage.processes()), (9, 12));
+}
+
+#[test]
+fn a_learner_that_is_killed_as_often_as_one_likes_is_always_started_again() {
+    let learner = "echo >> $dir/lives; report 1
+        if [ $(wc -l < $dir/lives) -le 12 ]; then kill -9 $$; fi; touch $dir/stop";
+    let mut stage = Stage::new(learner, FAITHFUL_ACTOR);
+    stage.plan.deadlines.learner_pause = Duration::from_millis(10);
+    let (result, seen) = stage.run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert_eq!(seen.restarts.learner, 12);
+}
+
+#[test]
+fn an_actor_that_is_killed_before_it_is_of_use_is_always_started_again() {
+    let actor = format!(
+        "echo >> $dir/lives-$id; if [ $(wc -l < $dir/lives-$id) -le 5 ]; then kill -$((9 + 6 * id)) $$; fi; touch $dir/up-$id; {FAITHFUL_ACTOR}"
+    );
+    let learner = "report 1; while [ ! -e $dir/up-0 ] || [ ! -e $dir/up-1 ]; do sleep 0.02; done; touch $dir/stop";
+    let (result, seen) = Stage::new(learner, &actor).run(never);
+    assert_eq!(result.unwrap(), Ended::Finished);
+    assert!(!seen.warnings.contains("given up"), "{}", seen.warnings);
 }
 
 #[test]
