@@ -192,10 +192,14 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         source,
     })?;
     print!("{}", conclusion(run));
-    // Whoever told the learner alone to stop has interrupted the run as well.
-    if ended == Ended::Interrupted || Summary::of(run).is_some_and(|summary| summary.ending == Ending::Interrupted) {
+    // Whoever told the learner alone to stop has interrupted the run as well, and a run may be complete before it heeds an interruption.
+    let ended = match Summary::of(run).map(|summary| summary.ending) {
+        Some(Ending::Completed) => Ended::Finished,
+        Some(Ending::Interrupted) => Ended::Interrupted,
+        None => ended,
+    };
+    if ended == Ended::Interrupted {
         tell_how_to_go_on(run);
-        return Ok(Ended::Interrupted);
     }
     Ok(ended)
 }
