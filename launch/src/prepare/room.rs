@@ -71,6 +71,11 @@ fn check_memory_in(path: &Path, actors: usize, needed: u64) -> Result<(), Shared
     })
 }
 
+/// Bytes of shared memory that are free; `None` where it cannot be asked for.
+pub fn free_shared_memory() -> Option<u64> {
+    space(Path::new(SHARED_MEMORY)).map(|space| space.free)
+}
+
 /// A warning, if the disk that `directory` lies on has no room for the checkpoints of a run with `config`.
 pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
     let free = space(directory)?.free;

@@ -12,10 +12,12 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep};
 
 use super::log_tail::log_tail;
+use super::memory::want_of_memory;
 use super::process::{Exit, Launch, Order, Output, reap};
 use super::restarts::{ActorDeaths, Life, Verdict};
 use super::work::Work;
 use super::{Event, SupervisorError};
+use crate::prepare::room::free_shared_memory;
 
 /// A life that lasted so long was a good start, whether or not there are reports that show it.
 const GOOD_START: Duration = Duration::from_secs(10);
@@ -243,23 +245,24 @@ impl<'a> Crew<'a> {
         if age >= GOOD_START {
             member.standing = Standing::Proven;
         }
+        let want = want_of_memory(exit, free_shared_memory());
         let life = match member.judge(work) {
             // Unless it was the supervisor, which kills only what no longer moves.
-            Life::InVain if exit.is_a_kill() && told == Order::Run => Life::Interrupted,
+            Life::InVain if want.is_some() || exit.is_a_kill() && told == Order::Run => Life::Interrupted,
             life => life,
         };
         match member.deaths.died(Instant::now(), life) {
-            Verdict::RestartAfter(pause) => self.rest(number, exit, pause),
+            Verdict::RestartAfter(pause) => self.rest(number, &format!("{exit}{}", want.unwrap_or_default()), pause),
             Verdict::GiveUp => self.give_up(number, exit),
         }
     }
 
     /// Has a member started again after `pause`.
-    fn rest(&mut self, number: usize, exit: &Exit, pause: Duration) {
+    fn rest(&mut self, number: usize, how: &str, pause: Duration) {
         let member = &mut self.members[number];
         member.state = State::Resting;
         self.warnings.push_back(format!(
-            "actor {} {exit}; it is started again in {} s ({})",
+            "actor {} {how}; it is started again in {} s ({})",
             member.id,
             pause.as_secs_f64(),
             self.run.actor_log(member.id).display()

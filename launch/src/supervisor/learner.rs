@@ -9,10 +9,12 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep, timeout};
 
 use super::log_tail::{last_words, log_tail};
+use super::memory::want_of_memory;
 use super::process::{Exit, Launch, Order, Output, reap};
 use super::restarts::{Cause, LearnerDeaths, Verdict};
 use super::work::Work;
 use super::{Event, Plan, SupervisorError};
+use crate::prepare::room::free_shared_memory;
 
 /// Last words come before the end; a pipe that somebody else holds open must not delay that for ever.
 const LAST_WORDS: Duration = Duration::from_secs(1);
@@ -211,7 +213,8 @@ impl<'a> Learner<'a> {
             );
         }
         // The supervisor kills only what no longer moves: that counts as a failure.
-        let cause = if exit.is_a_kill() && !matches!(state, State::Killed) {
+        let want = want_of_memory(exit, free_shared_memory());
+        let cause = if want.is_some() || exit.is_a_kill() && !matches!(state, State::Killed) {
             Cause::Outside
         } else {
             Cause::Failure
@@ -232,7 +235,8 @@ impl<'a> Learner<'a> {
                     pause => format!("in {} s", pause.as_secs()),
                 };
                 Ok(format!(
-                    "the learner {exit}; it is started again {when}, {}",
+                    "the learner {exit}{}; it is started again {when}, {}",
+                    want.unwrap_or_default(),
                     self.whence()
                 ))
             }

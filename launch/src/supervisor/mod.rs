@@ -16,6 +16,7 @@ mod dismissal;
 mod error;
 mod learner;
 mod log_tail;
+mod memory;
 mod process;
 mod restarts;
 mod stop;
