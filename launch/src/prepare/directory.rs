@@ -97,7 +97,10 @@ pub(super) fn copy_courses(root: &Path, config: &mut Config) -> Result<(), Prepa
             name = format!("{stem}_{number}.toml").into();
         }
         let copy = folder.join(&name);
-        fs::copy(&*path, &copy).map_err(|source| PrepareError::Io { path: copy, source })?;
+        // A copy has the original's mode, whatever the umask.
+        fs::copy(&*path, &copy)
+            .and_then(|_| fs::set_permissions(&copy, Permissions::from_mode(0o600)))
+            .map_err(|source| PrepareError::Io { path: copy, source })?;
         let relative = Path::new("courses").join(&name);
         copies.insert(name, std::mem::replace(path, relative));
     }

@@ -1,6 +1,7 @@
 //! Runs that can be prepared, and runs that cannot.
 
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
@@ -41,6 +42,8 @@ fn a_prepared_run_holds_copies_of_all_it_needs() {
         Course::load(shipped("training.toml")).unwrap()
     );
     assert_eq!(prepared.run.open().unwrap().0, prepared.identity);
+    let copy = fs::metadata(prepared.run.courses().join("training.toml")).unwrap();
+    assert_eq!(copy.permissions().mode() & 0o777, 0o600);
 }
 
 #[test]
