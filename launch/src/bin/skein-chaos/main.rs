@@ -29,7 +29,7 @@ use points::Points;
 use recorder::Recorder;
 use soak::Soak;
 use stage::{Recipe, Stage};
-use storm::{Spared, Storm};
+use storm::{Calm, Spared, Storm};
 
 /// Kills, freezes, attaches and detaches the processes of a training at random, and compares what it learned with an undisturbed one.
 #[derive(Debug, Parser)]
@@ -215,13 +215,10 @@ fn new_folder(path: &Path) -> Result<PathBuf> {
 fn train_in_peace(folder: &Path, recipe: &Recipe, actors: u32) -> Result<RunDirectory> {
     let stage = Stage::new(folder, "calm", None)?;
     eprintln!("skein-chaos: trains in peace, in {}", stage.run.root().display());
-    let status = stage.start(recipe, actors)?.wait().context("cannot wait for the run")?;
-    if !status.success() {
-        bail!(
-            "the undisturbed run failed; the last that was said:\n{}",
-            stage.last_words()
-        );
-    }
+    let supervisor = stage.start(recipe, actors)?;
+    Storm::new(&stage, supervisor, Recorder::silent(), Spared::Nobody)
+        .rage(&mut Calm)
+        .context("the undisturbed run failed")?;
     let left = leftovers(&stage.run);
     if !left.is_empty() {
         bail!("the undisturbed run left behind {left:?}");

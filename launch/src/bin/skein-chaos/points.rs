@@ -18,6 +18,7 @@ const PATIENCE: f64 = 1.0 / 6.0;
 pub(crate) struct Points {
     folder: PathBuf,
     total_flights: u64,
+    /// The next one last.
     to_arm: Vec<FaultPoint>,
     /// With the flights learned from at most by then.
     armed: Vec<(FaultPoint, u64)>,
@@ -36,7 +37,7 @@ impl Points {
         Ok(Self {
             folder,
             total_flights,
-            to_arm: FaultPoint::ALL.iter().rev().copied().collect(),
+            to_arm: order_of_arming().into_iter().rev().collect(),
             armed: Vec::new(),
             fired: Vec::new(),
             recovering_from: None,
@@ -76,6 +77,14 @@ impl Points {
         self.recovering_from = self.recovering_from.filter(recovering);
         self.recovering_from.is_none()
     }
+}
+
+/// All points, those first that may be passed only early in a run: the first candidate for the best snapshot is always better than none, the later ones
+/// may all be worse.
+fn order_of_arming() -> Vec<FaultPoint> {
+    let mut points = FaultPoint::ALL.to_vec();
+    points.sort_by_key(|&point| point != FaultPoint::LearnerBestSaved);
+    points
 }
 
 impl Script for Points {

@@ -11,7 +11,8 @@ use serde_json::{Map, Value};
 /// Writes what happens as it happens.
 #[derive(Debug)]
 pub(crate) struct Recorder {
-    file: File,
+    /// Of an undisturbed run nothing is recorded.
+    file: Option<File>,
     started: Instant,
 }
 
@@ -22,9 +23,17 @@ impl Recorder {
     /// When it cannot be created.
     pub(crate) fn create(path: &Path) -> io::Result<Self> {
         Ok(Self {
-            file: File::create(path)?,
+            file: Some(File::create(path)?),
             started: Instant::now(),
         })
+    }
+
+    /// None: for a run that nothing is done to.
+    pub(crate) fn silent() -> Self {
+        Self {
+            file: None,
+            started: Instant::now(),
+        }
     }
 
     /// Notes what happened: seconds since the start, flights learned from by then, `event`, and the fields of `details`.
@@ -32,6 +41,9 @@ impl Recorder {
     /// # Errors
     /// When it cannot be written.
     pub(crate) fn note(&mut self, flights: u64, event: &str, details: &impl Serialize) -> io::Result<()> {
+        let Some(file) = &mut self.file else {
+            return Ok(());
+        };
         let mut line = Map::new();
         let secs = (self.started.elapsed().as_secs_f64() * 1000.0).round() / 1000.0;
         line.insert("secs".to_owned(), secs.into());
@@ -45,6 +57,6 @@ impl Recorder {
             }
         }
         // One write a line, and nothing kept back: the recording is whole when this program is killed as well.
-        self.file.write_all(format!("{}\n", Value::Object(line)).as_bytes())
+        file.write_all(format!("{}\n", Value::Object(line)).as_bytes())
     }
 }

@@ -3,15 +3,19 @@
 //! What is done to it is a [`Script`]'s business. Here is what every script needs: the hand that kills, freezes and attaches, and the eye on
 //! supervisor, crews and flights, so that what happens by itself is told from what was done.
 
+mod supervisor;
+
 use std::collections::BTreeMap;
-use std::process::{Child, ExitStatus};
+use std::process::Child;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::Signal;
 use serde_json::json;
 use skein_launch::inspection::{Process, Role};
+
+use supervisor::{Supervisor, Told};
 
 use crate::plan::{Disturbance, Manner, Reach};
 use crate::recorder::Recorder;
@@ -19,10 +23,6 @@ use crate::stage::{FlightCount, LOOK, Stage, wait};
 
 /// Without a new flight for so long, a run is stuck: the longest pause of a sound one is its evaluation.
 const STUCK: Duration = Duration::from_secs(300);
-/// How long a killed run's processes may keep it from being resumed: a learner that was orphaned ends its epoch and saves.
-const RESUME: Duration = Duration::from_secs(120);
-/// Between two attempts to resume.
-const RESUME_PAUSE: Duration = Duration::from_millis(500);
 /// How long a killed process may take to be gone: the kernel gives its memory back first.
 const DEATH: Duration = Duration::from_secs(2);
 /// How long those that attached actors may outlive the run.
@@ -35,6 +35,16 @@ pub(crate) trait Script {
     /// # Errors
     /// Whatever makes it pointless to go on.
     fn step(&mut self, storm: &mut Storm<'_>) -> Result<()>;
+}
+
+/// Nothing is done.
+#[derive(Debug)]
+pub(crate) struct Calm;
+
+impl Script for Calm {
+    fn step(&mut self, _: &mut Storm<'_>) -> Result<()> {
+        Ok(())
+    }
 }
 
 /// How an attempt to disturb ended.
@@ -70,37 +80,6 @@ pub(crate) enum Spared {
     /// The actor that was started first.
     ElderActor,
 }
-
-/// Who supervises the run.
-#[derive(Debug)]
-enum Supervisor {
-    /// A process of ours.
-    Running { child: Child, told_to_stop: Told },
-    /// Nobody, until it is resumed.
-    Killed {
-        resume_at: Instant,
-        give_up_at: Instant,
-        actors: u32,
-    },
-    /// Was started again, and may find that the orphans of the one before are still ending.
-    Resuming {
-        child: Child,
-        give_up_at: Instant,
-        actors: u32,
-    },
-    /// Nobody any more: the run has ended.
-    Ended,
-}
-
-/// Whether a supervisor was interrupted from here.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Told {
-    Nothing,
-    ToStop,
-}
-
-/// Status of a process that was interrupted, as shells report it: 128 + SIGINT.
-const INTERRUPTED: i32 = 130;
 
 impl<'a> Storm<'a> {
     /// Over the run that `supervisor` has just been started for.
@@ -240,28 +219,6 @@ impl<'a> Storm<'a> {
         });
     }
 
-    fn kill_supervisor(&mut self, reach: Reach, pause_secs: f64, actors: u32) -> Result<Vec<i32>> {
-        let Supervisor::Running { child, .. } = &mut self.supervisor else {
-            return Ok(Vec::new());
-        };
-        let mut victims = vec![child.id().cast_signed()];
-        child.kill().context("cannot kill the supervisor")?;
-        child.wait().context("cannot wait for the supervisor")?;
-        if reach == Reach::Everybody {
-            let others = self.stage.processes();
-            others.iter().for_each(|process| process.signal(Signal::KILL));
-            await_death(&others);
-            victims.extend(others.iter().map(pid));
-        }
-        let now = Instant::now();
-        self.supervisor = Supervisor::Killed {
-            resume_at: now + Duration::from_secs_f64(pause_secs),
-            give_up_at: now + RESUME,
-            actors,
-        };
-        Ok(victims)
-    }
-
     fn attach(&mut self, count: u32) -> Result<Vec<i32>> {
         if !matches!(self.supervisor, Supervisor::Running { .. }) || self.choose(Role::Learner, 0).is_none() {
             return Ok(Vec::new());
@@ -278,20 +235,6 @@ impl<'a> Storm<'a> {
             Manner::Kill => Signal::KILL,
         };
         self.strike(Role::Crew, choice, signal)
-    }
-
-    /// Ends the run in order.
-    ///
-    /// # Errors
-    /// When the supervisor is not there to be told.
-    pub(crate) fn interrupt(&mut self) -> Result<()> {
-        let Supervisor::Running { child, told_to_stop } = &mut self.supervisor else {
-            bail!("there is no supervisor to be told to stop");
-        };
-        *told_to_stop = Told::ToStop;
-        let pid = Pid::from_raw(child.id().cast_signed()).context("a process has a number")?;
-        kill_process(pid, Signal::INT).context("cannot interrupt the supervisor")?;
-        self.note("interrupted", &())
     }
 
     fn watch_flights(&mut self) {
@@ -326,99 +269,6 @@ impl<'a> Storm<'a> {
     /// The run's processes, oldest first.
     pub(crate) fn processes(&self) -> Vec<Process> {
         self.stage.processes()
-    }
-
-    fn watch_supervisor(&mut self) -> Result<()> {
-        self.supervisor = match std::mem::replace(&mut self.supervisor, Supervisor::Ended) {
-            Supervisor::Ended => Supervisor::Ended,
-            Supervisor::Running {
-                mut child,
-                told_to_stop,
-            } => match child.try_wait()? {
-                None => Supervisor::Running { child, told_to_stop },
-                Some(status) => {
-                    self.ended(status, told_to_stop)?;
-                    Supervisor::Ended
-                }
-            },
-            Supervisor::Killed {
-                resume_at,
-                give_up_at,
-                actors,
-            } => {
-                if Instant::now() < resume_at {
-                    Supervisor::Killed {
-                        resume_at,
-                        give_up_at,
-                        actors,
-                    }
-                } else {
-                    let child = self.stage.resume(actors)?;
-                    Supervisor::Resuming {
-                        child,
-                        give_up_at,
-                        actors,
-                    }
-                }
-            }
-            Supervisor::Resuming {
-                child,
-                give_up_at,
-                actors,
-            } => self.watch_resumption(child, give_up_at, actors)?,
-        };
-        Ok(())
-    }
-
-    fn watch_resumption(&mut self, mut child: Child, give_up_at: Instant, actors: u32) -> Result<Supervisor> {
-        let Some(status) = child.try_wait()? else {
-            // It starts actors once its learner has reported: then nothing of the former life is in its way any more.
-            let accepted = self
-                .stage
-                .processes()
-                .iter()
-                .any(|process| process.role() == Role::Actor && process.parent() == Some(child.id()));
-            return Ok(if accepted {
-                self.note("resumed", &json!({ "pid": child.id(), "actors": actors }))?;
-                Supervisor::Running {
-                    child,
-                    told_to_stop: Told::Nothing,
-                }
-            } else {
-                Supervisor::Resuming {
-                    child,
-                    give_up_at,
-                    actors,
-                }
-            });
-        };
-        if status.success() || self.stage.is_complete() {
-            self.note("ended", &json!({ "status": status.to_string() }))?;
-            return Ok(Supervisor::Ended);
-        }
-        let said = self.stage.last_words();
-        let said = said.lines().last().unwrap_or_default();
-        if Instant::now() > give_up_at {
-            bail!("the run cannot be resumed: {said}");
-        }
-        self.note("not resumed yet", &json!({ "said": said }))?;
-        Ok(Supervisor::Killed {
-            resume_at: Instant::now() + RESUME_PAUSE,
-            give_up_at,
-            actors,
-        })
-    }
-
-    fn ended(&mut self, status: ExitStatus, told: Told) -> Result<()> {
-        self.note("ended", &json!({ "status": status.to_string() }))?;
-        match (status.code(), told) {
-            (Some(0), _) | (Some(INTERRUPTED), Told::ToStop) => Ok(()),
-            _ => bail!(
-                "the run ended with {status} after {} flights; the last that was said:\n{}",
-                self.flights,
-                self.stage.last_words()
-            ),
-        }
     }
 
     /// Waits for those that attached actors, until `deadline`.
