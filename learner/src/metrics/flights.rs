@@ -192,7 +192,8 @@ fn end_of_rows(path: &Path, file: &File, flights: u64) -> Result<u64, FlightsErr
         path: path.to_owned(),
         source,
     };
-    let mut reader = csv::Reader::from_reader(file);
+    // No row of ours is quoted, and a quote that is opened and never closed would swallow what is appended.
+    let mut reader = csv::ReaderBuilder::new().quoting(false).from_reader(file);
     let headers = reader.headers().map_err(row_error)?.clone();
     if headers != COLUMNS[..] {
         return Err(content(format!("its columns are {headers:?}")));
@@ -312,6 +313,18 @@ mod tests {
         fs::write(&path, &text[..text.len() - 7]).unwrap();
         write(&mut FlightsCsv::resume(&path, 4, &disk()).unwrap(), 4..5);
         assert_eq!(fs::read_to_string(&path).unwrap(), text);
+    }
+
+    #[test]
+    fn a_row_with_a_quote_that_would_swallow_the_next_is_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("flights.csv");
+        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 0..2);
+        let text = fs::read_to_string(&path).unwrap();
+        let (whole, last) = text.trim_end().rsplit_once(',').unwrap();
+        fs::write(&path, format!("{whole},\"{last}\n")).unwrap();
+        let refusal = FlightsCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
+        assert!(refusal.contains("flights.csv"), "{refusal}");
     }
 
     #[test]
