@@ -20,7 +20,12 @@ impl Config {
 
     /// Fingerprint of the [portable](Config::portable) configuration; processes of one run compare it.
     pub fn digest(&self) -> u64 {
-        xxh3_64(self.portable().as_bytes())
+        Self::digest_of(&self.portable())
+    }
+
+    /// The digest of the configuration whose portable text is `portable`.
+    pub(crate) fn digest_of(portable: &str) -> u64 {
+        xxh3_64(portable.as_bytes())
     }
 
     /// In what `other`, the portable text of another configuration, differs from this one: for each key `section.key = value there, value here`.

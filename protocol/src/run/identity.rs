@@ -4,6 +4,7 @@
 //! life before it had. So nothing that a killed process left half done is ever met again. The learner announces its life by a small file once its
 //! services are open; actors look there, and again whenever they have lost it.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::fs;
 use std::io;
@@ -30,6 +31,9 @@ pub struct RunIdentity {
     pub run: RunId,
     /// [`Config::digest`].
     pub config_digest: u64,
+    /// Checksum (xxh3, hexadecimal) of each file in [`courses`](super::RunDirectory::courses) as the run was started with it, by its name.
+    #[serde(default)]
+    pub courses: BTreeMap<String, String>,
 }
 
 /// One start of a learner: its number among those of its run since the first of the processes that live now was started. A small number, because it
@@ -58,7 +62,7 @@ impl Life {
 }
 
 impl RunIdentity {
-    pub(super) fn new(config: &Config) -> Self {
+    pub(super) fn new(config: &Config, courses: BTreeMap<String, String>) -> Self {
         let nanos = SystemTime::now()
             .duration_since(UNIX_EPOCH)
             .map_or(0, |elapsed| elapsed.as_nanos() as u64);
@@ -66,6 +70,7 @@ impl RunIdentity {
             protocol_version: PROTOCOL_VERSION,
             run: RunId(nanos ^ u64::from(std::process::id()).rotate_left(48)),
             config_digest: config.digest(),
+            courses,
         }
     }
 
@@ -232,7 +237,7 @@ mod tests {
     fn the_transport_leaves_room_for_socket_names() {
         // folder/prefix<number of a port>.event, ended by a zero byte; the number has up to 39 digits.
         const ROOM: usize = 108 - 1 - "/".len() - ".event".len() - 39;
-        let identity = RunIdentity::new(&Config::default());
+        let identity = RunIdentity::new(&Config::default(), BTreeMap::new());
         let life = Life(9999);
         assert!(identity.life_folder(life).as_os_str().len() + identity.life_prefix(life).len() <= ROOM);
     }
@@ -240,7 +245,7 @@ mod tests {
     #[test]
     fn whoever_differs_is_told_in_what() {
         let config = Config::default();
-        let identity = RunIdentity::new(&config);
+        let identity = RunIdentity::new(&config, BTreeMap::new());
         let told = Announcement::new(&identity, Life::after(None), &config);
         assert_eq!(told.check(&identity, &config), Ok(()));
         let refusal = |identity: &RunIdentity, config: &Config| told.check(identity, config).unwrap_err().to_string();

@@ -1,5 +1,6 @@
 //! A run on this machine: who it is, where everything in its directory lies, who of it lives, and what it leaves in shared memory.
 
+mod courses;
 mod identity;
 mod place;
 mod presence;
@@ -99,7 +100,8 @@ impl RunDirectory {
             .max()
     }
 
-    /// Creates the directory with its folders, for this user alone, and writes the resolved configuration and a new identity.
+    /// Creates the directory with its folders, for this user alone, and writes the resolved configuration and a new identity, which vouches for the course
+    /// files that are in it already.
     ///
     /// # Errors
     /// [`RunError`] names the path.
@@ -128,13 +130,14 @@ impl RunDirectory {
         );
         fs::write(self.config(), text).map_err(io(self.config()))?;
         let resolved = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
-        let identity = RunIdentity::new(&resolved);
+        let courses = courses::checksums(&self.courses()).map_err(io(self.courses()))?;
+        let identity = RunIdentity::new(&resolved, courses);
         let json = serde_json::to_string_pretty(&identity).expect("an identity is plain data");
         fs::write(self.identity(), json).map_err(io(self.identity()))?;
         Ok(identity)
     }
 
-    /// Reads identity and configuration of an existing run.
+    /// Reads identity and configuration of an existing run; its course files are those it was started with.
     ///
     /// # Errors
     /// [`RunError`] names the file and what is wrong with it.
@@ -158,11 +161,34 @@ impl RunDirectory {
         if config.digest() != identity.config_digest {
             return Err(RunError::ConfigChanged {
                 path: self.config(),
-                expected: identity.config_digest,
-                found: config.digest(),
+                differences: self.differences(&identity, &config),
             });
         }
+        courses::verify(&self.courses(), &identity.courses)?;
         Ok((identity, config))
+    }
+}
+
+impl RunDirectory {
+    /// In which keys `config` differs from the configuration of the run, if a checkpoint still tells it.
+    fn differences(&self, identity: &RunIdentity, config: &Config) -> String {
+        let known = self.newest_checkpoint().and_then(|flights| {
+            let copy = self.checkpoints().join(format!("flight-{flights}/config.toml"));
+            fs::read_to_string(copy).ok()
+        });
+        known
+            .filter(|text| Config::digest_of(text) == identity.config_digest)
+            .and_then(|text| config.differences(&text).ok())
+            .map_or_else(
+                || {
+                    format!(
+                        "its digest is {:016x} where {:016x} is expected",
+                        config.digest(),
+                        identity.config_digest
+                    )
+                },
+                |differences| differences.join(", "),
+            )
     }
 }
 
@@ -196,14 +222,20 @@ pub enum RunError {
         found: u32,
     },
     /// The configuration is not the one the run was started with.
-    #[error("{} was changed since the run was started: its digest is {found:016x} where {expected:016x} is expected; start a new run for another configuration", path.display())]
+    #[error("{} was changed since the run was started (there): {differences}; change it back, or start a new run for another configuration", path.display())]
     ConfigChanged {
         /// The configuration file.
         path: PathBuf,
-        /// [`Config::digest`] of the run.
-        expected: u64,
-        /// That of the file.
-        found: u64,
+        /// Each key with both values; if no checkpoint tells them, both digests.
+        differences: String,
+    },
+    /// A course file is not the one the run was started with.
+    #[error("{} {problem}, and flights through another course would be learned from as if it were the same; put the file back as it was, or start a new run", path.display())]
+    CourseChanged {
+        /// The course file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
     },
     /// The configuration cannot be used.
     #[error(transparent)]
@@ -229,11 +261,46 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         run.create(&Config::default()).unwrap();
+        let (_, before) = run.open().unwrap();
         let text = fs::read_to_string(run.config())
             .unwrap()
             .replace("seed = 1", "seed = 2");
         fs::write(run.config(), text).unwrap();
-        assert!(matches!(run.open(), Err(RunError::ConfigChanged { .. })));
+        let refusal = || match run.open() {
+            Err(error @ RunError::ConfigChanged { .. }) => error.to_string(),
+            other => panic!("{other:?}"),
+        };
+        assert!(refusal().contains("its digest is"), "{}", refusal());
+        // What a checkpoint says of the run's configuration tells the key.
+        let checkpoint = run.checkpoints().join("flight-20");
+        fs::create_dir(&checkpoint).unwrap();
+        fs::write(checkpoint.join("config.toml"), before.portable()).unwrap();
+        assert!(refusal().contains("run.seed = 1 there, 2 here"), "{}", refusal());
+    }
+
+    #[test]
+    fn a_changed_damaged_or_missing_course_is_noticed_and_named() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        fs::create_dir(run.courses()).unwrap();
+        let (training, gates) = (run.courses().join("training.toml"), run.courses().join("gates.toml"));
+        fs::write(&training, "walls = 5").unwrap();
+        fs::write(&gates, "walls = 2").unwrap();
+        run.create(&Config::default()).unwrap();
+        run.open().unwrap();
+        let refused = |path: &Path, problem: &str| {
+            let error = run.open().unwrap_err().to_string();
+            assert!(
+                error.contains(path.to_str().unwrap()) && error.contains(problem),
+                "{error}"
+            );
+        };
+        fs::write(&training, "walls = 4").unwrap();
+        refused(&training, "was changed");
+        fs::write(&training, "walls = 5").unwrap();
+        run.open().unwrap();
+        fs::remove_file(&gates).unwrap();
+        refused(&gates, "No such file");
     }
 
     #[test]
