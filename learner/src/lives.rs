@@ -6,13 +6,20 @@ use std::{fs, io};
 
 use skein_protocol::durable;
 
-/// Notes that a learner begins to live, with the state after `flights` flights; returns how many lives there were before.
+const HEADER: &str = "life,unix_secs,flights\n";
+
+/// Notes that a learner begins to live, with the state after `flights` flights; returns how many lives there were before. A file that cannot be read as
+/// text is begun anew: nothing learned depends on it.
 ///
 /// # Errors
 /// Of the file system.
 pub fn begin_life(path: &Path, flights: u64) -> io::Result<u64> {
     let mut text = match fs::read_to_string(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => "life,unix_secs,flights\n".to_owned(),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => HEADER.to_owned(),
+        Err(error) if error.kind() == io::ErrorKind::InvalidData => {
+            tracing::warn!(path = %path.display(), "damaged: begun anew, earlier lives are no longer counted");
+            HEADER.to_owned()
+        }
         text => text?,
     };
     let earlier = text.lines().skip(1).count() as u64;
@@ -39,5 +46,17 @@ mod tests {
         let rows: Vec<_> = text.lines().collect();
         assert_eq!(rows.len(), 4);
         assert!(rows[3].starts_with("2,") && rows[3].ends_with(",500"), "{text}");
+    }
+
+    #[test]
+    fn a_damaged_file_is_begun_anew() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("lives.csv");
+        begin_life(&path, 0).unwrap();
+        let mut bytes = fs::read(&path).unwrap();
+        bytes.push(0xff);
+        fs::write(&path, bytes).unwrap();
+        assert_eq!(begin_life(&path, 500).unwrap(), 0);
+        assert_eq!(begin_life(&path, 500).unwrap(), 1);
     }
 }
