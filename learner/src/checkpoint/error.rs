@@ -65,7 +65,7 @@ pub enum CheckpointError {
     },
     /// There are checkpoints, but none can be used.
     #[error(
-        "none of the {count} checkpoints in {} can be used; to train anew from the first flight, remove that folder. The newest: {newest}", directory.display()
+        "none of the {count} checkpoints in {} can be used; to train anew from the first flight, remove that folder and flights.csv. The newest: {newest}", directory.display()
     )]
     NoneUsable {
         /// Where they lie.

@@ -63,6 +63,7 @@ fn state(flights: u64) -> CheckpointState {
             }),
             metrics: MetricsState {
                 flights,
+                flights_extent: crate::metrics::FlightsExtent::empty(),
                 events: vec![EventFile {
                     name: "events.out.tfevents.1.skein.000000".into(),
                     bytes: 77,
@@ -271,7 +272,7 @@ fn a_run_whose_checkpoints_are_all_damaged_is_not_begun_anew() {
     for part in [
         "none of the 2 checkpoints",
         "flight-1000/progress.bin",
-        "remove that folder",
+        "remove that folder and flights.csv",
     ] {
         assert!(error.contains(part), "`{error}` does not mention `{part}`");
     }

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use skein_protocol::transition::Outcome;
+use xxhash_rust::xxh3::Xxh3Default;
 
 use crate::disk::{Disk, Patient};
 use crate::flight::CommittedFlight;
@@ -66,11 +67,104 @@ impl From<&CommittedFlight> for FlightRow {
     }
 }
 
+/// The first bytes of `flights.csv`, by which it is recognised as what was written; part of a checkpoint.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FlightsExtent {
+    /// How many.
+    pub bytes: u64,
+    /// Their checksum.
+    pub xxh3: u64,
+}
+
+impl FlightsExtent {
+    /// Of a file that is empty, or not there yet.
+    pub fn empty() -> Self {
+        Self {
+            bytes: 0,
+            xxh3: Xxh3Default::new().digest(),
+        }
+    }
+
+    /// Checks that the file at `path` begins with them; nothing is written. `flights` is how many rows they hold.
+    ///
+    /// # Errors
+    /// [`FlightsError::Damaged`]; [`FlightsError::Io`] when it cannot be read.
+    pub fn check(&self, path: &Path, flights: u64) -> Result<(), FlightsError> {
+        if self.bytes == 0 {
+            return Ok(());
+        }
+        let found = match File::open(path).and_then(|file| summed(file, self.bytes)) {
+            Ok((bytes, _)) if bytes < self.bytes => Err(format!("ends after {bytes} bytes of {}", self.bytes)),
+            Ok((_, sum)) if sum.digest() != self.xxh3 => Err(format!(
+                "was changed within its first {} bytes: their checksum is {:016x} where {:016x} is expected",
+                self.bytes,
+                sum.digest(),
+                self.xxh3
+            )),
+            Ok(_) => Ok(()),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Err("is missing".to_owned()),
+            Err(source) => {
+                return Err(FlightsError::Io {
+                    path: path.to_owned(),
+                    source,
+                });
+            }
+        };
+        found.map_err(|problem| FlightsError::Damaged {
+            path: path.to_owned(),
+            flights,
+            problem,
+        })
+    }
+}
+
+/// Reads at most `bytes` bytes of `file` from where it stands; how many there were, and their checksum.
+fn summed(file: impl Read, bytes: u64) -> io::Result<(u64, Xxh3Default)> {
+    let mut sum = Xxh3Default::new();
+    let read = io::copy(&mut file.take(bytes), &mut sum)?;
+    Ok((read, sum))
+}
+
+/// Writes to a file, and keeps a checksum of all that is in it.
+struct Summed<W> {
+    inner: W,
+    bytes: u64,
+    sum: Xxh3Default,
+}
+
+impl<W> Summed<W> {
+    fn extent(&self) -> FlightsExtent {
+        FlightsExtent {
+            bytes: self.bytes,
+            xxh3: self.sum.digest(),
+        }
+    }
+}
+
+impl<W: Write> Write for Summed<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let taken = self.inner.write(bytes)?;
+        self.sum.update(&bytes[..taken]);
+        self.bytes += taken as u64;
+        Ok(taken)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.inner.flush()
+    }
+}
+
+impl<W> std::fmt::Debug for Summed<W> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.extent().fmt(f)
+    }
+}
+
 /// Writes `flights.csv`.
 #[derive(Debug)]
 pub struct FlightsCsv {
     path: PathBuf,
-    writer: csv::Writer<Patient<File>>,
+    writer: csv::Writer<Summed<Patient<File>>>,
 }
 
 /// Why `flights.csv` cannot be written or continued.
@@ -93,6 +187,18 @@ pub enum FlightsError {
         /// Which, and why.
         #[source]
         source: csv::Error,
+    },
+    /// It is not what was written before the checkpoint.
+    #[error(
+        "{} {problem}, but the checkpoint of flight {flights} counts on it; put the file back, or remove this checkpoint and others that count on more of the file than there is, so that the run goes on from an older one", path.display()
+    )]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// Flights committed at the checkpoint.
+        flights: u64,
+        /// What is wrong with it.
+        problem: String,
     },
     /// The rows are not those of the flights that the checkpoint knows of.
     #[error("{} cannot be continued after {expected} flights: {problem}", path.display())]
@@ -118,7 +224,11 @@ impl FlightsCsv {
         })?;
         Ok(Self {
             path: path.to_owned(),
-            writer: csv::Writer::from_writer(disk.patient(path, file)),
+            writer: csv::Writer::from_writer(Summed {
+                inner: disk.patient(path, file),
+                bytes: 0,
+                sum: Xxh3Default::new(),
+            }),
         })
     }
 
@@ -138,9 +248,12 @@ impl FlightsCsv {
         let end = end_of_rows(path, &file, flights)?;
         file.set_len(end).map_err(io)?;
         end_line(&mut file).map_err(io)?;
+        file.rewind().map_err(io)?;
+        let (bytes, sum) = summed(&file, u64::MAX).map_err(io)?;
+        let inner = disk.patient(path, file);
         let writer = csv::WriterBuilder::new()
             .has_headers(false)
-            .from_writer(disk.patient(path, file));
+            .from_writer(Summed { inner, bytes, sum });
         Ok(Self {
             path: path.to_owned(),
             writer,
@@ -156,6 +269,11 @@ impl FlightsCsv {
             path: self.path.clone(),
             source,
         })
+    }
+
+    /// What is in the file: all that was written before it was last [flushed](FlightsCsv::flush), and perhaps some of what was written since.
+    pub fn extent(&self) -> FlightsExtent {
+        self.writer.get_ref().extent()
     }
 
     /// Hands everything written to the operating system.
@@ -325,6 +443,41 @@ mod tests {
         fs::write(&path, format!("{whole},\"{last}\n")).unwrap();
         let refusal = FlightsCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
         assert!(refusal.contains("flights.csv"), "{refusal}");
+    }
+
+    #[test]
+    fn a_file_that_is_not_what_was_written_before_the_checkpoint_is_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("flights.csv");
+        let mut csv = FlightsCsv::create(&path, &disk()).unwrap();
+        write(&mut csv, 0..3);
+        drop(csv);
+        // Counted over two lives.
+        let mut csv = FlightsCsv::resume(&path, 2, &disk()).unwrap();
+        write(&mut csv, 2..5);
+        let extent = csv.extent();
+        write(&mut csv, 5..7);
+        let sound = fs::read(&path).unwrap();
+        extent.check(&path, 5).unwrap();
+        let refused = |problem: &str| {
+            let error = extent.check(&path, 5).unwrap_err().to_string();
+            assert!(
+                error.contains(path.to_str().unwrap()) && error.contains(problem),
+                "{error}"
+            );
+        };
+        for index in 0..extent.bytes as usize {
+            let mut damaged = sound.clone();
+            damaged[index] ^= 1 << (index % 8);
+            fs::write(&path, damaged).unwrap();
+            refused("was changed within");
+            fs::write(&path, &sound[..index]).unwrap();
+            refused(&format!("ends after {index} bytes"));
+        }
+        fs::write(&path, &sound[..extent.bytes as usize]).unwrap();
+        extent.check(&path, 5).unwrap();
+        fs::remove_file(&path).unwrap();
+        refused("is missing");
     }
 
     #[test]

@@ -17,7 +17,7 @@ use crate::disk::Disk;
 use crate::flight::CommittedFlight;
 
 pub use events::{EventError, EventFile, EventWriter};
-pub use flights::{FlightRow, FlightsCsv, FlightsError};
+pub use flights::{FlightRow, FlightsCsv, FlightsError, FlightsExtent};
 pub use scalars::Scalar;
 pub use window::MovingAverage;
 
@@ -50,6 +50,8 @@ impl Windows {
 pub struct MetricsState {
     /// Rows in `flights.csv`.
     pub flights: u64,
+    /// What those rows are.
+    pub flights_extent: FlightsExtent,
     /// Event files with their lengths.
     pub events: Vec<EventFile>,
     /// Averages over the latest flights.
@@ -61,6 +63,7 @@ impl MetricsState {
     pub fn new(window_flights: usize) -> Self {
         Self {
             flights: 0,
+            flights_extent: FlightsExtent::empty(),
             events: Vec::new(),
             windows: Windows::new(window_flights),
         }
@@ -92,13 +95,15 @@ impl Metrics {
     /// Continues where the metrics were in `state`. What was written since is dropped, so that nothing is told twice; of a new run that is everything.
     ///
     /// # Errors
-    /// [`MetricsError`] names the file; `flights.csv` must hold the flights that `state` counts.
+    /// [`MetricsError`] names the file; `flights.csv` must be what was written when `state` was taken, or more.
     pub fn resume(run: &RunDirectory, state: MetricsState, disk: &Disk) -> Result<Self, MetricsError> {
         let MetricsState {
             flights,
+            flights_extent,
             events,
             windows,
         } = state;
+        flights_extent.check(&run.flights_csv(), flights)?;
         Ok(Self {
             run: run.clone(),
             rows: flights,
@@ -112,6 +117,7 @@ impl Metrics {
     pub fn state(&self) -> MetricsState {
         MetricsState {
             flights: self.rows,
+            flights_extent: self.flights.extent(),
             events: self.events.files().to_vec(),
             windows: self.windows.clone(),
         }

@@ -56,6 +56,16 @@ pub enum TrainingError {
         version: u64,
         problem: &'static str,
     },
+    /// There is no checkpoint where there must have been one.
+    #[error(
+        "{} has {rows} flights, and yet there is no checkpoint in {}, where the first is written after {first_after}: put the checkpoints back; or, to train anew from the first flight, remove flights.csv", flights_csv.display(), checkpoints.display()
+    )]
+    CheckpointsLost {
+        flights_csv: PathBuf,
+        rows: u64,
+        checkpoints: PathBuf,
+        first_after: u64,
+    },
     /// It was told to stop and did not wait for the end of an epoch's updates.
     #[error("stopped amid the updates of an epoch")]
     Abandoned,

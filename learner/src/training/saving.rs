@@ -20,7 +20,7 @@ use crate::checkpoint::{CheckpointState, CheckpointStore, CheckpointWriter, Prog
 use crate::disk::Disk;
 use crate::flights::reception::Reception;
 use crate::lives::begin_life;
-use crate::metrics::Metrics;
+use crate::metrics::{Metrics, MetricsError};
 use crate::report::Reporter;
 use crate::threads;
 use crate::trainer::Trainer;
@@ -41,15 +41,20 @@ impl<'a> Training<'a> {
         let (saved, snapshots) = match store.load_newest()? {
             Some(checkpoint) => restore(&mut trainer, checkpoint)?,
             // A life that died before its first checkpoint may have left files: they are dropped as if they came after flight 0.
-            None => (start(config, &trainer), BTreeMap::new()),
+            None => {
+                refuse_lost_checkpoints(directory, config)?;
+                (start(config, &trainer), BTreeMap::new())
+            }
         };
+        let reception = Reception::start(identity, life, config)?;
+        // Before anything is written: if that has to wait for room on the disk, it is told.
+        let reporter = Reporter::start(first_line(config, &saved), reception.shared(), disk.clone())
+            .map_err(TrainingError::Thread)?;
         let lives = directory.lives_csv();
         let resumes = disk
             .with_room(&lives, || begin_life(&lives, saved.flights))
             .map_err(file_error(&lives))?;
-        let metrics = Metrics::resume(directory, saved.metrics.clone(), &disk)?;
-        let reception = Reception::start(identity, life, config)?;
-        let first_line = first_line(config, &saved);
+        let metrics = resume_metrics(directory, &saved, &disk)?;
         let mut training = Self {
             config,
             identity,
@@ -58,7 +63,7 @@ impl<'a> Training<'a> {
             stop_watch: StopWatch::of(stop),
             layout: SnapshotLayout::of(config),
             trainer,
-            reporter: Reporter::start(first_line, reception.shared(), disk.clone()).map_err(TrainingError::Thread)?,
+            reporter,
             reception,
             metrics,
             checkpoints: CheckpointWriter::start(store, disk.clone())?,
@@ -207,7 +212,7 @@ impl<'a> Training<'a> {
         self.reporter.update(|progress| progress.phase = Phase::Finishing);
         // What is flushed now cannot follow what is cut.
         self.metrics.flush()?;
-        self.metrics = Metrics::resume(self.directory, self.saved.metrics.clone(), &self.disk)?;
+        self.metrics = resume_metrics(self.directory, &self.saved, &self.disk)?;
         self.metrics.flush()?;
         Ok(self.saved.clone())
     }
@@ -243,6 +248,35 @@ fn save_summary(directory: &RunDirectory, disk: &Disk, summary: &Summary) -> Res
     pass(FaultPoint::LearnerBeforeSummary);
     let path = directory.summary_json();
     disk.with_room(&path, || summary.save(&path)).map_err(file_error(&path))
+}
+
+/// The metrics as they were when `saved` was.
+fn resume_metrics(directory: &RunDirectory, saved: &Progress, disk: &Disk) -> Result<Metrics, MetricsError> {
+    disk.with_room(directory.root(), || {
+        Metrics::resume(directory, saved.metrics.clone(), disk)
+    })
+}
+
+/// A run without checkpoints is not begun anew without a word when it has had some: `flights.csv` shows more flights than can be flown before the first.
+fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<(), TrainingError> {
+    let flights_csv = directory.flights_csv();
+    let content = match fs::read(&flights_csv) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+        content => content.map_err(file_error(&flights_csv))?,
+    };
+    let lines = content.iter().filter(|&&byte| byte == b'\n').count() as u64;
+    let rows = lines.saturating_sub(1);
+    let first_after = config.checkpoints.every_flights;
+    // A checkpoint is taken at the end of an epoch, and training goes on while it is written: until the next one is to be handed over.
+    if rows > 2 * (first_after + config.learning.flights_per_epoch) {
+        return Err(TrainingError::CheckpointsLost {
+            flights_csv,
+            rows,
+            checkpoints: directory.checkpoints(),
+            first_after,
+        });
+    }
+    Ok(())
 }
 
 /// A run that has not begun.
@@ -336,4 +370,29 @@ fn remove(path: &Path) -> io::Result<()> {
 fn file_error(path: &Path) -> impl FnOnce(io::Error) -> TrainingError {
     let path = path.to_owned();
     move |source| TrainingError::File { path, source }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_that_lost_its_checkpoints_is_not_begun_anew_without_a_word() {
+        let folder = tempfile::tempdir().unwrap();
+        let directory = RunDirectory::new(folder.path());
+        let mut config = Config::default();
+        config.checkpoints.every_flights = 20;
+        config.learning.flights_per_epoch = 5;
+        refuse_lost_checkpoints(&directory, &config).unwrap();
+        let flown =
+            |flights| fs::write(directory.flights_csv(), format!("header\n{}", "row\n".repeat(flights))).unwrap();
+        // The second checkpoint waits until the first is in place, so that many can be flown without one.
+        flown(50);
+        refuse_lost_checkpoints(&directory, &config).unwrap();
+        flown(51);
+        let error = refuse_lost_checkpoints(&directory, &config).unwrap_err().to_string();
+        for part in ["flights.csv has 51 flights", "checkpoints", "remove flights.csv"] {
+            assert!(error.contains(part), "`{error}` does not mention `{part}`");
+        }
+    }
 }
