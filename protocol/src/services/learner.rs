@@ -10,6 +10,7 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 
+use super::dead::Reclaimer;
 use super::joining::JoinError;
 use super::memory::reserve;
 use super::opening::{Manner, Opener, control_slots};
@@ -33,6 +34,7 @@ pub(super) const SNAPSHOT_SLOTS: usize = 8;
 #[derive(Debug)]
 pub struct LearnerPorts {
     run: RunId,
+    dead: Reclaimer,
     layout: SnapshotLayout,
     transitions: Subscriber<Ipc, TransitionRecord, ()>,
     status: Subscriber<Ipc, StatusRecord, ()>,
@@ -75,6 +77,7 @@ impl LearnerPorts {
         let messages = control_slots(&config.transport);
         Ok(Self {
             run: identity.run,
+            dead: Reclaimer::new(identity, life),
             transitions: open
                 .transitions(config)?
                 .subscriber_builder()
@@ -199,8 +202,7 @@ impl LearnerPorts {
         self.control
             .update_connections()
             .map_err(failed("control", "connecting"))?;
-        self.node.try_cleanup_dead_nodes();
-        Ok(())
+        self.dead.reclaim(&self.node)
     }
 }
 

@@ -17,6 +17,7 @@
 //! Services carry protocol version, run, configuration and snapshot layout as attributes: a process that differs in one of them is refused on opening.
 
 mod actor;
+mod dead;
 mod joining;
 mod learner;
 mod memory;
@@ -110,6 +111,7 @@ fn transport_config(identity: &RunIdentity, life: Life) -> Result<IceoryxConfig,
     // does, and nobody would go on with it.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
     Ok(config)
 }
 

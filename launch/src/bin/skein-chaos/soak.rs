@@ -17,7 +17,7 @@ use skein_protocol::ids::RunId;
 use skein_protocol::run::RunDirectory;
 
 use crate::plan::{Disturbance, Manner};
-use crate::statistics::Trend;
+use crate::statistics::{Trend, commonest};
 use crate::storm::{Script, Storm};
 
 /// Between two samples.
@@ -78,7 +78,16 @@ pub(crate) struct Soak {
     next_sample: Instant,
     ending: Ending,
     table: File,
-    samples: Vec<(f64, Sample)>,
+    samples: Vec<Moment>,
+}
+
+/// What was sampled at one time.
+#[derive(Debug)]
+struct Moment {
+    secs: f64,
+    /// Processes of the run that there were.
+    processes: usize,
+    sample: Sample,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -169,20 +178,26 @@ impl Soak {
             processes.len(),
             cells.join(",")
         )?;
-        self.samples.push((secs, sample));
+        self.samples.push(Moment {
+            secs,
+            processes: processes.len(),
+            sample,
+        });
         Ok(())
     }
 
-    /// The trend of each figure after the warm-up, and whether it is flat.
+    /// The trend of each figure after the warm-up, and whether it is flat: over the moments at which as many processes were there as mostly are, because
+    /// each one that comes brings files, segments and descriptors with it.
     pub(crate) fn findings(&self) -> Vec<Finding> {
         let warm = self.length.as_secs_f64() * WARM_UP;
         let hours = (self.length.as_secs_f64() - warm) / 3600.0;
+        let judged: Vec<_> = self.samples.iter().filter(|moment| moment.secs >= warm).collect();
+        let attendance = commonest(judged.iter().map(|moment| moment.processes));
         let finding = |(index, series): (usize, &Series)| {
-            let values: Vec<_> = self
-                .samples
+            let values: Vec<_> = judged
                 .iter()
-                .filter(|(secs, _)| *secs >= warm)
-                .filter_map(|(secs, sample)| Some((*secs, sample[index]?)))
+                .filter(|moment| Some(moment.processes) == attendance)
+                .filter_map(|moment| Some((moment.secs, moment.sample[index]?)))
                 .collect();
             let trend = Trend::of(&values);
             let tolerance = trend.map_or(0.0, |trend| (trend.first * TOLERANCE).max(series.at_least));

@@ -1,5 +1,8 @@
 //! Whether a series of samples grows: quarters, medians, and a slope that single outliers do not bend.
 
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+
 /// What a series shows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Trend {
@@ -46,6 +49,14 @@ fn slope_per_sec(samples: &[(f64, f64)]) -> f64 {
     median(slopes)
 }
 
+/// The number that is there most often; of several the smallest.
+pub(crate) fn commonest(numbers: impl Iterator<Item = usize>) -> Option<usize> {
+    let mut counts = BTreeMap::<usize, usize>::new();
+    numbers.for_each(|number| *counts.entry(number).or_default() += 1);
+    let most = counts.iter().max_by_key(|&(&number, &count)| (count, Reverse(number)));
+    most.map(|(&number, _)| number)
+}
+
 /// The middle value; of an even number the upper of the two. Zero of none.
 fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
@@ -77,6 +88,12 @@ mod tests {
     fn a_step_that_the_slope_does_not_see_is_seen_by_the_quarters() {
         let step = Trend::of(&series(|secs| if secs < 3000.0 { 100.0 } else { 200.0 })).unwrap();
         assert!(step.per_hour * 1.0 < 150.0 && !step.is_flat(50.0, 1.0), "{step:?}");
+    }
+
+    #[test]
+    fn the_commonest_number_is_found() {
+        assert_eq!(commonest([7, 9, 9, 8, 7, 3].into_iter()), Some(7));
+        assert_eq!(commonest([].into_iter()), None);
     }
 
     #[test]

@@ -1,0 +1,188 @@
+//! Takes back what dead processes held.
+//!
+//! iceoryx2 does it for nodes whose process is gone. But where death left a file half made, or half removed, it stops: the slot of a port, of which there
+//! are few, is lost, or files stay behind, with each actor that is killed while it comes or goes. So what is half made is removed before iceoryx2 cleans
+//! up, and what still names a process that is gone is removed after.
+
+use std::collections::BTreeSet;
+use std::fs::{self, DirEntry};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use iceoryx2::node::{DeadNodeView, Node, NodeState, NodeView};
+use iceoryx2::prelude::*;
+use iceoryx2_bb_posix::unique_system_id::UniqueSystemId;
+
+use super::{Ipc, ServiceError, failed};
+use crate::run::{Life, RunIdentity};
+
+/// Nobody takes as long to come, from the first file of its node to the lock by which others see that it lives. Who was stopped meanwhile finds its files
+/// gone, fails to join, and tries again.
+const LONGEST_COMING: Duration = Duration::from_secs(10);
+
+/// Takes back what the dead held in the transport of a life.
+#[derive(Debug)]
+pub(super) struct Reclaimer {
+    identity: RunIdentity,
+    life: Life,
+}
+
+impl Reclaimer {
+    pub(super) fn new(identity: &RunIdentity, life: Life) -> Self {
+        Self {
+            identity: identity.clone(),
+            life,
+        }
+    }
+
+    /// Takes back what the dead held whose nodes lie beside `node`. What cannot be had now is tried again at the next call.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when the nodes cannot be listed.
+    pub(super) fn reclaim(&self, node: &Node<Ipc>) -> Result<(), ServiceError> {
+        let mut living = BTreeSet::from([process_of(node.id().value())]);
+        Node::<Ipc>::list(node.config(), |state| {
+            if let NodeState::Dead(dead) = state {
+                self.reclaim_node(dead);
+            } else {
+                living.insert(process_of(state.node_id().value()));
+            }
+            CallbackProgression::Continue
+        })
+        .map_err(failed("all", "listing the nodes"))?;
+        for path in self.files().into_iter().chain(self.segments()) {
+            if processes_in(&path).any(|process| !living.contains(&process)) && is_old(&path) {
+                remove(&path);
+            }
+        }
+        Ok(())
+    }
+
+    fn reclaim_node(&self, dead: DeadNodeView<Ipc>) {
+        let process = process_of(dead.id().value());
+        // Nothing hangs on what is half made: a tag is finished before its service or port is entered, a segment before anybody maps it.
+        let tags = entries(self.nodes().join(dead.id().value().to_string()));
+        let half_made_tags = tags.filter(|tag| mode(tag) & 0o200 != 0);
+        let segments = self
+            .segments()
+            .filter(|path| processes_in(path).any(|of| of == process));
+        let half_made_segments = segments.filter(|segment| mode(segment) & 0o400 == 0);
+        half_made_tags.chain(half_made_segments).for_each(|path| remove(&path));
+        let _ = dead.try_remove_stale_resources();
+    }
+
+    fn nodes(&self) -> PathBuf {
+        self.identity.life_folder(self.life).join("nodes")
+    }
+
+    /// Listeners' sockets, nodes' locks, and nodes' folders.
+    fn files(&self) -> Vec<PathBuf> {
+        let sockets = entries(self.identity.life_folder(self.life));
+        sockets.chain(entries(self.nodes())).collect()
+    }
+
+    fn segments(&self) -> impl Iterator<Item = PathBuf> {
+        self.identity.segments(self.life)
+    }
+}
+
+/// The process that made `id`, of a node or a port.
+fn process_of(id: u128) -> u32 {
+    UniqueSystemId::from(id).pid().value().cast_unsigned()
+}
+
+/// The processes that made the nodes and ports that `path` is called after: two where it is a connection, none where it belongs to all.
+fn processes_in(path: &Path) -> impl Iterator<Item = u32> {
+    /// Ids are large: the life's number, the run's and digests, in hexadecimal, are not taken for one.
+    const DIGITS: std::ops::RangeInclusive<usize> = 20..=39;
+    let name = path.file_name().and_then(std::ffi::OsStr::to_str).unwrap_or_default();
+    let ids = name.split(['_', '.']).filter(|word| DIGITS.contains(&word.len()));
+    ids.filter_map(|word| word.parse().ok()).map(process_of)
+}
+
+fn mode(path: &PathBuf) -> u32 {
+    // Of what is gone nothing is half made.
+    fs::symlink_metadata(path).map_or(0o600, |about| about.mode())
+}
+
+fn is_old(path: &Path) -> bool {
+    let changed = fs::symlink_metadata(path).and_then(|about| about.modified());
+    // A clock that was set back makes it young again, for as long.
+    changed.is_ok_and(|at| at.elapsed().is_ok_and(|age| age > LONGEST_COMING))
+}
+
+fn remove(path: &Path) {
+    let _ = match path.is_dir() {
+        true => fs::remove_dir_all(path),
+        false => fs::remove_file(path),
+    };
+}
+
+/// What is in `folder`; nothing when it is gone.
+fn entries(folder: PathBuf) -> impl Iterator<Item = PathBuf> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    entries.map(|entry: DirEntry| entry.path())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+    use std::process::Command;
+
+    use super::super::LearnerPorts;
+    use super::super::node;
+    use super::super::tests::Run;
+    use super::*;
+
+    fn age(path: &Path) {
+        let touched = Command::new("touch")
+            .args(["-h", "-d", "1 minute ago"])
+            .arg(path)
+            .status();
+        assert!(touched.unwrap().success());
+    }
+
+    #[test]
+    fn what_names_a_process_that_is_gone_is_removed_once_it_is_old_and_nothing_else_is() {
+        let run = Run::with(|_| {});
+        let learner = LearnerPorts::open(&run.identity, run.seat.life(), &run.config).unwrap();
+        let _living = node(&run.identity, run.seat.life(), "living").unwrap();
+        learner.maintain().unwrap();
+        let life = run.identity.life_folder(run.seat.life());
+        let prefix = run.identity.life_prefix(run.seat.life());
+        let listed = || -> BTreeSet<PathBuf> {
+            let files = entries(life.clone()).chain(entries(life.join("nodes")));
+            files.chain(run.identity.segments(run.seat.life())).collect()
+        };
+        let before = listed();
+        before.iter().for_each(|path| age(path));
+
+        // A process that has ended, in the number of a node or port as iceoryx2 makes them.
+        let mut gone = Command::new("true").spawn().unwrap();
+        gone.wait().unwrap();
+        let made_by = |process: u32| (7_u128 << 96) | (u128::from(process) << 64) | 1;
+        let (id, living) = (made_by(gone.id()), made_by(std::process::id()));
+        assert_eq!(process_of(id), gone.id());
+        let left = [
+            life.join("nodes").join(id.to_string()),
+            life.join("nodes").join(format!("{prefix}{id}.node_monitor_context")),
+            life.join(format!("{prefix}{id}.event")),
+            format!("/dev/shm/{prefix}{}_{id}.data", "a".repeat(40)).into(),
+            format!("/dev/shm/{prefix}{}_{living}_{id}.connection", "a".repeat(40)).into(),
+        ];
+        fs::create_dir(&left[0]).unwrap();
+        fs::write(left[0].join(format!("{prefix}node.details")), "").unwrap();
+        for path in &left[1..] {
+            fs::write(path, "").unwrap();
+            fs::set_permissions(path, fs::Permissions::from_mode(0o200)).unwrap();
+        }
+        let with_left = listed();
+        assert_eq!(with_left.len(), before.len() + left.len());
+        learner.maintain().unwrap();
+        assert_eq!(listed(), with_left, "whoever made them may be about to come");
+        left.iter().for_each(|path| age(path));
+        learner.maintain().unwrap();
+        assert_eq!(listed(), before);
+    }
+}
