@@ -20,7 +20,7 @@ use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, Superviso
 use skein_protocol::claims::ActorClaim;
 use skein_protocol::config::Config;
 use skein_protocol::failure::with_causes;
-use skein_protocol::run::{Presence, RunDirectory, RunError, sweep_leftovers};
+use skein_protocol::run::{RunDirectory, RunError, SupervisorSeat, sweep_leftovers};
 use skein_protocol::summary::{Ending, Summary};
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
@@ -132,21 +132,21 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         None => thread::available_parallelism().map_or(1, Into::into),
     };
     sweep();
-    let (prepared, _supervisor) = match arguments.task() {
+    let (prepared, seat) = match arguments.task() {
         Task::New { config, run_dir } => {
             let prepared = prepare(config, &arguments.overrides, run_dir, actors)?;
-            let claim = prepared.run.claim_supervisor()?;
-            (prepared, claim.context("somebody else supervises this run already")?)
+            let seat = SupervisorSeat::take(&prepared.run, &prepared.identity)?;
+            (prepared, seat)
         }
         Task::Resume(directory) => resume(directory, actors, PATIENCE)?,
     };
     announce(&prepared, actors, arguments);
     let Prepared {
         run,
-        identity,
         config,
         courses,
         new,
+        ..
     } = &prepared;
     if let Some(warning) = scarce_disk(config, run.root()) {
         eprintln!("skein: {warning}");
@@ -160,14 +160,13 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         learner_threads: config.run.learner_threads,
         deadlines: Deadlines::of(config),
     };
-    let presence = Presence::enter(identity)?;
     let mut display = Display::new();
     let outcome = runtime()?.block_on(async {
         let mut interrupts = interrupts()?;
         anyhow::Ok(supervisor::run(&plan, &mut interrupts, &mut display).await)
     });
     display.finish();
-    drop(presence);
+    drop(seat);
     sweep();
 
     let outcome = outcome?;
@@ -260,10 +259,9 @@ fn tell_how_to_go_on(run: &RunDirectory) {
 fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let programs = Programs::beside_this()?;
     let run = open(&arguments.run)?;
-    let (identity, config) = run.open()?;
+    let (_, config) = run.open()?;
     // Between two lives of its learner, a run is under way as long as somebody sees to it that there will be another.
-    let is_under_way = || Ok::<_, anyhow::Error>(run.claim_supervisor()?.is_none() || identity.is_learner_alive()?);
-    if !is_under_way()? {
+    if !run.is_under_way()? {
         bail!("the run in {} is not under way on this machine", run.root().display());
     }
     umask(Mode::RWXG | Mode::RWXO);
@@ -286,7 +284,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let mut display = Display::new();
     runtime()?.block_on(async {
         let mut interrupts = interrupts()?;
-        let is_under_way = || is_under_way().unwrap_or(false);
+        let is_under_way = || run.is_under_way().unwrap_or(false);
         Ok(supervisor::attach(&plan, is_under_way, &mut interrupts, &mut display).await?)
     })
 }

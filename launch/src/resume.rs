@@ -4,8 +4,7 @@ use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use skein_protocol::claims::SupervisorClaim;
-use skein_protocol::run::{PlaceError, RunDirectory, RunError};
+use skein_protocol::run::{PlaceError, RunDirectory, RunError, SeatError, SupervisorSeat};
 use skein_protocol::summary::{Ending, Summary};
 
 use crate::prepare::room::check_shared_memory;
@@ -56,6 +55,15 @@ pub enum ResumeError {
     /// Its transport cannot be looked at: it is another user's.
     #[error(transparent)]
     Place(#[from] PlaceError),
+    /// It is under way in another directory, of which this one is a copy.
+    #[error("the run in {} is under way in another directory, of which this one is a copy: {source}", directory.display())]
+    Copy {
+        /// The directory.
+        directory: PathBuf,
+        /// Who is at it.
+        #[source]
+        source: SeatError,
+    },
 }
 
 /// Checks that the run in `directory` can be gone on with by `actors` actors, and claims it. A learner that nobody supervises is given `patience`
@@ -63,7 +71,7 @@ pub enum ResumeError {
 ///
 /// # Errors
 /// [`ResumeError`]; nothing was changed then.
-pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Prepared, SupervisorClaim), ResumeError> {
+pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Prepared, SupervisorSeat), ResumeError> {
     let not_a_run = |missing: &Path| ResumeError::NotARun {
         directory: directory.to_owned(),
         missing: missing.to_owned(),
@@ -75,7 +83,15 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
     let (identity, config) = run.open()?;
     let under_way = || ResumeError::UnderWay(run.root().to_owned());
     // Whoever only looks whether it is taken holds it for a moment.
-    let claim = in_time(LOOK * 5, || run.claim_supervisor())?.ok_or_else(under_way)?;
+    let seat = in_time(LOOK * 5, || match SupervisorSeat::take(&run, &identity) {
+        Err(SeatError::Taken { lock, .. }) if lock == run.root() => Ok(None),
+        Err(SeatError::Place(error)) => Err(error.into()),
+        taken => taken.map(Some).map_err(|source| ResumeError::Copy {
+            directory: run.root().to_owned(),
+            source,
+        }),
+    })?
+    .ok_or_else(under_way)?;
     in_time(patience, || {
         Ok::<_, PlaceError>((!identity.is_learner_alive()?).then_some(()))
     })?
@@ -99,7 +115,7 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
             courses,
             new: None,
         },
-        claim,
+        seat,
     ))
 }
 
@@ -131,13 +147,13 @@ mod tests {
     fn an_unfinished_run_can_be_gone_on_with_by_one_supervisor() {
         let directory = tempfile::tempdir().unwrap();
         let prepared = prepared_run(directory.path());
-        let (resumed, claim) = resume(prepared.run.root(), 3, Duration::ZERO).unwrap();
+        let (resumed, seat) = resume(prepared.run.root(), 3, Duration::ZERO).unwrap();
         assert_eq!(
             (&resumed.identity, &resumed.config, &resumed.courses),
             (&prepared.identity, &prepared.config, &prepared.courses)
         );
         assert!(refusal(prepared.run.root()).contains("is under way"));
-        drop(claim);
+        drop(seat);
         assert!(resume(prepared.run.root(), 1, Duration::ZERO).is_ok());
     }
 

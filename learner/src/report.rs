@@ -28,6 +28,13 @@ pub struct Reporter {
     thread: Option<JoinHandle<()>>,
 }
 
+/// Says something to the user, by way of whoever reads the reports: a line that is none is shown as it is.
+pub fn tell(line: &str) {
+    tracing::warn!("{line}");
+    // Nobody may be listening; it is in the log.
+    let _ = writeln!(std::io::stdout().lock(), "{line}");
+}
+
 impl Reporter {
     /// Starts reporting, with `progress` as the first line: in it `elapsed_secs` are those of earlier lives, to which this one's are added.
     ///

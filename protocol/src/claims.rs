@@ -1,4 +1,4 @@
-//! Who may be what in a run's directory: held by locks that end with the process that holds them.
+//! Which actor has which number: held by locks that end with the process that holds them.
 //!
 //! A lock is never in the way of the dead: the kernel frees it however its process ended. Files that are locked stay; only the lock counts.
 
@@ -25,12 +25,6 @@ impl ActorClaim {
     }
 }
 
-/// That this process supervises a run, which no other does while this is alive: a lock on the run's directory itself.
-#[derive(Debug)]
-pub struct SupervisorClaim {
-    _lock: File,
-}
-
 impl RunDirectory {
     /// Claims the lowest number that no actor of this run has at present. Logs are appended to, so that a number whose actor is gone can be used again.
     ///
@@ -45,16 +39,6 @@ impl RunDirectory {
             }
         }
         unreachable!("the numbers of four thousand million actors are taken")
-    }
-
-    /// Claims to be this run's supervisor; `None` when it has one.
-    ///
-    /// # Errors
-    /// [`RunError::Io`] when the directory cannot be opened or locked.
-    pub fn claim_supervisor(&self) -> Result<Option<SupervisorClaim>, RunError> {
-        let path = self.root().to_owned();
-        let directory = File::open(&path);
-        Ok(locked(path, directory)?.map(|lock| SupervisorClaim { _lock: lock }))
     }
 }
 
@@ -83,15 +67,5 @@ mod tests {
         let [first, _second, _third] = claims;
         drop(first);
         assert_eq!(run.claim_actor().unwrap().id(), ActorId(0));
-    }
-
-    #[test]
-    fn a_run_has_one_supervisor_at_a_time() {
-        let directory = tempfile::tempdir().unwrap();
-        let run = RunDirectory::new(directory.path());
-        let claim = run.claim_supervisor().unwrap();
-        assert!(claim.is_some() && run.claim_supervisor().unwrap().is_none());
-        drop(claim);
-        assert!(run.claim_supervisor().unwrap().is_some());
     }
 }

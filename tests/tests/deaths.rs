@@ -4,6 +4,7 @@
 
 use std::fs;
 use std::path::PathBuf;
+use std::process::Command;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
@@ -76,12 +77,15 @@ fn after_a_power_cut_a_damaged_checkpoint_is_named_and_the_one_before_it_used() 
     run.resume(2);
     let resumed = run.finish();
     resumed.assert_same_as(&calm);
-    let log = fs::read_to_string(resumed.directory.learner_log()).unwrap();
     let name = newest.file_name().unwrap().to_str().unwrap();
-    assert!(
-        log.lines().any(|line| line.contains("WARN") && line.contains(name)),
-        "nobody was warned of {name}:\n{log}"
-    );
+    let terminal = &resumed.output.stderr;
+    let told = |words: [&str; 2]| {
+        terminal
+            .lines()
+            .any(|line| words.iter().all(|word| line.contains(word)))
+    };
+    assert!(told([name, "damaged"]), "nobody was warned of {name}:\n{terminal}");
+    assert!(told(["going on after flight", ""]), "{terminal}");
 }
 
 /// The checkpoints that are in their place, oldest first.
@@ -95,6 +99,40 @@ fn checkpoints(run: &Running) -> Vec<PathBuf> {
         .collect();
     found.sort_by_key(number);
     found
+}
+
+#[test]
+fn a_run_whose_folder_is_removed_makes_another() {
+    let calm = calm();
+    let mut run = recipe().start();
+    run.until_flights(30);
+    let identity = run.directory().open().unwrap().0;
+    fs::remove_dir_all(identity.transport_folder()).unwrap();
+    let disturbed = run.finish();
+    disturbed.assert_same_as(&calm);
+    assert!(disturbed.summary().resumes > 0, "{:?}", disturbed.summary());
+    let terminal = &disturbed.output.stderr;
+    assert!(terminal.contains("leave it alone"), "{terminal}");
+}
+
+#[test]
+fn a_copy_of_a_runs_directory_is_not_resumed_while_the_run_is_under_way() {
+    let calm = calm();
+    let mut run = recipe().start();
+    run.until_flights(30);
+    let copies = tempfile::tempdir().unwrap();
+    let copy = copies.path().join("copy");
+    let copied = Command::new("cp")
+        .arg("-r")
+        .arg(run.directory().root())
+        .arg(&copy)
+        .status();
+    assert!(copied.unwrap().success());
+    // Between two lives of the learner, too.
+    run.process("skein-learner").signal(Signal::KILL);
+    let refused = run_program("skein", &["run", "--resume", copy.to_str().unwrap(), "--actors", "1"]);
+    refused.assert_refused(&["under way in another directory", "copy"]);
+    run.finish().assert_same_as(&calm);
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use skein_protocol::failure::EXIT_START_AGAIN;
 use skein_protocol::progress::Progress;
 use tokio::io::{AsyncBufReadExt, BufReader, Lines};
 use tokio::process::ChildStdout;
@@ -235,7 +236,8 @@ impl<'a> Learner<'a> {
                     pause => format!("in {} s", pause.as_secs()),
                 };
                 Ok(format!(
-                    "the learner {exit}{}; it is started again {when}, {}",
+                    "the learner {exit}{}{}; it is started again {when}, {}",
+                    self.reason_given(exit),
                     want.unwrap_or_default(),
                     self.whence()
                 ))
@@ -243,11 +245,19 @@ impl<'a> Learner<'a> {
         }
     }
 
+    /// What a learner that asks for another life says about it.
+    fn reason_given(&self, exit: &Exit) -> String {
+        (*exit == Exit::Status(EXIT_START_AGAIN.into()))
+            .then(|| last_words(&self.plan.run.learner_log(), &self.plan.programs.learner))
+            .flatten()
+            .map_or(String::new(), |words| format!(" (\"{words}\")"))
+    }
+
     /// What its next life begins from.
-    fn whence(&self) -> String {
+    fn whence(&self) -> &'static str {
         match self.plan.run.newest_checkpoint() {
-            Some(flights) => format!("from its checkpoint after flight {flights}"),
-            None => "from the beginning: there is no checkpoint yet".to_owned(),
+            Some(_) => "from its newest checkpoint",
+            None => "from the beginning: there is no checkpoint yet",
         }
     }
 

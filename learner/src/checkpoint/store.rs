@@ -198,12 +198,16 @@ impl CheckpointStore {
         }
     }
 
-    /// Loads the newest checkpoint that is undamaged; `None` when there is none at all. Resuming from an older one costs time, never the result.
+    /// Loads the newest checkpoint that is undamaged; `None` when there is none at all. Resuming from an older one costs time, never the result. Each
+    /// damaged one that is newer is given to `passed_over`.
     ///
     /// # Errors
     /// [`CheckpointError::NoneUsable`] when all are damaged: a run is not begun anew without a word. [`CheckpointError::Format`] or
     /// [`CheckpointError::Configuration`] when the newest undamaged one is of another version or configuration.
-    pub fn load_newest(&self) -> Result<Option<CheckpointState>, CheckpointError> {
+    pub fn load_newest(
+        &self,
+        mut passed_over: impl FnMut(&CheckpointError),
+    ) -> Result<Option<CheckpointState>, CheckpointError> {
         let places = self.places()?;
         let count = places.len();
         let mut newest = None;
@@ -211,7 +215,7 @@ impl CheckpointStore {
             match self.load_from(&place) {
                 Ok(state) => return Ok(Some(state)),
                 Err(error) if error.is_damage() => {
-                    warn!(%error, "checkpoint refused, looking for an older one");
+                    passed_over(&error);
                     newest = newest.or(Some(Box::new(error)));
                 }
                 Err(error) => return Err(error),

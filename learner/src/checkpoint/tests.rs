@@ -150,7 +150,7 @@ fn what_is_saved_is_what_is_loaded() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
-    assert_same(&store.load_newest().unwrap().unwrap(), &state(500));
+    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(500));
 }
 
 #[test]
@@ -237,7 +237,7 @@ fn another_configuration_is_refused_by_key_with_both_values() {
     let mut config = config(2);
     config.sac.discount = 0.5;
     let other = CheckpointStore::new(store.directory(), &config);
-    let error = other.load_newest().unwrap_err().to_string();
+    let error = other.load_newest(|_| {}).unwrap_err().to_string();
     for part in ["flight-500", "sac.discount = 0.99 there, 0.5 here"] {
         assert!(error.contains(part), "`{error}` does not mention `{part}`");
     }
@@ -253,7 +253,7 @@ fn another_format_is_refused_before_anything_else_is_believed() {
     let checksum = xxhash_rust::xxh3::xxh3_64(body.as_bytes());
     fs::write(&path, format!("{body},\n  \"xxh3\": \"{checksum:016x}\"\n}}\n")).unwrap();
     // It is no damage that an older checkpoint could make good.
-    let error = store.load_newest().unwrap_err();
+    let error = store.load_newest(|_| {}).unwrap_err();
     let expected = manifest::FORMAT;
     assert!(
         matches!(error, CheckpointError::Format { found: 9, expected: ours, .. } if ours == expected),
@@ -268,7 +268,7 @@ fn a_run_whose_checkpoints_are_all_damaged_is_not_begun_anew() {
         let place = store.save(&state(flights), &[]).unwrap();
         fs::write(place.join("progress.bin"), "").unwrap();
     }
-    let error = store.load_newest().unwrap_err().to_string();
+    let error = store.load_newest(|_| {}).unwrap_err().to_string();
     for part in [
         "none of the 2 checkpoints",
         "flight-1000/progress.bin",
@@ -319,7 +319,7 @@ fn a_checkpoint_that_is_written_again_is_never_missed() {
     // The first half of the exchange, then a death.
     let replaced = store.directory().join("flight-500.replaced");
     fs::rename(&place, &replaced).unwrap();
-    assert_same(&store.load_newest().unwrap().unwrap(), &state(500));
+    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(500));
     assert_eq!(store.list().unwrap(), [500]);
     // The second half, then damage to the new one.
     let place = store.save(&state(500), &[]).unwrap();
@@ -327,7 +327,7 @@ fn a_checkpoint_that_is_written_again_is_never_missed() {
     fs::rename(&place, &replaced).unwrap();
     fs::create_dir(&place).unwrap();
     fs::write(place.join("progress.bin"), "").unwrap();
-    assert_same(&store.load_newest().unwrap().unwrap(), &state(500));
+    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(500));
     store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
     assert_eq!(names(store.directory()), ["flight-500"]);
@@ -339,9 +339,9 @@ fn a_damaged_newest_is_passed_over_and_replaced_when_its_flight_is_reached_again
     store.save(&state(500), &[]).unwrap();
     let newest = store.save(&state(1000), &[]).unwrap();
     fs::write(newest.join("progress.bin"), "").unwrap();
-    assert_eq!(store.load_newest().unwrap().unwrap().progress.flights, 500);
+    assert_eq!(store.load_newest(|_| {}).unwrap().unwrap().progress.flights, 500);
     store.save(&state(1000), &[]).unwrap();
-    assert_same(&store.load_newest().unwrap().unwrap(), &state(1000));
+    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(1000));
 }
 
 #[test]
@@ -358,7 +358,7 @@ fn what_an_interrupted_write_left_is_never_read_and_then_cleared() {
     let interrupted = store.save(&state(437), &[]).unwrap();
     fs::write(interrupted.join("tensors.safetensors.part"), "half").unwrap();
     fs::rename(interrupted, store.directory().join(".writing")).unwrap();
-    assert!(store.load_newest().unwrap().is_none());
+    assert!(store.load_newest(|_| {}).unwrap().is_none());
     let place = store.save(&state(500), &[]).unwrap();
     assert_eq!(names(store.directory()), ["flight-500"]);
     assert_eq!(
@@ -377,7 +377,7 @@ fn what_an_interrupted_write_left_is_never_read_and_then_cleared() {
 #[test]
 fn a_run_without_checkpoints_has_none() {
     let (_directory, store) = store(2);
-    assert!(store.load_newest().unwrap().is_none());
+    assert!(store.load_newest(|_| {}).unwrap().is_none());
 }
 
 #[test]
@@ -462,10 +462,10 @@ fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop
     let mut writer = CheckpointWriter::start(store.clone(), disk.clone()).unwrap();
     writer.save(state(600), Vec::new()).unwrap();
     wait_for(|| disk.waiting().is_some());
-    assert_eq!(store.load_newest().unwrap().unwrap().progress.flights, 500);
+    assert_eq!(store.load_newest(|_| {}).unwrap().unwrap().progress.flights, 500);
     fs::remove_file(&ballast).unwrap();
     writer.finish().unwrap();
-    assert_same(&store.load_newest().unwrap().unwrap(), &state(600));
+    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(600));
 
     free(&ballast);
     let mut writer = CheckpointWriter::start(store.clone(), disk.clone()).unwrap();
@@ -474,7 +474,7 @@ fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop
     stop.store(true, std::sync::atomic::Ordering::Relaxed);
     let error = writer.finish().unwrap_err().to_string();
     assert!(error.contains("No space left on device"), "{error}");
-    assert_same(&store.load_newest().unwrap().unwrap(), &state(600));
+    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(600));
 }
 
 fn wait_for(condition: impl Fn() -> bool) {

@@ -21,7 +21,7 @@ use crate::disk::Disk;
 use crate::flights::reception::Reception;
 use crate::lives::begin_life;
 use crate::metrics::{Metrics, MetricsError};
-use crate::report::Reporter;
+use crate::report::{Reporter, tell};
 use crate::threads;
 use crate::trainer::Trainer;
 
@@ -38,8 +38,12 @@ impl<'a> Training<'a> {
         let disk = Disk::new(stop.clone());
         let mut trainer = Trainer::new(config)?;
         let store = CheckpointStore::new(&directory.checkpoints(), config);
-        let (saved, snapshots) = match store.load_newest()? {
-            Some(checkpoint) => restore(&mut trainer, checkpoint)?,
+        let newest = store.load_newest(|error| tell(&format!("a checkpoint is damaged and not used: {error}")))?;
+        let (saved, snapshots) = match newest {
+            Some(checkpoint) => {
+                tell(&format!("going on after flight {}", checkpoint.progress.flights));
+                restore(&mut trainer, checkpoint)?
+            }
             // A life that died before its first checkpoint may have left files: they are dropped as if they came after flight 0.
             None => {
                 refuse_lost_checkpoints(directory, config)?;

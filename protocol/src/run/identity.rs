@@ -117,6 +117,10 @@ impl RunIdentity {
         super::sweep::learner_lock(&self.transport_folder())
     }
 
+    pub(super) fn supervisor_lock(&self) -> PathBuf {
+        super::sweep::supervisor_lock(&self.transport_folder())
+    }
+
     /// What the living learner of this run has announced; `None` when there is none, or it has not opened its services yet. Looking leaves no trace.
     ///
     /// # Errors

@@ -18,7 +18,7 @@ use crate::ids::ActorId;
 pub use identity::{Announcement, Difference, Life, RunIdentity};
 pub use place::PlaceError;
 pub use presence::Presence;
-pub use seat::{LearnerSeat, SeatError};
+pub use seat::{LearnerSeat, SeatError, SupervisorSeat};
 pub use sweep::{Swept, sweep_leftovers};
 
 /// Paths within a run's directory.

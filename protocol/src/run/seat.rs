@@ -1,11 +1,13 @@
-//! The learner's seat: exactly one learner of a run, and a transport of its own for each of its lives.
+//! The seats of a run: exactly one learner, with a transport of its own for each of its lives, and exactly one supervisor.
+//!
+//! A seat is taken by two locks, one on the run's directory and one in the transport's folder: a copy of the directory is the same run.
 
-use std::fs;
+use std::fs::{self, File, TryLockError};
 use std::path::PathBuf;
 
 use super::RunDirectory;
 use super::identity::{Announcement, Life, RunIdentity};
-use super::place::{HeldLock, Locked, PlaceError, lock, make_folder};
+use super::place::{HeldLock, Locked, PlaceError, is_locked, lock, make_folder};
 use super::presence::Presence;
 use super::sweep::MACHINE;
 
@@ -20,12 +22,23 @@ pub struct LearnerSeat {
     _presence: Presence,
 }
 
-/// Why there is no seat for this learner.
+/// The supervisor's seat of a run, taken. To be held as long as the run is supervised.
+#[derive(Debug)]
+pub struct SupervisorSeat {
+    // Locks are let go before the presence, which may remove their files.
+    _in_transport: HeldLock,
+    _directory: File,
+    _presence: Presence,
+}
+
+/// Why there is no seat for this process.
 #[derive(Debug, thiserror::Error)]
 pub enum SeatError {
-    /// Another learner of this run lives.
-    #[error("another learner of this run lives{}: it holds {}", pid.map_or(String::new(), |pid| format!(" (process {pid})")), lock.display())]
+    /// Another process of this run has it.
+    #[error("another {who} of this run lives{}: it holds {}", pid.map_or(String::new(), |pid| format!(" (process {pid})")), lock.display())]
     Taken {
+        /// What it is.
+        who: &'static str,
         /// The lock it holds.
         lock: PathBuf,
         /// Its process, if it could be read.
@@ -39,18 +52,16 @@ pub enum SeatError {
 impl LearnerSeat {
     /// Takes the seat, removes what dead lives of this run left, and begins a new life.
     ///
-    /// One lock lies in the run's directory and one in the transport's folder: a copy of the directory is the same run.
-    ///
     /// # Errors
     /// [`SeatError::Taken`] when another learner of this run lives.
     pub fn take(directory: &RunDirectory, identity: &RunIdentity) -> Result<Self, SeatError> {
-        let in_directory = take_lock(directory.learner_lock())?;
+        let in_directory = take_lock("learner", directory.learner_lock())?;
         let presence = Presence::enter(identity)?;
-        let in_transport = take_lock(identity.learner_lock())?;
+        let in_transport = take_lock("learner", identity.learner_lock())?;
 
-        // The last life's number stands in the lock's file, which is there as long as a process lives that may know of that life.
-        let last = in_transport.words()?.split_whitespace().nth(1).and_then(Life::parse);
-        let life = Life::after(last);
+        // The last life's number stands in both files: the transport's folder may have been removed from under its processes, and of a directory there
+        // may be copies.
+        let life = Life::after(last_life(&in_transport)?.max(last_life(&in_directory)?));
         let words = format!("{} {life}", std::process::id());
         in_transport.write(&words)?;
         in_directory.write(&words)?;
@@ -82,6 +93,46 @@ impl Drop for LearnerSeat {
     }
 }
 
+impl SupervisorSeat {
+    /// Takes the seat.
+    ///
+    /// # Errors
+    /// [`SeatError::Taken`] when another process supervises this run.
+    pub fn take(directory: &RunDirectory, identity: &RunIdentity) -> Result<Self, SeatError> {
+        let root = directory.root();
+        let locked = File::open(root).map_err(PlaceError::at(root))?;
+        match locked.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                return Err(SeatError::Taken {
+                    who: "supervisor",
+                    lock: root.to_owned(),
+                    pid: None,
+                });
+            }
+            Err(TryLockError::Error(error)) => return Err(PlaceError::at(root)(error).into()),
+        }
+        let presence = Presence::enter(identity)?;
+        let in_transport = take_lock("supervisor", identity.supervisor_lock())?;
+        in_transport.write(&std::process::id().to_string())?;
+        Ok(Self {
+            _in_transport: in_transport,
+            _directory: locked,
+            _presence: presence,
+        })
+    }
+}
+
+impl RunDirectory {
+    /// Whether a process supervises the run in this very directory, or is its learner.
+    ///
+    /// # Errors
+    /// [`PlaceError`] when it cannot be looked at.
+    pub fn is_under_way(&self) -> Result<bool, PlaceError> {
+        Ok(is_locked(self.root())? || is_locked(&self.learner_lock())?)
+    }
+}
+
 impl RunIdentity {
     /// Tells actors that the services of `announcement`'s life are open. For the learner that holds the seat.
     ///
@@ -97,14 +148,20 @@ impl RunIdentity {
     }
 }
 
-fn take_lock(path: PathBuf) -> Result<HeldLock, SeatError> {
+fn take_lock(who: &'static str, path: PathBuf) -> Result<HeldLock, SeatError> {
     match lock(&path)? {
         Locked::Mine(lock) => Ok(lock),
         Locked::Taken { words } => Err(SeatError::Taken {
+            who,
             lock: path,
             pid: words.split_whitespace().next().and_then(|pid| pid.parse().ok()),
         }),
     }
+}
+
+/// The life that whoever held `lock` last wrote into it.
+fn last_life(lock: &HeldLock) -> Result<Option<Life>, PlaceError> {
+    Ok(lock.words()?.split_whitespace().nth(1).and_then(Life::parse))
 }
 
 fn remove_announcement(path: &std::path::Path) -> Result<(), PlaceError> {
@@ -148,6 +205,41 @@ mod tests {
         let first = seat.life();
         drop(seat);
         assert!(LearnerSeat::take(&run, &identity).unwrap().life() > first);
+    }
+
+    #[test]
+    fn a_run_has_one_supervisor_at_a_time_whichever_copy_of_its_directory_it_is_given() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let identity = run.create(&Config::default()).unwrap();
+        let copied = tempfile::tempdir().unwrap();
+        fs::copy(run.identity(), copied.path().join("run.json")).unwrap();
+        let copy = RunDirectory::new(copied.path());
+
+        assert!(!run.is_under_way().unwrap());
+        let seat = SupervisorSeat::take(&run, &identity).unwrap();
+        assert!(run.is_under_way().unwrap() && !copy.is_under_way().unwrap());
+        for (other, lock) in [(&run, run.root().to_owned()), (&copy, identity.supervisor_lock())] {
+            let refusal = SupervisorSeat::take(other, &identity).unwrap_err().to_string();
+            assert!(refusal.starts_with("another supervisor of this run lives"), "{refusal}");
+            assert!(refusal.contains(&lock.display().to_string()), "{refusal}");
+        }
+        drop(seat);
+        assert!(!identity.transport_folder().exists());
+        drop(SupervisorSeat::take(&copy, &identity).unwrap());
+        SupervisorSeat::take(&run, &identity).unwrap();
+    }
+
+    #[test]
+    fn a_life_whose_folder_was_removed_is_not_lived_again() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let identity = run.create(&Config::default()).unwrap();
+        let first = LearnerSeat::take(&run, &identity).unwrap();
+        let life = first.life();
+        fs::remove_dir_all(identity.transport_folder()).unwrap();
+        drop(first);
+        assert!(LearnerSeat::take(&run, &identity).unwrap().life() > life);
     }
 
     #[test]

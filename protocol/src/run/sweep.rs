@@ -42,6 +42,11 @@ pub(super) fn learner_lock(folder: &Path) -> PathBuf {
     folder.join("learner.lock")
 }
 
+/// The supervisor's lock in a run's folder.
+pub(super) fn supervisor_lock(folder: &Path) -> PathBuf {
+    folder.join("supervisor.lock")
+}
+
 /// What a sweep did.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Swept {
@@ -112,8 +117,9 @@ impl Machine {
     pub(super) fn remove(&self, run: RunId) {
         self.remove_lives(run);
         let folder = self.transport_folder(run);
-        // The lock's file comes last: by it a folder is known as ours, should this process die on the way.
-        for file in [folder.join("life.new"), folder.join("life"), learner_lock(&folder)] {
+        // The locks' files come last: by them a folder is known as ours, should this process die on the way.
+        let [learner, supervisor] = [learner_lock(&folder), supervisor_lock(&folder)];
+        for file in [folder.join("life.new"), folder.join("life"), learner, supervisor] {
             told(&file, fs::remove_file(&file));
         }
         told(&folder, fs::remove_dir(&folder));
@@ -144,10 +150,11 @@ impl Machine {
     }
 }
 
-/// Whether a folder is one of this version: empty, or with the learner's lock in it. Those of version 0.1 hold no lock, so that it cannot be told
+/// Whether a folder is one of this version: empty, or with a lock in it. Those of version 0.1 hold no lock, so that it cannot be told
 /// whether their run lives.
 fn is_ours(folder: &Path) -> io::Result<bool> {
-    Ok(learner_lock(folder).exists() || fs::read_dir(folder)?.next().is_none())
+    let has_lock = learner_lock(folder).exists() || supervisor_lock(folder).exists();
+    Ok(has_lock || fs::read_dir(folder)?.next().is_none())
 }
 
 /// What in `folder` belongs to this user. Links are told as links.

@@ -17,7 +17,6 @@ use super::opening::{Manner, Opener, control_slots};
 use super::{Ipc, ServiceError, failed, node, wait};
 use crate::config::Config;
 use crate::fault::{FaultPoint, pass};
-use crate::ids::RunId;
 use crate::run::{Announcement, Life, RunIdentity};
 use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 use crate::status::StatusRecord;
@@ -33,7 +32,8 @@ pub(super) const SNAPSHOT_SLOTS: usize = 8;
 /// The learner's ends.
 #[derive(Debug)]
 pub struct LearnerPorts {
-    run: RunId,
+    identity: RunIdentity,
+    life: Life,
     dead: Reclaimer,
     layout: SnapshotLayout,
     transitions: Subscriber<Ipc, TransitionRecord, ()>,
@@ -76,7 +76,8 @@ impl LearnerPorts {
         let weights_factory = open.weights()?;
         let messages = control_slots(&config.transport);
         Ok(Self {
-            run: identity.run,
+            identity: identity.clone(),
+            life,
             dead: Reclaimer::new(identity, life),
             transitions: open
                 .transitions(config)?
@@ -166,7 +167,7 @@ impl LearnerPorts {
             .weights
             .loan_slice_uninit(bytes.len())
             .map_err(failed("weights", "loaning"))?;
-        *sample.user_header_mut() = snapshot.header(self.run, &self.layout);
+        *sample.user_header_mut() = snapshot.header(self.identity.run, &self.layout);
         let sample = sample.write_from_slice(bytes);
         pass(FaultPoint::LearnerPublishing);
         sample.send().map_err(failed("weights", "sending"))?;
@@ -188,8 +189,9 @@ impl LearnerPorts {
     /// Connects to actors that have come, hands late joiners the newest snapshots, and reclaims what dead processes held. To be called regularly.
     ///
     /// # Errors
-    /// [`ServiceError`] when a peer's memory cannot be mapped.
+    /// [`ServiceError`] when a peer's memory cannot be mapped, or actors can no longer find this learner.
     pub fn maintain(&self) -> Result<(), ServiceError> {
+        self.check_findable()?;
         self.transitions
             .update_connections()
             .map_err(failed("transitions", "connecting"))?;
@@ -203,6 +205,23 @@ impl LearnerPorts {
             .update_connections()
             .map_err(failed("control", "connecting"))?;
         self.dead.reclaim(&self.node)
+    }
+
+    /// Looks for this learner as an actor would.
+    fn check_findable(&self) -> Result<(), ServiceError> {
+        let present = self
+            .identity
+            .present_life()
+            .map_err(failed("all", "looking at the folder"))?;
+        if present.is_some_and(|found| found.life == self.life) && self.identity.life_folder(self.life).is_dir() {
+            return Ok(());
+        }
+        Err(ServiceError {
+            service: "all",
+            operation: "looking at the folder",
+            cause: format!("what was in {} is gone", self.identity.transport_folder().display()),
+            remedy: "; leave it alone while the run is under way",
+        })
     }
 }
 

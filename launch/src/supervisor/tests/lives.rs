@@ -43,7 +43,7 @@ fn a_learner_that_dies_is_started_again_and_its_actors_stay() {
         assert_eq!(result.unwrap(), Ended::Finished);
         assert_eq!(
             seen.warnings,
-            format!("{told}, from its checkpoint after flight 40\n"),
+            format!("{told}, from its newest checkpoint\n"),
             "{death}"
         );
         assert_eq!(seen.restarts, Restarts { learner: 1, actors: 0 });
