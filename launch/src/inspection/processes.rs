@@ -97,6 +97,11 @@ impl Process {
         }
     }
 
+    /// Its number.
+    pub fn pid(&self) -> u32 {
+        self.pid.as_raw_nonzero().get().cast_unsigned()
+    }
+
     /// Whether it has not ended. A process that waits to be reaped has.
     pub fn is_alive(&self) -> bool {
         self.stat().is_some_and(|stat| stat.state != 'Z')
