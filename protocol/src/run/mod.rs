@@ -11,8 +11,11 @@ use std::fs;
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+use serde::Deserialize;
+
 use crate::PROTOCOL_VERSION;
 use crate::config::{Config, ConfigError};
+use crate::durable;
 use crate::ids::ActorId;
 
 pub use identity::{Announcement, Difference, Life, RunIdentity};
@@ -128,12 +131,19 @@ impl RunDirectory {
             env!("CARGO_PKG_VERSION"),
             config.to_toml()
         );
-        fs::write(self.config(), text).map_err(io(self.config()))?;
+        // A power cut shortly after must not leave checkpoints of a run that nobody knows any more: all of it is brought to disk.
+        durable::replace(&self.config(), text.as_bytes()).map_err(io(self.config()))?;
         let resolved = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
         let courses = courses::checksums(&self.courses()).map_err(io(self.courses()))?;
+        for file in courses.keys().map(|name| self.courses().join(name)) {
+            durable::sync(&file).map_err(io(file))?;
+        }
+        if !courses.is_empty() {
+            durable::sync(&self.courses()).map_err(io(self.courses()))?;
+        }
         let identity = RunIdentity::new(&resolved, courses);
         let json = serde_json::to_string_pretty(&identity).expect("an identity is plain data");
-        fs::write(self.identity(), json).map_err(io(self.identity()))?;
+        durable::replace(&self.identity(), json.as_bytes()).map_err(io(self.identity()))?;
         Ok(identity)
     }
 
@@ -147,16 +157,19 @@ impl RunDirectory {
             path: path.clone(),
             source,
         })?;
-        let identity: RunIdentity = serde_json::from_str(&text).map_err(|source| RunError::Identity {
+        let not_an_identity = |source| RunError::Identity {
             path: path.clone(),
             source,
-        })?;
-        if identity.protocol_version != PROTOCOL_VERSION {
+        };
+        // First of all: another version's identity may have other parts.
+        let Versioned { protocol_version } = serde_json::from_str(&text).map_err(not_an_identity)?;
+        if protocol_version != PROTOCOL_VERSION {
             return Err(RunError::OtherVersion {
                 path,
-                found: identity.protocol_version,
+                found: protocol_version,
             });
         }
+        let identity: RunIdentity = serde_json::from_str(&text).map_err(not_an_identity)?;
         let config = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
         if config.digest() != identity.config_digest {
             return Err(RunError::ConfigChanged {
@@ -167,6 +180,12 @@ impl RunDirectory {
         courses::verify(&self.courses(), &identity.courses)?;
         Ok((identity, config))
     }
+}
+
+/// What identities of all versions have.
+#[derive(Deserialize)]
+struct Versioned {
+    protocol_version: u32,
 }
 
 impl RunDirectory {
@@ -254,6 +273,19 @@ mod tests {
         let (opened, config) = run.open().unwrap();
         assert_eq!(opened, identity);
         assert_eq!(config.run, Config::default().run);
+    }
+
+    #[test]
+    fn another_versions_run_is_told_as_such_whatever_its_identity_holds() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        run.create(&Config::default()).unwrap();
+        fs::write(run.identity(), r#"{ "protocol_version": 1, "what": "was then" }"#).unwrap();
+        let error = run.open().unwrap_err().to_string();
+        assert!(error.contains("speaks protocol version 1"), "{error}");
+        fs::write(run.identity(), "").unwrap();
+        let error = run.open().unwrap_err().to_string();
+        assert!(error.contains("is not the identity of a run"), "{error}");
     }
 
     #[test]
