@@ -33,6 +33,7 @@ pub struct Recipe {
     overrides: Vec<String>,
     environment: Vec<(String, String)>,
     actors: u32,
+    within: Option<PathBuf>,
 }
 
 impl Recipe {
@@ -53,7 +54,14 @@ impl Recipe {
             overrides: Vec::new(),
             environment: Vec::new(),
             actors: 2,
+            within: None,
         }
+    }
+
+    /// With its directory in this folder.
+    pub fn within(mut self, folder: &Path) -> Self {
+        self.within = Some(folder.to_owned());
+        self
     }
 
     /// With so many actors.
@@ -93,7 +101,8 @@ impl Recipe {
 
     fn start_in_turn(self, turn: Option<MutexGuard<'static, ()>>) -> Running {
         let folder = tempfile::tempdir().unwrap();
-        let root = folder.path().canonicalize().unwrap().join("run");
+        let within = self.within.as_deref().unwrap_or(folder.path());
+        let root = within.canonicalize().unwrap().join("run");
         let mut command = skein_run(folder.path(), self.actors);
         command
             .arg("--config")
