@@ -1,5 +1,6 @@
 //! `skein-chaos`: trains a run in peace and once more under fire, and tells whether it made a difference.
 
+mod cost;
 mod plan;
 mod planned;
 mod points;
@@ -23,6 +24,7 @@ use skein_protocol::failure::with_causes;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::summary::Summary;
 
+use cost::Cost;
 use plan::{Subject, Wanted};
 use planned::Planning;
 use points::Points;
@@ -76,6 +78,9 @@ struct Arguments {
     /// Instead of all that, train for so long with actors coming and going, and look for anything that grows.
     #[arg(long, value_name = "MINUTES", conflicts_with_all = ["calm", "points"])]
     soak: Option<f64>,
+    /// Instead of all that, train so many times with checkpoints and so many times without, and tell what they cost.
+    #[arg(long, value_name = "TIMES", conflicts_with_all = ["calm", "points", "soak"], value_parser = clap::value_parser!(u32).range(1..))]
+    cost: Option<u32>,
     /// Instead of all that, let a process die at each of the named points of the programs.
     #[arg(long)]
     points: bool,
@@ -114,10 +119,23 @@ fn main() -> ExitCode {
 
 fn run(arguments: &Arguments) -> Result<Verdict> {
     let folder = new_folder(&arguments.run_dir)?;
-    match arguments.soak {
-        Some(minutes) => soak(arguments, &folder, Duration::from_secs_f64(minutes * 60.0)),
-        None => disturb(arguments, &folder),
+    match (arguments.soak, arguments.cost) {
+        (Some(minutes), _) => soak(arguments, &folder, Duration::from_secs_f64(minutes * 60.0)),
+        (None, Some(times)) => cost(arguments, &folder, times),
+        (None, None) => disturb(arguments, &folder),
     }
+}
+
+/// Trains with checkpoints and without, and tells what they cost.
+fn cost(arguments: &Arguments, folder: &Path, times: u32) -> Result<Verdict> {
+    let recipe = Recipe {
+        config: arguments.config.clone().context("--config is missing")?,
+        overrides: arguments.overrides.clone(),
+    };
+    let cost = Cost::measure(&recipe, times, |name, recipe| {
+        summary(&train_in_peace(folder, name, recipe, arguments.actors)?)
+    })?;
+    Ok(Verdict::of(cost.tell()))
 }
 
 /// Trains in peace, then under fire, and compares.
@@ -189,7 +207,7 @@ fn calm_run(arguments: &Arguments, folder: &Path) -> Result<(RunDirectory, Recip
             config: arguments.config.clone().context("--config is missing")?,
             overrides: arguments.overrides.clone(),
         };
-        return Ok((train_in_peace(folder, &recipe, arguments.actors)?, recipe));
+        return Ok((train_in_peace(folder, "calm", &recipe, arguments.actors)?, recipe));
     };
     let calm = calm
         .canonicalize()
@@ -212,8 +230,8 @@ fn new_folder(path: &Path) -> Result<PathBuf> {
     path.canonicalize().with_context(context)
 }
 
-fn train_in_peace(folder: &Path, recipe: &Recipe, actors: u32) -> Result<RunDirectory> {
-    let stage = Stage::new(folder, "calm", None)?;
+fn train_in_peace(folder: &Path, name: &str, recipe: &Recipe, actors: u32) -> Result<RunDirectory> {
+    let stage = Stage::new(folder, name, None)?;
     eprintln!("skein-chaos: trains in peace, in {}", stage.run.root().display());
     let supervisor = stage.start(recipe, actors)?;
     Storm::new(&stage, supervisor, Recorder::silent(), Spared::Nobody)

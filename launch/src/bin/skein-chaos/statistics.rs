@@ -58,7 +58,7 @@ pub(crate) fn commonest(numbers: impl Iterator<Item = usize>) -> Option<usize> {
 }
 
 /// The middle value; of an even number the upper of the two. Zero of none.
-fn median(mut values: Vec<f64>) -> f64 {
+pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or_default()
 }

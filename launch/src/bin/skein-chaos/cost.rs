@@ -1,0 +1,88 @@
+//! What it costs to survive: the same training with checkpoints and without, in turn, and what the receiving thread takes.
+
+use anyhow::{Context, Result};
+use skein_protocol::config::Config;
+use skein_protocol::summary::Summary;
+
+use crate::stage::Recipe;
+use crate::statistics::median;
+
+/// What may be lost of the training's speed.
+const TOLERANCE: f64 = 0.03;
+
+/// What it came to.
+#[derive(Debug)]
+pub(crate) struct Cost {
+    every_flights: u64,
+    with: Vec<Summary>,
+    without: Vec<Summary>,
+}
+
+impl Cost {
+    /// Trains by `recipe` so many times with checkpoints and so many times without, in turn. `train` trains in the folder it is given the name of.
+    ///
+    /// # Errors
+    /// When a training fails, or the configuration cannot be read.
+    pub(crate) fn measure(
+        recipe: &Recipe,
+        times: u32,
+        train: impl Fn(&str, &Recipe) -> Result<Summary>,
+    ) -> Result<Self> {
+        let config = Config::load(&recipe.config, &recipe.overrides)?;
+        let mut bare = recipe.clone();
+        // Beyond the last flight: one is written at the end all the same, as in the others.
+        bare.overrides
+            .push(format!("checkpoints.every_flights={}", config.run.flights + 1));
+        let mut cost = Self {
+            every_flights: config.checkpoints.every_flights,
+            with: Vec::new(),
+            without: Vec::new(),
+        };
+        for time in 1..=times {
+            let context = || format!("training number {time} failed");
+            cost.with
+                .push(train(&format!("with-{time}"), recipe).with_context(context)?);
+            cost.without
+                .push(train(&format!("without-{time}"), &bare).with_context(context)?);
+        }
+        Ok(cost)
+    }
+
+    /// Prints it; whether it is little.
+    pub(crate) fn tell(&self) -> bool {
+        let wall = |summary: &Summary| summary.wall_secs;
+        let (with, without) = (median_of(&self.with, wall), median_of(&self.without, wall));
+        let slower = with / without - 1.0;
+        let cpu = |name: &'static str| {
+            median_of(&self.with, move |summary| {
+                summary.thread_cpu_secs.get(name).copied().unwrap_or_default()
+            })
+        };
+        let all: f64 = median_of(&self.with, |summary| summary.thread_cpu_secs.values().sum());
+        let waits = median_of(&self.with, |summary| {
+            summary.phase_secs.get("checkpoint").copied().unwrap_or_default()
+        });
+        let receives = cpu("reception") / all;
+        println!("Cost, medians of {} trainings each, seconds:", self.with.len());
+        println!(
+            "  {:<44} {with:8.2}",
+            format!("with a checkpoint each {} flights", self.every_flights)
+        );
+        println!("  {:<44} {without:8.2}", "without");
+        println!("  {:<44} {:7.2} %", "slower by", slower * 100.0);
+        println!("  {:<44} {waits:8.2}", "training waited for checkpoints");
+        println!("  {:<44} {:8.2}", "processor time of writing them", cpu("checkpoints"));
+        println!(
+            "  {:<44} {:8.2}",
+            "processor time of assembling flights",
+            cpu("reception")
+        );
+        println!("  {:<44} {all:8.2}", "processor time of the learner");
+        println!("  {:<44} {:7.2} %", "assembling, of the learner's", receives * 100.0);
+        slower.max(0.0) + receives < TOLERANCE
+    }
+}
+
+fn median_of(summaries: &[Summary], value: impl Fn(&Summary) -> f64) -> f64 {
+    median(summaries.iter().map(value).collect())
+}
