@@ -90,6 +90,10 @@ struct Arguments {
 /// up.
 const SOAK_SETTINGS: [&str; 2] = ["run.flights=100000000", "replay.capacity=8192"];
 
+/// What a death at each point sets, unless it is set otherwise: a checkpoint after each epoch, so that the points of writing one are passed soon after
+/// each death.
+const POINTS_SETTINGS: [&str; 1] = ["checkpoints.every_flights=1"];
+
 /// How it went.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Verdict {
@@ -103,6 +107,18 @@ impl Verdict {
     #[allow(clippy::fn_params_excessive_bools)] // the condition is the point
     fn of(all_is_well: bool) -> Self {
         if all_is_well { Self::Passed } else { Self::Failed }
+    }
+}
+
+impl Arguments {
+    /// What to train, with `settings` unless they are set otherwise.
+    fn recipe(&self, settings: &[&str]) -> Result<Recipe> {
+        let mut overrides: Vec<_> = settings.iter().map(ToString::to_string).collect();
+        overrides.extend_from_slice(&self.overrides);
+        Ok(Recipe {
+            config: self.config.clone().context("--config is missing")?,
+            overrides,
+        })
     }
 }
 
@@ -128,10 +144,7 @@ fn run(arguments: &Arguments) -> Result<Verdict> {
 
 /// Trains with checkpoints and without, and tells what they cost.
 fn cost(arguments: &Arguments, folder: &Path, times: u32) -> Result<Verdict> {
-    let recipe = Recipe {
-        config: arguments.config.clone().context("--config is missing")?,
-        overrides: arguments.overrides.clone(),
-    };
+    let recipe = arguments.recipe(&[])?;
     let cost = Cost::measure(&recipe, times, |name, recipe| {
         summary(&train_in_peace(folder, name, recipe, arguments.actors)?)
     })?;
@@ -174,12 +187,7 @@ fn disturb(arguments: &Arguments, folder: &Path) -> Result<Verdict> {
 /// Trains for `length` with actors coming and going, and looks for anything that grows.
 fn soak(arguments: &Arguments, folder: &Path, length: Duration) -> Result<Verdict> {
     let stage = Stage::new(folder, "soaked", None)?;
-    let mut overrides: Vec<_> = SOAK_SETTINGS.iter().map(ToString::to_string).collect();
-    overrides.extend_from_slice(&arguments.overrides);
-    let recipe = Recipe {
-        config: arguments.config.clone().context("--config is missing")?,
-        overrides,
-    };
+    let recipe = arguments.recipe(&SOAK_SETTINGS)?;
     eprintln!(
         "skein-chaos: trains for {:.0} minutes in {}",
         length.as_secs_f64() / 60.0,
@@ -203,10 +211,7 @@ fn start<'a>(stage: &'a Stage, recipe: &Recipe, actors: u32, spared: Spared) -> 
 /// The undisturbed run, and how to train the same.
 fn calm_run(arguments: &Arguments, folder: &Path) -> Result<(RunDirectory, Recipe)> {
     let Some(calm) = &arguments.calm else {
-        let recipe = Recipe {
-            config: arguments.config.clone().context("--config is missing")?,
-            overrides: arguments.overrides.clone(),
-        };
+        let recipe = arguments.recipe(if arguments.points { &POINTS_SETTINGS } else { &[] })?;
         return Ok((train_in_peace(folder, "calm", &recipe, arguments.actors)?, recipe));
     };
     let calm = calm
