@@ -18,7 +18,6 @@ use skein_launch::reports;
 use skein_launch::resume::resume;
 use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, SupervisorError};
 use skein_protocol::claims::ActorClaim;
-use skein_protocol::config::Config;
 use skein_protocol::failure::with_causes;
 use skein_protocol::run::{RunDirectory, RunError, SupervisorSeat, sweep_leftovers};
 use skein_protocol::summary::{Ending, Summary};
@@ -250,10 +249,13 @@ fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
 
 /// The last line about a run that is not complete.
 fn tell_how_to_go_on(run: &RunDirectory) {
-    eprintln!(
-        "skein: to go on with it: launch/run_local.sh --resume {}",
-        run.root().display()
-    );
+    let root = run.root().display().to_string();
+    let is_plain = |character: char| character.is_alphanumeric() || "/._-+=:,@".contains(character);
+    let root = match root.chars().all(is_plain) {
+        true => root,
+        false => format!("'{}'", root.replace('\'', r"'\''")),
+    };
+    eprintln!("skein: to go on with it: launch/run_local.sh --resume {root}");
 }
 
 fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
@@ -268,6 +270,12 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     check_shared_memory_for_more(&config, arguments.count as usize)?;
     let claims = claim_actors(&run, arguments.count as usize)?;
     let actors: Vec<_> = claims.iter().map(ActorClaim::id).collect();
+    let most = config.transport.max_actors;
+    // The lowest free numbers were claimed: with those from the limit on, there would be too many.
+    let too_many = actors.iter().filter(|id| id.0 as usize >= most).count();
+    if too_many > 0 {
+        bail!("that is {too_many} more than transport.max_actors = {most} of this run allows: attach fewer");
+    }
     let names: Vec<_> = actors.iter().map(ToString::to_string).collect();
     eprintln!(
         "skein: adding actor {} to {}; Ctrl-C takes them away again",
@@ -291,7 +299,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
 
 fn report(arguments: &ReportArguments) -> anyhow::Result<Ended> {
     let run = open(&arguments.run)?;
-    let config = Config::load(&run.config(), &[])?;
+    let (_, config) = run.open()?;
     let courses = load_courses(&config)?;
     let window = config.evaluation.window_flights as usize;
     for picture in reports::draw_all(&run, &courses, window, ideal_walls_passed(&config)?)? {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use skein_protocol::run::{PlaceError, RunDirectory, RunError, SeatError, SupervisorSeat};
 use skein_protocol::summary::{Ending, Summary};
 
-use crate::prepare::room::check_shared_memory;
+use crate::prepare::room::{check_folders, check_shared_memory};
 use crate::prepare::{PrepareError, Prepared, check, load_courses};
 
 /// Between two looks whether an earlier learner is gone.
@@ -30,7 +30,7 @@ pub enum ResumeError {
     },
     /// All of it is done.
     #[error(
-        "the run in {} is complete, all {flights} flights of it: there is nothing to go on with; start a new one for more",
+        "the run in {} is complete, all {flights} flights of it: there is nothing to go on with; start a new one for more. `skein report --run` draws its plots again, launch/evaluate.sh flies its best snapshot again",
         directory.display()
     )]
     Complete {
@@ -104,8 +104,10 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
             flights: summary.flights,
         });
     }
+    run.make_folders()?;
     check(&run.config(), &config, actors)?;
     check_shared_memory(&config, actors).map_err(PrepareError::from)?;
+    check_folders().map_err(PrepareError::from)?;
     let courses = load_courses(&config).map_err(PrepareError::from)?;
     Ok((
         Prepared {

@@ -22,6 +22,11 @@ pub fn begin_life(path: &Path, flights: u64) -> io::Result<u64> {
         }
         text => text?,
     };
+    if text.is_empty() {
+        text.push_str(HEADER);
+    } else if !text.ends_with('\n') {
+        text.push('\n');
+    }
     let earlier = text.lines().skip(1).count() as u64;
     let now = SystemTime::now()
         .duration_since(UNIX_EPOCH)
@@ -54,6 +59,11 @@ mod tests {
         let path = directory.path().join("lives.csv");
         begin_life(&path, 0).unwrap();
         let mut bytes = fs::read(&path).unwrap();
+        // The end of the last line is lost.
+        bytes.pop();
+        fs::write(&path, &bytes).unwrap();
+        assert_eq!(begin_life(&path, 500).unwrap(), 1);
+        assert_eq!(fs::read_to_string(&path).unwrap().lines().count(), 3);
         bytes.push(0xff);
         fs::write(&path, bytes).unwrap();
         assert_eq!(begin_life(&path, 500).unwrap(), 0);

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use skein_launch::inspection::{Footprint, footprint};
+use skein_protocol::run::RunIdentity;
 use skein_tests::{Ended, Recipe, Role, Running, flights, run_program};
 
 /// Long enough to be disturbed several times.
@@ -101,18 +102,39 @@ fn checkpoints(run: &Running) -> Vec<PathBuf> {
     found
 }
 
-#[test]
-fn a_run_whose_folder_is_removed_makes_another() {
+/// Lets `remove` take something of the transport from under a run.
+fn goes_on_without(remove: impl Fn(&RunIdentity)) {
     let calm = calm();
     let mut run = recipe().start();
     run.until_flights(30);
-    let identity = run.directory().open().unwrap().0;
-    fs::remove_dir_all(identity.transport_folder()).unwrap();
+    remove(&run.directory().open().unwrap().0);
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
     assert!(disturbed.summary().resumes > 0, "{:?}", disturbed.summary());
     let terminal = &disturbed.output.stderr;
-    assert!(terminal.contains("leave it alone"), "{terminal}");
+    assert!(
+        terminal.contains("was removed") && terminal.contains("leave what is called skein alone"),
+        "{terminal}"
+    );
+}
+
+#[test]
+fn a_run_whose_folder_is_removed_makes_another() {
+    goes_on_without(|identity| fs::remove_dir_all(identity.transport_folder()).unwrap());
+}
+
+#[test]
+fn a_run_whose_shared_memory_is_removed_makes_another() {
+    goes_on_without(|identity| {
+        let prefix = format!("skein_{:016x}_", identity.run.0);
+        for entry in fs::read_dir("/dev/shm").unwrap() {
+            let entry = entry.unwrap();
+            if entry.file_name().to_str().unwrap().starts_with(&prefix) {
+                // An actor's may go by itself.
+                let _ = fs::remove_file(entry.path());
+            }
+        }
+    });
 }
 
 #[test]

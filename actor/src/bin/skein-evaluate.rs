@@ -168,6 +168,10 @@ fn snapshot_path(subject: &Subject) -> anyhow::Result<PathBuf> {
             .context("neither --run nor --snapshot is given");
     };
     let directory = RunDirectory::new(run);
+    // Of a run that has an identity, it can be told whether its courses are those that it was trained and evaluated on.
+    if directory.identity().is_file() {
+        directory.open()?;
+    }
     let candidates = [directory.best_snapshot(), directory.latest_snapshot()];
     let found = candidates.iter().find(|path| path.is_file()).cloned();
     found.with_context(|| {

@@ -58,7 +58,7 @@ fn transport(id: RunId) -> PathBuf {
 }
 
 fn segments(id: RunId) -> Vec<PathBuf> {
-    let prefix = format!("skein_{:016x}_", id.0);
+    let prefix = format!("skein_{:016x}", id.0);
     fs::read_dir("/dev/shm")
         .into_iter()
         .flatten()

@@ -8,7 +8,7 @@ use skein_protocol::run::RunError;
 use skein_simulator::course::{CourseError, RangesError};
 use skein_simulator::simulator::SimulatorError;
 
-use super::room::SharedMemoryTooSmall;
+use super::room::{FoldersTooSmall, SharedMemoryTooSmall};
 
 /// Why a run cannot be started.
 #[derive(Debug, thiserror::Error)]
@@ -84,6 +84,9 @@ pub enum PrepareError {
     /// The shared memory would be used up.
     #[error(transparent)]
     Room(#[from] SharedMemoryTooSmall),
+    /// No room for the transport's small files.
+    #[error(transparent)]
+    Folders(#[from] FoldersTooSmall),
     /// There is something in the run's directory.
     #[error("{} is not empty: choose another --run-dir, or remove it if nobody needs it", .0.display())]
     NotEmpty(PathBuf),

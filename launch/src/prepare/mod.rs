@@ -52,6 +52,7 @@ pub fn prepare(
         check(config_file, &config, actors).map_err(|error| checks::blame(error, config_file, overrides, actors))?;
     config.simulator = written_out(&settings);
     room::check_shared_memory(&config, actors)?;
+    room::check_folders()?;
     let new = NewDirectory::make(run_directory)?;
     match fill(&new, config) {
         Ok(prepared) => Ok(Prepared {

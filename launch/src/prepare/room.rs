@@ -11,6 +11,10 @@ use skein_protocol::{ACTION, IMAGE_PIXELS};
 
 /// Where iceoryx2's segments lie.
 const SHARED_MEMORY: &str = "/dev/shm";
+/// Where the folder of a run's transport lies.
+const FOLDERS: &str = "/tmp";
+/// More than the small files of a hundred actors take: a dozen each, of a block each.
+const TRANSPORT_FILES: u64 = 8 << 20;
 const MIB: u64 = 1 << 20;
 /// All that is trained, targets and moments, in snapshots of the same configuration. 23 were measured: `tensors.safetensors` of a checkpoint of
 /// `tests/small.toml` has 73.1 MB, `latest.safetensors` 3.2 MB.
@@ -69,6 +73,25 @@ fn check_memory_in(path: &Path, actors: usize, needed: u64) -> Result<(), Shared
         free,
         enough: total - free + needed,
     })
+}
+
+/// There is no room for the transport's locks and sockets.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{FOLDERS} has {} KiB free, but the files by which a run's processes find each other need {} KiB: make room there", free >> 10, TRANSPORT_FILES >> 10)]
+pub struct FoldersTooSmall {
+    /// Bytes.
+    free: u64,
+}
+
+/// Checks that there is room for the folder of a run's transport.
+///
+/// # Errors
+/// [`FoldersTooSmall`] names what is needed and what there is.
+pub fn check_folders() -> Result<(), FoldersTooSmall> {
+    match space(Path::new(FOLDERS)) {
+        Some(Space { free, .. }) if free < TRANSPORT_FILES => Err(FoldersTooSmall { free }),
+        _ => Ok(()),
+    }
 }
 
 /// Bytes of shared memory that are free; `None` where it cannot be asked for.

@@ -63,6 +63,14 @@ pub enum CheckpointError {
         /// What is wrong with it.
         problem: String,
     },
+    /// It counts on files beside it that are not as they were.
+    #[error("the checkpoint of flight {flights} does not fit: {problem}")]
+    Unfit {
+        /// The checkpoint.
+        flights: u64,
+        /// What does not fit, with the file.
+        problem: String,
+    },
     /// There are checkpoints, but none can be used.
     #[error(
         "none of the {count} checkpoints in {} can be used; to train anew from the first flight, remove that folder and flights.csv. The newest: {newest}", directory.display()

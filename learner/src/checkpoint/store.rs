@@ -133,7 +133,12 @@ impl CheckpointStore {
         let io = || CheckpointError::io("list", &self.directory);
         let mut found = Vec::new();
         for entry in fs::read_dir(&self.directory).map_err(io())? {
-            let name = entry.map_err(io())?.file_name();
+            let entry = entry.map_err(io())?;
+            // A checkpoint is a directory; whatever else lies here is nobody's business.
+            if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+                continue;
+            }
+            let name = entry.file_name();
             let flights = name.to_str().and_then(|name| {
                 let number = name.strip_prefix("flight-")?;
                 number.strip_suffix(REPLACED).unwrap_or(number).parse::<u64>().ok()
@@ -199,20 +204,22 @@ impl CheckpointStore {
     }
 
     /// Loads the newest checkpoint that is undamaged; `None` when there is none at all. Resuming from an older one costs time, never the result. Each
-    /// damaged one that is newer is given to `passed_over`.
+    /// damaged one that is newer is given to `passed_over`, and so is one that does not fit what lies beside it, of which `check` tells.
     ///
     /// # Errors
     /// [`CheckpointError::NoneUsable`] when all are damaged: a run is not begun anew without a word. [`CheckpointError::Format`] or
     /// [`CheckpointError::Configuration`] when the newest undamaged one is of another version or configuration.
     pub fn load_newest(
         &self,
+        check: impl Fn(&CheckpointState) -> Result<(), CheckpointError>,
         mut passed_over: impl FnMut(&CheckpointError),
     ) -> Result<Option<CheckpointState>, CheckpointError> {
         let places = self.places()?;
         let count = places.len();
         let mut newest = None;
         for place in places {
-            match self.load_from(&place) {
+            let loaded = self.load_from(&place);
+            match loaded.and_then(|state| check(&state).map(|()| state)) {
                 Ok(state) => return Ok(Some(state)),
                 Err(error) if error.is_damage() => {
                     passed_over(&error);
@@ -284,7 +291,12 @@ fn replaced(place: &Path) -> PathBuf {
 }
 
 fn remove(path: &Path) -> Result<(), CheckpointError> {
-    match fs::remove_dir_all(path) {
+    let removed = match fs::remove_dir_all(path) {
+        // Somebody put a file where only directories of ours are.
+        Err(error) if error.kind() == std::io::ErrorKind::NotADirectory => fs::remove_file(path),
+        removed => removed,
+    };
+    match removed {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(CheckpointError::io("remove", path)(error)),
         _ => Ok(()),
     }

@@ -150,7 +150,7 @@ fn what_is_saved_is_what_is_loaded() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
-    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(500));
+    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
 }
 
 #[test]
@@ -232,7 +232,7 @@ fn another_configuration_is_refused_by_key_with_both_values() {
     let mut config = config(2);
     config.sac.discount = 0.5;
     let other = CheckpointStore::new(store.directory(), &config);
-    let error = other.load_newest(|_| {}).unwrap_err().to_string();
+    let error = other.load_newest(|_| Ok(()), |_| {}).unwrap_err().to_string();
     for part in ["flight-500", "sac.discount = 0.99 there, 0.5 here"] {
         assert!(error.contains(part), "`{error}` does not mention `{part}`");
     }
@@ -248,7 +248,7 @@ fn another_format_is_refused_before_anything_else_is_believed() {
     let checksum = xxhash_rust::xxh3::xxh3_64(body.as_bytes());
     fs::write(&path, format!("{body},\n  \"xxh3\": \"{checksum:016x}\"\n}}\n")).unwrap();
     // It is no damage that an older checkpoint could make good.
-    let error = store.load_newest(|_| {}).unwrap_err();
+    let error = store.load_newest(|_| Ok(()), |_| {}).unwrap_err();
     let expected = manifest::FORMAT;
     assert!(
         matches!(error, CheckpointError::Format { found: 9, expected: ours, .. } if ours == expected),
@@ -263,7 +263,7 @@ fn a_run_whose_checkpoints_are_all_damaged_is_not_begun_anew() {
         let place = store.save(&state(flights), &[]).unwrap();
         fs::write(place.join("progress.bin"), "").unwrap();
     }
-    let error = store.load_newest(|_| {}).unwrap_err().to_string();
+    let error = store.load_newest(|_| Ok(()), |_| {}).unwrap_err().to_string();
     for part in [
         "none of the 2 checkpoints",
         "flight-1000/progress.bin",
@@ -314,7 +314,7 @@ fn a_checkpoint_that_is_written_again_is_never_missed() {
     // The first half of the exchange, then a death.
     let replaced = store.directory().join("flight-500.replaced");
     fs::rename(&place, &replaced).unwrap();
-    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(500));
+    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
     assert_eq!(store.list().unwrap(), [500]);
     // The second half, then damage to the new one.
     let place = store.save(&state(500), &[]).unwrap();
@@ -322,7 +322,7 @@ fn a_checkpoint_that_is_written_again_is_never_missed() {
     fs::rename(&place, &replaced).unwrap();
     fs::create_dir(&place).unwrap();
     fs::write(place.join("progress.bin"), "").unwrap();
-    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(500));
+    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
     store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
     assert_eq!(names(store.directory()), ["flight-500"]);
@@ -334,9 +334,12 @@ fn a_damaged_newest_is_passed_over_and_replaced_when_its_flight_is_reached_again
     store.save(&state(500), &[]).unwrap();
     let newest = store.save(&state(1000), &[]).unwrap();
     fs::write(newest.join("progress.bin"), "").unwrap();
-    assert_eq!(store.load_newest(|_| {}).unwrap().unwrap().progress.flights, 500);
+    assert_eq!(
+        store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap().progress.flights,
+        500
+    );
     store.save(&state(1000), &[]).unwrap();
-    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(1000));
+    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(1000));
 }
 
 #[test]
@@ -353,7 +356,7 @@ fn what_an_interrupted_write_left_is_never_read_and_then_cleared() {
     let interrupted = store.save(&state(437), &[]).unwrap();
     fs::write(interrupted.join("tensors.safetensors.part"), "half").unwrap();
     fs::rename(interrupted, store.directory().join(".writing")).unwrap();
-    assert!(store.load_newest(|_| {}).unwrap().is_none());
+    assert!(store.load_newest(|_| Ok(()), |_| {}).unwrap().is_none());
     let place = store.save(&state(500), &[]).unwrap();
     assert_eq!(names(store.directory()), ["flight-500"]);
     assert_eq!(
@@ -372,7 +375,7 @@ fn what_an_interrupted_write_left_is_never_read_and_then_cleared() {
 #[test]
 fn a_run_without_checkpoints_has_none() {
     let (_directory, store) = store(2);
-    assert!(store.load_newest(|_| {}).unwrap().is_none());
+    assert!(store.load_newest(|_| Ok(()), |_| {}).unwrap().is_none());
 }
 
 #[test]
@@ -457,10 +460,13 @@ fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop
     let mut writer = CheckpointWriter::start(store.clone(), disk.clone()).unwrap();
     writer.save(state(600), Vec::new()).unwrap();
     wait_for(|| disk.waiting().is_some());
-    assert_eq!(store.load_newest(|_| {}).unwrap().unwrap().progress.flights, 500);
+    assert_eq!(
+        store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap().progress.flights,
+        500
+    );
     fs::remove_file(&ballast).unwrap();
     writer.finish().unwrap();
-    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(600));
+    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(600));
 
     free(&ballast);
     let mut writer = CheckpointWriter::start(store.clone(), disk.clone()).unwrap();
@@ -469,7 +475,7 @@ fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop
     stop.store(true, std::sync::atomic::Ordering::Relaxed);
     let error = writer.finish().unwrap_err().to_string();
     assert!(error.contains("No space left on device"), "{error}");
-    assert_same(&store.load_newest(|_| {}).unwrap().unwrap(), &state(600));
+    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(600));
 }
 
 fn wait_for(condition: impl Fn() -> bool) {
@@ -478,4 +484,38 @@ fn wait_for(condition: impl Fn() -> bool) {
         assert!(std::time::Instant::now() < end, "it never came");
         std::thread::sleep(std::time::Duration::from_millis(10));
     }
+}
+
+#[test]
+fn one_that_does_not_fit_what_lies_beside_it_is_passed_over_and_told() {
+    let (_directory, store) = store(2);
+    store.save(&state(500), &[]).unwrap();
+    store.save(&state(1000), &[]).unwrap();
+    let check = |state: &CheckpointState| match state.progress.flights {
+        1000 => Err(CheckpointError::Unfit {
+            flights: 1000,
+            problem: "flights.csv ends after 3 bytes".to_owned(),
+        }),
+        _ => Ok(()),
+    };
+    let mut told = Vec::new();
+    let newest = store.load_newest(check, |error| told.push(error.to_string())).unwrap();
+    assert_same(&newest.unwrap(), &state(500));
+    assert_eq!(
+        told,
+        ["the checkpoint of flight 1000 does not fit: flights.csv ends after 3 bytes"]
+    );
+}
+
+#[test]
+fn files_among_the_checkpoints_are_in_nobodys_way() {
+    let (_directory, store) = store(2);
+    store.save(&state(500), &[]).unwrap();
+    for name in ["flight-9999", ".writing", ".removing", "notes.txt"] {
+        fs::write(store.directory().join(name), "").unwrap();
+    }
+    store.save(&state(1000), &[]).unwrap();
+    store.save(&state(1500), &[]).unwrap();
+    assert_eq!(store.list().unwrap(), [1500, 1000]);
+    assert!(store.directory().join("flight-9999").exists());
 }

@@ -14,6 +14,7 @@ use prost::Message;
 use serde::{Deserialize, Serialize};
 
 use crate::disk::{Disk, Patient};
+use crate::report::tell;
 
 /// How the names of our files begin, before the second of their start. TensorBoard takes files whose name has `tfevents` in it.
 const NAME: &str = "events.out.tfevents.";
@@ -191,7 +192,10 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, Even
         let path = directory.join(name);
         let found = fs::metadata(&path).map_or(0, |metadata| metadata.len());
         if found < *bytes {
-            tracing::warn!(path = %path.display(), found, expected = bytes, "a part of an event file is lost: curves have a hole");
+            let path = path.display();
+            tell(&format!(
+                "{path} ends after {found} of {bytes} bytes: TensorBoard's curves have a hole"
+            ));
         } else if found > *bytes {
             let file = OpenOptions::new().write(true).open(&path).map_err(at(&path))?;
             file.set_len(*bytes).map_err(at(&path))?;

@@ -190,7 +190,7 @@ pub enum FlightsError {
     },
     /// It is not what was written before the checkpoint.
     #[error(
-        "{} {problem}, but the checkpoint of flight {flights} counts on it; put the file back, or remove this checkpoint and others that count on more of the file than there is, so that the run goes on from an older one", path.display()
+        "{} {problem}, but the checkpoint of flight {flights} counts on it; put the file back", path.display()
     )]
     Damaged {
         /// The file.

@@ -70,6 +70,16 @@ impl MetricsState {
     }
 }
 
+impl MetricsState {
+    /// Checks that `flights.csv` of `run` is what was written when this state was taken, or more.
+    ///
+    /// # Errors
+    /// [`MetricsError::Flights`] says what is wrong with it.
+    pub fn check(&self, run: &RunDirectory) -> Result<(), MetricsError> {
+        Ok(self.flights_extent.check(&run.flights_csv(), self.flights)?)
+    }
+}
+
 /// Writes all metrics of a training run.
 #[derive(Debug)]
 pub struct Metrics {
@@ -97,13 +107,13 @@ impl Metrics {
     /// # Errors
     /// [`MetricsError`] names the file; `flights.csv` must be what was written when `state` was taken, or more.
     pub fn resume(run: &RunDirectory, state: MetricsState, disk: &Disk) -> Result<Self, MetricsError> {
+        state.check(run)?;
         let MetricsState {
             flights,
-            flights_extent,
+            flights_extent: _,
             events,
             windows,
         } = state;
-        flights_extent.check(&run.flights_csv(), flights)?;
         Ok(Self {
             run: run.clone(),
             rows: flights,

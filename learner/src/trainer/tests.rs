@@ -66,7 +66,7 @@ fn resumed(trainer: &Trainer, epochs: u64) -> Trainer {
     let directory = tempfile::tempdir().unwrap();
     let store = CheckpointStore::new(directory.path(), &config());
     store.save(&state(trainer, epochs), &[]).unwrap();
-    let stored = store.load_newest(|_| {}).unwrap().unwrap();
+    let stored = store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap();
     let mut resumed = Trainer::new(&config()).unwrap();
     resumed
         .restore(&stored.progress, &stored.tensors, stored.replay)

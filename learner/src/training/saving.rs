@@ -16,7 +16,7 @@ use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::summary::{Ending, Summary};
 
 use super::{StopWatch, Training, TrainingError};
-use crate::checkpoint::{CheckpointState, CheckpointStore, CheckpointWriter, Progress};
+use crate::checkpoint::{CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, Progress};
 use crate::disk::Disk;
 use crate::flights::reception::Reception;
 use crate::lives::begin_life;
@@ -38,7 +38,16 @@ impl<'a> Training<'a> {
         let disk = Disk::new(stop.clone());
         let mut trainer = Trainer::new(config)?;
         let store = CheckpointStore::new(&directory.checkpoints(), config);
-        let newest = store.load_newest(|error| tell(&format!("a checkpoint is damaged and not used: {error}")))?;
+        let fits = |state: &CheckpointState| {
+            let metrics = &state.progress.metrics;
+            metrics.check(directory).map_err(|problem| CheckpointError::Unfit {
+                flights: state.progress.flights,
+                problem: problem.to_string(),
+            })
+        };
+        let newest = store.load_newest(fits, |error| {
+            tell(&format!("a checkpoint is damaged and not used: {error}"));
+        })?;
         let (saved, snapshots) = match newest {
             Some(checkpoint) => {
                 tell(&format!("going on after flight {}", checkpoint.progress.flights));
@@ -261,7 +270,8 @@ fn resume_metrics(directory: &RunDirectory, saved: &Progress, disk: &Disk) -> Re
     })
 }
 
-/// A run without checkpoints is not begun anew without a word when it has had some: `flights.csv` shows more flights than can be flown before the first.
+/// A run without checkpoints is not begun anew without a word when it has had some: their folder is gone, or `flights.csv` shows more flights than can be
+/// flown before the first. What was flown before any is flown again.
 fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<(), TrainingError> {
     let flights_csv = directory.flights_csv();
     let content = match fs::read(&flights_csv) {
@@ -270,15 +280,19 @@ fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<
     };
     let lines = content.iter().filter(|&&byte| byte == b'\n').count() as u64;
     let rows = lines.saturating_sub(1);
-    let first_after = config.checkpoints.every_flights;
-    // A checkpoint is taken at the end of an epoch, and training goes on while it is written: until the next one is to be handed over.
-    if rows > 2 * (first_after + config.learning.flights_per_epoch) {
+    let (checkpoints, first_after) = (directory.checkpoints(), config.checkpoints.every_flights);
+    // A checkpoint is taken at the end of an epoch, and training goes on while it is written: until the next one is to be handed over. Their folder was
+    // made with the run's.
+    if rows > 2 * (first_after + config.learning.flights_per_epoch) || rows > 0 && !checkpoints.is_dir() {
         return Err(TrainingError::CheckpointsLost {
             flights_csv,
             rows,
-            checkpoints: directory.checkpoints(),
+            checkpoints,
             first_after,
         });
+    }
+    if rows > 0 {
+        tell("there is no checkpoint yet: beginning anew");
     }
     Ok(())
 }
@@ -384,6 +398,7 @@ mod tests {
     fn a_run_that_lost_its_checkpoints_is_not_begun_anew_without_a_word() {
         let folder = tempfile::tempdir().unwrap();
         let directory = RunDirectory::new(folder.path());
+        fs::create_dir(directory.checkpoints()).unwrap();
         let mut config = Config::default();
         config.checkpoints.every_flights = 20;
         config.learning.flights_per_epoch = 5;
@@ -393,6 +408,18 @@ mod tests {
         // The second checkpoint waits until the first is in place, so that many can be flown without one.
         flown(50);
         refuse_lost_checkpoints(&directory, &config).unwrap();
+        fs::remove_dir(directory.checkpoints()).unwrap();
+        assert!(
+            refuse_lost_checkpoints(&directory, &config).is_err(),
+            "their folder is gone"
+        );
+        std::os::unix::fs::symlink("/no/such/disk", directory.checkpoints()).unwrap();
+        assert!(
+            refuse_lost_checkpoints(&directory, &config).is_err(),
+            "it leads nowhere"
+        );
+        fs::remove_file(directory.checkpoints()).unwrap();
+        fs::create_dir(directory.checkpoints()).unwrap();
         flown(51);
         let error = refuse_lost_checkpoints(&directory, &config).unwrap_err().to_string();
         for part in ["flights.csv has 51 flights", "checkpoints", "remove flights.csv"] {

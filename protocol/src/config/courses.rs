@@ -42,7 +42,12 @@ impl CoursesSection {
         course.file_stem().unwrap_or_default().to_string_lossy().into_owned()
     }
 
-    /// All course files.
+    /// Every course file.
+    pub fn paths(&self) -> impl Iterator<Item = &PathBuf> {
+        std::iter::once(&self.training).chain(&self.evaluation)
+    }
+
+    /// Every course file, to be changed.
     pub fn paths_mut(&mut self) -> impl Iterator<Item = &mut PathBuf> {
         self.evaluation.iter_mut().chain([&mut self.training])
     }

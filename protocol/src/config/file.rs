@@ -99,7 +99,7 @@ impl Config {
     }
 
     fn resolve(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text = fs::read_to_string(path).map_err(|source| ConfigError::Read {
+        let text = read_text(path).map_err(|source| ConfigError::Read {
             path: path.to_owned(),
             source,
         })?;
@@ -222,6 +222,17 @@ fn parse_value(text: &str) -> Value {
         .ok()
         .and_then(|mut table| table.remove("value"))
         .unwrap_or_else(|| Value::String(text.to_owned()))
+}
+
+/// Reads a text file of a size that people write. Of what is no file, a pipe or a device, the end might never come.
+fn read_text(path: &Path) -> io::Result<String> {
+    /// Many times what a configuration with every key and a comment on each has.
+    const LONGEST: u64 = 1 << 20;
+    let about = fs::metadata(path)?;
+    if !about.is_file() || about.len() > LONGEST {
+        return Err(io::Error::other(format!("is no text file of at most {LONGEST} bytes")));
+    }
+    fs::read_to_string(path)
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ use std::path::Path;
 use xxhash_rust::xxh3::xxh3_64;
 
 use super::RunError;
+use crate::config::Config;
 
 /// Checksum of each file in `folder`, by its name; of a folder that does not exist, none.
 pub(super) fn checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {
@@ -26,8 +27,22 @@ pub(super) fn checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {
     Ok(checksums)
 }
 
-/// Checks that the files in `folder` are those of `checksums`.
-pub(super) fn verify(folder: &Path, checksums: &BTreeMap<String, String>) -> Result<(), RunError> {
+/// Checks that the files in `folder` are those of `checksums`, and that the run flies through no others.
+pub(super) fn verify(folder: &Path, checksums: &BTreeMap<String, String>, config: &Config) -> Result<(), RunError> {
+    for path in config.courses.paths() {
+        let name = path.file_name().and_then(|name| name.to_str());
+        let is_known = path.parent() == Some(folder) && name.is_some_and(|name| checksums.contains_key(name));
+        // A run that was created without copies vouches for none.
+        if !checksums.is_empty() && !is_known {
+            return Err(RunError::CourseChanged {
+                path: path.clone(),
+                problem: format!(
+                    "is none of the courses in {} that the run was started with",
+                    folder.display()
+                ),
+            });
+        }
+    }
     for (name, expected) in checksums {
         let path = folder.join(name);
         let problem = if Path::new(name).file_name() != Some(name.as_ref()) {

@@ -32,7 +32,6 @@ pub struct RunIdentity {
     /// [`Config::digest`].
     pub config_digest: u64,
     /// Checksum (xxh3, hexadecimal) of each file in [`courses`](super::RunDirectory::courses) as the run was started with it, by its name.
-    #[serde(default)]
     pub courses: BTreeMap<String, String>,
 }
 
@@ -56,7 +55,9 @@ impl Life {
 
     /// From the name of its folder; `None` for what is none.
     pub(super) fn parse(name: &str) -> Option<Self> {
-        let life = name.parse().ok().map(Self)?;
+        /// No run dies as often; and a listener's socket has room for so many digits.
+        const MOST: u32 = 9_999_999;
+        let life = name.parse().ok().filter(|&life| life < MOST).map(Self)?;
         (life.to_string() == name).then_some(life)
     }
 }

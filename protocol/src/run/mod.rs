@@ -117,15 +117,8 @@ impl RunDirectory {
             // One that was there before may be open to others.
             .and_then(|()| fs::set_permissions(&self.root, fs::Permissions::from_mode(0o700)))
             .map_err(io(self.root.clone()))?;
-        for folder in [
-            self.logs(),
-            self.tensorboard(),
-            self.snapshots(),
-            self.checkpoints(),
-            self.plots(),
-        ] {
-            fs::create_dir_all(&folder).map_err(io(folder.clone()))?;
-        }
+        self.make_folders()?;
+        fs::create_dir_all(self.checkpoints()).map_err(io(self.checkpoints()))?;
         let text = format!(
             "# Resolved by Skein {}.\n\n{}",
             env!("CARGO_PKG_VERSION"),
@@ -145,6 +138,18 @@ impl RunDirectory {
         let json = serde_json::to_string_pretty(&identity).expect("an identity is plain data");
         durable::replace(&self.identity(), json.as_bytes()).map_err(io(self.identity()))?;
         Ok(identity)
+    }
+
+    /// Makes the folders that are not there: copies of a run may lack those that were empty. That of the checkpoints is none of them, because a run without
+    /// any is begun anew.
+    ///
+    /// # Errors
+    /// [`RunError`] names the path.
+    pub fn make_folders(&self) -> Result<(), RunError> {
+        for folder in [self.logs(), self.tensorboard(), self.snapshots(), self.plots()] {
+            fs::create_dir_all(&folder).map_err(|source| RunError::Io { path: folder, source })?;
+        }
+        Ok(())
     }
 
     /// Reads identity and configuration of an existing run; its course files are those it was started with.
@@ -177,7 +182,7 @@ impl RunDirectory {
                 differences: self.differences(&identity, &config),
             });
         }
-        courses::verify(&self.courses(), &identity.courses)?;
+        courses::verify(&self.courses(), &identity.courses, &config)?;
         Ok((identity, config))
     }
 }
@@ -211,11 +216,21 @@ impl RunDirectory {
     }
 }
 
+/// What to do about it, if that can be told.
+fn remedy(error: &std::io::Error) -> &'static str {
+    match error.kind() {
+        std::io::ErrorKind::NotFound => "; is this the directory of a run?",
+        std::io::ErrorKind::PermissionDenied => "; it belongs to another user, or may not be written",
+        std::io::ErrorKind::ReadOnlyFilesystem => "; copy the run to a disk that can be written",
+        _ => "",
+    }
+}
+
 /// Why a run's directory cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// A file or folder cannot be read or written.
-    #[error("{}: {source}; is this the directory of a run?", path.display())]
+    #[error("{}: {source}{}", path.display(), remedy(source))]
     Io {
         /// The path.
         path: PathBuf,
@@ -318,7 +333,10 @@ mod tests {
         let (training, gates) = (run.courses().join("training.toml"), run.courses().join("gates.toml"));
         fs::write(&training, "walls = 5").unwrap();
         fs::write(&gates, "walls = 2").unwrap();
-        run.create(&Config::default()).unwrap();
+        let mut config = Config::default();
+        config.courses.training.clone_from(&training);
+        config.courses.evaluation = vec![training.clone(), gates.clone()];
+        run.create(&config).unwrap();
         run.open().unwrap();
         let refused = |path: &Path, problem: &str| {
             let error = run.open().unwrap_err().to_string();
@@ -333,6 +351,15 @@ mod tests {
         run.open().unwrap();
         fs::remove_file(&gates).unwrap();
         refused(&gates, "No such file");
+        fs::write(&gates, "walls = 2").unwrap();
+        run.open().unwrap();
+
+        // The configuration's digest is the same wherever the run's directory lies: a course of the same name elsewhere is another one all the same.
+        let elsewhere = directory.path().join("training.toml");
+        fs::copy(&training, &elsewhere).unwrap();
+        config.courses.training.clone_from(&elsewhere);
+        fs::write(run.config(), config.to_toml()).unwrap();
+        refused(&elsewhere, "is none of the courses");
     }
 
     #[test]

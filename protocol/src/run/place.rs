@@ -153,9 +153,9 @@ pub(super) enum Locked {
     Taken { words: String },
 }
 
-/// Takes the lock of the file at `path`, which is made if need be.
-pub(super) fn lock(path: &Path) -> Result<Locked, PlaceError> {
-    let file = fs::OpenOptions::new()
+/// A file for this user alone, made if need be. A link to one is none.
+pub(super) fn open_private(path: &Path) -> io::Result<File> {
+    fs::OpenOptions::new()
         .read(true)
         .write(true)
         .create(true)
@@ -163,7 +163,11 @@ pub(super) fn lock(path: &Path) -> Result<Locked, PlaceError> {
         .mode(0o600)
         .custom_flags(OFlags::NOFOLLOW.bits().cast_signed())
         .open(path)
-        .map_err(PlaceError::at(path))?;
+}
+
+/// Takes the lock of the file at `path`, which is made if need be.
+pub(super) fn lock(path: &Path) -> Result<Locked, PlaceError> {
+    let file = open_private(path).map_err(PlaceError::at(path))?;
     if lock_within(LOCK_PATIENCE, || file.try_lock()).map_err(PlaceError::at(path))? {
         let path = path.to_owned();
         return Ok(Locked::Mine(HeldLock { file, path }));

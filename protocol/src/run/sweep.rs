@@ -5,13 +5,13 @@
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
-use std::fs;
+use std::fs::{self, File};
 use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use super::identity::Life;
-use super::place::{is_still_at, make_folder, open_folder, run_of, user};
+use super::place::{is_still_at, make_folder, open_folder, open_private, run_of, user};
 use crate::ids::RunId;
 
 /// Where the transport of runs lies.
@@ -36,6 +36,9 @@ const SEGMENT_PREFIX: &str = "skein_";
 pub(super) fn shared_memory_prefix(run: RunId) -> String {
     format!("{SEGMENT_PREFIX}{:016x}_", run.0)
 }
+
+/// Ends the name of the file in shared memory by which a run's processes are seen where another `/tmp` hides its folder.
+const PRESENCE: &str = ".presence";
 
 /// The learner's lock in a run's folder.
 pub(super) fn learner_lock(folder: &Path) -> PathBuf {
@@ -68,6 +71,11 @@ impl Machine {
         Path::new(self.folders).join(format!("{FOLDER_PREFIX}{:016x}", run.0))
     }
 
+    /// Locked, as the folder is, by every process of the run: containers and services may share the memory and not the folder.
+    pub(super) fn presence_file(&self, run: RunId) -> PathBuf {
+        Path::new(self.segments).join(format!("{SEGMENT_PREFIX}{:016x}{PRESENCE}", run.0))
+    }
+
     fn sweep(&self) -> Swept {
         let mut swept = Swept::default();
         for run in self.runs() {
@@ -88,7 +96,9 @@ impl Machine {
         });
         let segments = own_entries(Path::new(self.segments)).filter_map(|(name, about)| {
             let (run, length) = run_of(&name, SEGMENT_PREFIX)?;
-            (about.is_file() && name.as_encoded_bytes().get(length) == Some(&b'_')).then_some(RunId(run))
+            let rest = &name.as_encoded_bytes()[length..];
+            let is_its = rest.first() == Some(&b'_') || rest == PRESENCE.as_bytes();
+            (about.is_file() && is_its).then_some(RunId(run))
         });
         folders.chain(segments).collect()
     }
@@ -102,10 +112,18 @@ impl Machine {
         let Some(folder) = open_folder(&path).map_err(|error| error.to_string())? else {
             return Ok(false);
         };
-        let is_dead = folder.try_lock().is_ok() && is_still_at(&folder, &path).map_err(told)?;
-        if !is_dead || !is_ours(&path).map_err(told)? {
+        if folder.try_lock().is_err() || !is_still_at(&folder, &path).map_err(told)? {
             return Ok(false);
         }
+        if !is_ours(&path).map_err(told)? {
+            return Ok(false);
+        }
+        // Held until all is removed: whoever starts waits for it.
+        let Some(_presence) = self.lock_presence(run).map_err(told)? else {
+            // Its folder lies in another place of that name; this one was made here.
+            let _ = fs::remove_dir(&path);
+            return Ok(false);
+        };
         self.remove(run);
         if path.exists() {
             return Err(format!("{}: not all of it could be removed", path.display()));
@@ -113,7 +131,15 @@ impl Machine {
         Ok(true)
     }
 
-    /// Removes everything of `run`. For who holds the lock of its folder alone.
+    /// The lock of a run's presence in shared memory, had alone; `None` when a process of the run lives.
+    fn lock_presence(&self, run: RunId) -> io::Result<Option<File>> {
+        let path = self.presence_file(run);
+        let presence = open_private(&path)?;
+        let is_alone = presence.try_lock().is_ok() && is_still_at(&presence, &path)?;
+        Ok(is_alone.then_some(presence))
+    }
+
+    /// Removes everything of `run`. For who holds the locks of its folder and its presence alone.
     pub(super) fn remove(&self, run: RunId) {
         self.remove_lives(run);
         let folder = self.transport_folder(run);
@@ -123,6 +149,8 @@ impl Machine {
             told(&file, fs::remove_file(&file));
         }
         told(&folder, fs::remove_dir(&folder));
+        let presence = self.presence_file(run);
+        told(&presence, fs::remove_file(&presence));
     }
 
     /// Removes all lives of `run`: segments and folders. For who holds the lock of its learner.
@@ -232,6 +260,23 @@ mod tests {
         assert_eq!(machine.sweep().runs, [RUN]);
         assert!(is_empty(machine));
         assert_eq!(machine.sweep(), Swept::default());
+    }
+
+    #[test]
+    fn segments_of_a_run_whose_folder_lies_in_another_place_are_left_alone() {
+        let (machine, directory) = machine();
+        let elsewhere = directory.path().join("elsewhere");
+        fs::create_dir(&elsewhere).unwrap();
+        let other: &'static Machine = Box::leak(Box::new(Machine {
+            folders: elsewhere.to_str().unwrap().to_owned().leak(),
+            segments: machine.segments,
+        }));
+        let living = Presence::enter_on(other, RUN).unwrap();
+        let segment = segment(machine, &format!("{}0123", shared_memory_prefix(RUN)));
+        assert_eq!(machine.sweep(), Swept::default());
+        assert!(segment.exists() && !machine.transport_folder(RUN).exists());
+        drop(living);
+        assert!(is_empty(machine) && is_empty(other));
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! The learner's ends of the services.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use iceoryx2::node::Node;
@@ -35,6 +36,8 @@ pub struct LearnerPorts {
     identity: RunIdentity,
     life: Life,
     dead: Reclaimer,
+    /// What of it lies in shared memory from its start to its end.
+    segments: Vec<PathBuf>,
     layout: SnapshotLayout,
     transitions: Subscriber<Ipc, TransitionRecord, ()>,
     status: Subscriber<Ipc, StatusRecord, ()>,
@@ -59,8 +62,9 @@ impl LearnerPorts {
     /// # Errors
     /// [`JoinError`] says which service and why.
     pub fn open(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, JoinError> {
-        let ports = Self::create(identity, life, config)?;
+        let mut ports = Self::create(identity, life, config)?;
         reserve(identity, life)?;
+        ports.segments = identity.segments(life).collect();
         pass(FaultPoint::LearnerStarted);
         identity.announce(&Announcement::new(identity, life, config))?;
         Ok(ports)
@@ -79,6 +83,7 @@ impl LearnerPorts {
             identity: identity.clone(),
             life,
             dead: Reclaimer::new(identity, life),
+            segments: Vec::new(),
             transitions: open
                 .transitions(config)?
                 .subscriber_builder()
@@ -212,15 +217,19 @@ impl LearnerPorts {
         let present = self
             .identity
             .present_life()
-            .map_err(failed("all", "looking at the folder"))?;
-        if present.is_some_and(|found| found.life == self.life) && self.identity.life_folder(self.life).is_dir() {
-            return Ok(());
-        }
+            .map_err(failed("all", "looking at what actors need"))?;
+        let folder = self.identity.life_folder(self.life);
+        let is_announced = present.is_some_and(|found| found.life == self.life);
+        let gone = match self.segments.iter().find(|segment| !segment.exists()) {
+            Some(segment) => segment,
+            None if !is_announced || !folder.is_dir() => &self.identity.transport_folder(),
+            None => return Ok(()),
+        };
         Err(ServiceError {
             service: "all",
-            operation: "looking at the folder",
-            cause: format!("what was in {} is gone", self.identity.transport_folder().display()),
-            remedy: "; leave it alone while the run is under way",
+            operation: "looking at what actors need",
+            cause: format!("{} was removed, or what was in it", gone.display()),
+            remedy: "; leave what is called skein alone in /tmp and /dev/shm while a run is under way",
         })
     }
 }

@@ -43,6 +43,9 @@ pub enum CourseError {
     },
 }
 
+/// Bytes of a course file: far more than the walls of any course take.
+const LONGEST: u64 = 1 << 20;
+
 impl Course {
     /// Reads a course file.
     ///
@@ -50,10 +53,19 @@ impl Course {
     /// [`CourseError`] names the file, the wall and the key, and says what to change.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, CourseError> {
         let path = path.as_ref();
-        let text = std::fs::read_to_string(path).map_err(|source| CourseError::Read {
-            path: path.to_owned(),
-            source,
-        })?;
+        let is_a_file = std::fs::metadata(path).and_then(|about| match about.is_file() && about.len() <= LONGEST {
+            true => Ok(()),
+            // Of a pipe or a device, the end might never come.
+            false => Err(std::io::Error::other(format!(
+                "is no text file of at most {LONGEST} bytes"
+            ))),
+        });
+        let text = is_a_file
+            .and_then(|()| std::fs::read_to_string(path))
+            .map_err(|source| CourseError::Read {
+                path: path.to_owned(),
+                source,
+            })?;
         Self::parse(&text, path)
     }
 
