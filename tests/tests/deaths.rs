@@ -103,11 +103,11 @@ fn checkpoints(run: &Running) -> Vec<PathBuf> {
 }
 
 /// Lets `remove` take something of the transport from under a run.
-fn goes_on_without(remove: impl Fn(&RunIdentity)) {
+fn goes_on_without(remove: impl Fn(&Running, &RunIdentity)) {
     let calm = calm();
     let mut run = recipe().start();
     run.until_flights(30);
-    remove(&run.directory().open().unwrap().0);
+    remove(&run, &run.directory().open().unwrap().0);
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
     assert!(disturbed.summary().resumes > 0, "{:?}", disturbed.summary());
@@ -120,12 +120,12 @@ fn goes_on_without(remove: impl Fn(&RunIdentity)) {
 
 #[test]
 fn a_run_whose_folder_is_removed_makes_another() {
-    goes_on_without(|identity| fs::remove_dir_all(identity.transport_folder()).unwrap());
+    goes_on_without(|_, identity| fs::remove_dir_all(identity.transport_folder()).unwrap());
 }
 
 #[test]
 fn a_run_whose_shared_memory_is_removed_makes_another() {
-    goes_on_without(|identity| {
+    goes_on_without(|run, identity| {
         let prefix = format!("skein_{:016x}_", identity.run.0);
         for entry in fs::read_dir("/dev/shm").unwrap() {
             let entry = entry.unwrap();
@@ -134,6 +134,10 @@ fn a_run_whose_shared_memory_is_removed_makes_another() {
                 let _ = fs::remove_file(entry.path());
             }
         }
+        // Who has mapped it goes on with it; who comes then finds nothing.
+        run.processes(Role::Actor)
+            .iter()
+            .for_each(|actor| actor.signal(Signal::KILL));
     });
 }
 

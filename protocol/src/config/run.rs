@@ -107,7 +107,7 @@ impl From<Device> for String {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CheckpointSection {
-    /// Training flights between two checkpoints; one more is written at the end. Default 500.
+    /// Training flights between two checkpoints; one more is written at the end. Default 100.
     pub every_flights: u64,
     /// Checkpoints kept; older ones are removed. Default 2.
     pub keep: usize,
@@ -116,7 +116,7 @@ pub struct CheckpointSection {
 impl Default for CheckpointSection {
     fn default() -> Self {
         Self {
-            every_flights: 500,
+            every_flights: 100,
             keep: 2,
         }
     }
