@@ -114,7 +114,10 @@ fn main() -> ExitCode {
         Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
         Err(error) => {
             eprintln!("skein: {}", with_causes(error.as_ref()));
-            if let Some(Unfinished { run, .. }) = error.downcast_ref() {
+            // What keeps a learner from starting would keep it from going on, too.
+            if let Some(Unfinished { run, source }) = error.downcast_ref()
+                && !source.tells_all()
+            {
                 tell_how_to_go_on(run);
             }
             ExitCode::FAILURE
@@ -197,6 +200,13 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         None => ended,
     };
     if ended == Ended::Interrupted {
+        if Summary::of(run).is_none() {
+            let newest = run.newest_checkpoint();
+            let kept = newest.map_or("there is no checkpoint yet".to_owned(), |flights| {
+                format!("the newest checkpoint is of flight {flights}")
+            });
+            eprintln!("skein: stopped at once: {kept}");
+        }
         tell_how_to_go_on(run);
     }
     Ok(ended)
@@ -264,7 +274,10 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let (_, config) = run.open()?;
     // Between two lives of its learner, a run is under way as long as somebody sees to it that there will be another.
     if !run.is_under_way()? {
-        bail!("the run in {} is not under way on this machine", run.root().display());
+        let root = run.root().display();
+        bail!(
+            "the run in {root} is not under way on this machine; one that is not complete is gone on with by launch/run_local.sh --resume {root}"
+        );
     }
     umask(Mode::RWXG | Mode::RWXO);
     check_shared_memory_for_more(&config, arguments.count as usize)?;

@@ -30,7 +30,9 @@ pub enum ResumeError {
     },
     /// All of it is done.
     #[error(
-        "the run in {} is complete, all {flights} flights of it: there is nothing to go on with; start a new one for more. `skein report --run` draws its plots again, launch/evaluate.sh flies its best snapshot again",
+        "the run in {} is complete, all {flights} flights of it: there is nothing to go on with; start a new one for more. target/release/skein report --run {} draws its plots again, launch/evaluate.sh --run {} flies its best snapshot again",
+        directory.display(),
+        directory.display(),
         directory.display()
     )]
     Complete {
@@ -76,7 +78,7 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
         directory: directory.to_owned(),
         missing: missing.to_owned(),
     };
-    let run = RunDirectory::new(directory.canonicalize().map_err(|_| not_a_run(directory))?);
+    let run = RunDirectory::new(directory.canonicalize().map_err(|_| not_a_run(Path::new("run.json")))?);
     if !run.identity().is_file() {
         return Err(not_a_run(Path::new("run.json")));
     }

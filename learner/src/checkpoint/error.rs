@@ -73,7 +73,7 @@ pub enum CheckpointError {
     },
     /// There are checkpoints, but none can be used.
     #[error(
-        "none of the {count} checkpoints in {} can be used; to train anew from the first flight, remove that folder and flights.csv. The newest: {newest}", directory.display()
+        "none of the {count} checkpoints in {} can be used. The newest: {newest}. Mend that; or, to train anew from the first flight, remove that folder and flights.csv", directory.display()
     )]
     NoneUsable {
         /// Where they lie.

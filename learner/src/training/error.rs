@@ -58,7 +58,7 @@ pub enum TrainingError {
     },
     /// There is no checkpoint where there must have been one.
     #[error(
-        "{} has {rows} flights, and yet there is no checkpoint in {}, where the first is written after {first_after} flights: put the checkpoints back; or, to train anew from the first flight, remove flights.csv", flights_csv.display(), checkpoints.display()
+        "{} has {rows} flights, and yet there is no checkpoint in {}, or no such folder; one is written each {first_after} flights: put the checkpoints back; or, to train anew from the first flight, remove flights.csv", flights_csv.display(), checkpoints.display()
     )]
     CheckpointsLost {
         flights_csv: PathBuf,

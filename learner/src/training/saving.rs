@@ -46,7 +46,7 @@ impl<'a> Training<'a> {
             })
         };
         let newest = store.load_newest(fits, |error| {
-            tell(&format!("a checkpoint is damaged and not used: {error}"));
+            tell(&format!("a checkpoint is not used: {error}"));
         })?;
         let (saved, snapshots) = match newest {
             Some(checkpoint) => {
@@ -67,6 +67,9 @@ impl<'a> Training<'a> {
         let resumes = disk
             .with_room(&lives, || begin_life(&lives, saved.flights))
             .map_err(file_error(&lives))?;
+        if resumes > 0 && saved.flights == 0 {
+            tell("there is no checkpoint yet: beginning from the first flight");
+        }
         let metrics = resume_metrics(directory, &saved, &disk)?;
         let mut training = Self {
             config,
@@ -290,9 +293,6 @@ fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<
             checkpoints,
             first_after,
         });
-    }
-    if rows > 0 {
-        tell("there is no checkpoint yet: beginning anew");
     }
     Ok(())
 }

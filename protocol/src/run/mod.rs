@@ -256,7 +256,7 @@ pub enum RunError {
         found: u32,
     },
     /// The configuration is not the one the run was started with.
-    #[error("{} was changed since the run was started (there): {differences}; change it back, or start a new run for another configuration", path.display())]
+    #[error("{} was changed since the run was started (\"there\" is as it was started, \"here\" as it is now): {differences}; change it back, or start a new run for another configuration", path.display())]
     ConfigChanged {
         /// The configuration file.
         path: PathBuf,
