@@ -5,7 +5,8 @@
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_protocol::config::Config;
+use skein_kernels::{Isa, Team};
+use skein_protocol::config::{Config, Engine};
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
@@ -20,7 +21,7 @@ use crate::flight::CommittedFlight;
 use crate::flights::assembly::Keep;
 use crate::noise::Noise;
 use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
-use crate::sac::{Batch, Columns, Sac, SacMetrics};
+use crate::sac::{Columns, Sac, SacMetrics};
 use crate::state::{self, NamedTensor, Stateful};
 use crate::vae::{Vae, VaeMetrics, images_from_bytes};
 
@@ -53,7 +54,8 @@ pub enum TrainerRestoreError {
 pub struct Trainer {
     config: Config,
     layout: SnapshotLayout,
-    device: Device,
+    /// Threads of the native engine.
+    team: Team,
     vae: Vae,
     sac: Sac,
     replay: Replay,
@@ -61,18 +63,30 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Untrained networks and an empty buffer. Sets the calling thread's tensor threads: training belongs on this thread.
+    /// Untrained networks and an empty buffer. Starts the native engine's threads, and sets the calling thread's tensor threads: training belongs on this thread.
     ///
     /// # Errors
     /// [`DeviceError`] when the configured device does not exist.
     pub fn new(config: &Config) -> Result<Self, DeviceError> {
         device::use_threads(config.run.learner_threads);
         let device = device::open(config.run.device)?;
+        let engine = config.run.engine();
+        let (isa, threads) = (Isa::best(), config.run.learner_threads);
+        tracing::info!(%engine, device = %config.run.device, %isa, threads, "networks are computed");
         Ok(Self {
             layout: SnapshotLayout::of(config),
-            device,
+            team: Team::new(match engine {
+                Engine::Native => threads,
+                Engine::Libtorch => 1,
+            }),
             vae: Vae::new(&config.vae, config.run.seed, device),
-            sac: Sac::new(&config.sac, config.learning.observation, config.run.seed, device),
+            sac: Sac::new(
+                &config.sac,
+                config.learning.observation,
+                config.run.seed,
+                engine,
+                device,
+            ),
             replay: Replay::new(config),
             steps: 0,
             config: config.clone(),
@@ -221,9 +235,7 @@ impl Trainer {
         let mut means = Means::default();
         while self.sac.updates() < due {
             self.replay.sample(&mut rng, self.config.sac.batch_size, &mut minibatch);
-            let metrics = self
-                .sac
-                .update(&Batch::new(columns(&minibatch), self.device), &mut noise)?;
+            let metrics = self.sac.update(&mut self.team, columns(&minibatch), &mut noise)?;
             means.add(&metrics);
             after_each(&metrics)?;
         }
