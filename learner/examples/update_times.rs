@@ -1,6 +1,6 @@
 //! Prints how long a VAE step and a SAC update take on this machine, the latter on both engines and as a share of what the processor can do at most.
 //!
-//! `cargo run --release -p skein-learner --example update_times -- [THREADS]`
+//! `cargo run --release -p skein-learner --example update_times -- [THREADS] [WHAT]`, where WHAT is a part of the names of what is to be timed.
 
 use std::time::Instant;
 
@@ -44,6 +44,7 @@ fn main() {
             sac.update(&mut team, columns, &mut sac_noise)
                 .expect("random rewards are finite");
         });
+        let Some(secs) = secs else { continue };
         let operations = update_operations(rows, observation.len(), section.hidden_width);
         println!(
             "  {:.1} MFLOP, {:.1} GFLOP/s: {:.1} % of {threads} cores",
@@ -85,8 +86,12 @@ fn update_operations(rows: usize, observation: usize, width: usize) -> f64 {
     (2 * rows * (forward + gradients + back)) as f64
 }
 
-/// Runs `work` a few times to warm up, then `repetitions` times; prints and returns the median, in seconds, which a busy machine disturbs least.
-fn report(what: &str, batch: usize, repetitions: usize, mut work: impl FnMut()) -> f64 {
+/// Runs `work` a few times to warm up, then `repetitions` times; prints and returns the median, in seconds, which a busy machine disturbs least. `None` when
+/// it was not asked for.
+fn report(what: &str, batch: usize, repetitions: usize, mut work: impl FnMut()) -> Option<f64> {
+    if std::env::args().nth(2).is_some_and(|asked| !what.contains(&asked)) {
+        return None;
+    }
     let mut millis: Vec<f64> = (0..repetitions + repetitions / 5)
         .map(|_| {
             let start = Instant::now();
@@ -101,5 +106,5 @@ fn report(what: &str, batch: usize, repetitions: usize, mut work: impl FnMut()) 
         millis[repetitions / 2],
         millis[0]
     );
-    millis[repetitions / 2] / 1e3
+    Some(millis[repetitions / 2] / 1e3)
 }
