@@ -141,7 +141,7 @@ mod tests {
             "version 42",
             "training",
             "Completed after 1:15: 100 flights, 2000 steps",
-            "│ actors              ┆ encoder ┆  2000 ┆ 1.50 s ┆ 750.00 µs ┆ 100.0 % │",
+            "│ actors, together    ┆ encoder ┆  2000 ┆ 1.50 s ┆ 750.00 µs ┆ 100.0 % │",
             "summary.json",
         ] {
             assert!(text.contains(part), "`{part}` is missing in\n{text}");

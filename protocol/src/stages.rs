@@ -35,7 +35,7 @@ impl Thread {
 
     const fn title(self) -> &'static str {
         match self {
-            Self::Actors => "actors",
+            Self::Actors => "actors, together",
             Self::Receiving => "learner: receiving",
             Self::Training => "learner: training",
         }
@@ -357,7 +357,10 @@ mod tests {
 
     #[test]
     fn a_thread_names_each_of_its_stages_once_and_threads_do_not_mix() {
-        let names: HashSet<_> = Stage::ALL.iter().map(|stage| (stage.thread().name(), stage.name())).collect();
+        let names: HashSet<_> = Stage::ALL
+            .iter()
+            .map(|stage| (stage.thread().name(), stage.name()))
+            .collect();
         assert_eq!(names.len(), STAGES);
         let of_actors = Stage::ALL.iter().filter(|stage| stage.thread() == Thread::Actors);
         assert_eq!(of_actors.count(), ACTOR_STAGES);
@@ -387,7 +390,12 @@ mod tests {
         let (all, none) = (sample(), Times::default());
         assert_eq!(all.plus(&all).since(&all), all);
         assert_eq!(none.since(&all), none);
-        let endless = Times([Tally { count: u64::MAX, nanos: u64::MAX }; STAGES]);
+        let endless = Times(
+            [Tally {
+                count: u64::MAX,
+                nanos: u64::MAX,
+            }; STAGES],
+        );
         assert_eq!(endless.plus(&all), endless);
         assert_eq!(endless.total_nanos(Thread::Training), u64::MAX);
     }
@@ -413,7 +421,10 @@ mod tests {
         ];
         let times: Times = serde_json::from_str(&format!("[{}]", rows.join(","))).unwrap();
         assert_eq!(times.of(Stage::Physics), Tally { count: 1, nanos: 0 });
-        let most = Tally { count: u64::MAX, nanos: u64::MAX };
+        let most = Tally {
+            count: u64::MAX,
+            nanos: u64::MAX,
+        };
         assert_eq!(times.of(Stage::Camera), most);
         assert_eq!(times.occurred().count(), 2);
         assert!(times.to_string().contains("100.0 %"));

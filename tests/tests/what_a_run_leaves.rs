@@ -104,7 +104,10 @@ fn the_stages_agree_with_the_counts(run: &Ended) {
     let (flights, steps) = (count(Stage::TakeOff), count(Stage::Physics));
     let flown = summary.flights + summary.evaluation_flights;
     // The last flight's end may not have been heard of yet.
-    assert!((flown - 1..=flown).contains(&flights), "{flights} flights of {summary:?}");
+    assert!(
+        (flown - 1..=flown).contains(&flights),
+        "{flights} flights of {summary:?}"
+    );
     // Those that confirmed the best snapshot were flown besides.
     assert!(steps > summary.steps + evaluation_steps, "{steps} steps of {summary:?}");
     assert_eq!(count(Stage::Policy), steps);
@@ -114,15 +117,27 @@ fn the_stages_agree_with_the_counts(run: &Ended) {
     assert_eq!(count(Stage::TakeIn), summary.flights);
     assert_eq!(count(Stage::Evaluate), summary.evaluation_flights);
     assert_eq!([Stage::Sample, Stage::SacUpdate].map(count), [summary.updates; 2]);
-    assert_eq!([Stage::SampleImages, Stage::VaeStep].map(count), [summary.vae_updates; 2]);
+    assert_eq!(
+        [Stage::SampleImages, Stage::VaeStep].map(count),
+        [summary.vae_updates; 2]
+    );
     // One for the parameters it began with.
     assert_eq!(count(Stage::Publish), summary.final_version.0 + 1);
     assert_eq!(count(Stage::Recode), 1);
     let (training, receiving) = (secs(Thread::Training), secs(Thread::Receiving));
-    assert!((summary.wall_secs - training).abs() < 0.1, "{training} s of {summary:?}");
-    assert!(receiving > 0.5 * training && receiving <= summary.wall_secs, "{receiving} s of {summary:?}");
+    assert!(
+        (summary.wall_secs - training).abs() < 0.1,
+        "{training} s of {summary:?}"
+    );
+    assert!(
+        receiving > 0.5 * training && receiving <= summary.wall_secs,
+        "{receiving} s of {summary:?}"
+    );
     let actors = secs(Thread::Actors);
-    assert!(actors > 0.5 * training && actors <= 2.0 * summary.wall_secs, "{actors} s of {summary:?}");
+    assert!(
+        actors > 0.5 * training && actors <= 2.0 * summary.wall_secs,
+        "{actors} s of {summary:?}"
+    );
 }
 
 fn the_snapshots_are_those_of_the_summary(run: &Ended) {

@@ -168,7 +168,9 @@ impl Desk {
         match status.state {
             ActorState::Leaving => {
                 if known == Some(status.incarnation) {
-                    self.actors.entry(status.actor).and_modify(|actor| actor.times = status.times);
+                    self.actors
+                        .entry(status.actor)
+                        .and_modify(|actor| actor.times = status.times);
                     self.dismiss(status.actor, Reissue::Left);
                 }
             }

@@ -60,9 +60,7 @@ impl Cost {
             })
         };
         let all: f64 = median_of(&self.with, |summary| summary.thread_cpu_secs.values().sum());
-        let waits = median_of(&self.with, |summary| {
-            summary.stages.of(Stage::Checkpoint).secs()
-        });
+        let waits = median_of(&self.with, |summary| summary.stages.of(Stage::Checkpoint).secs());
         let receives = cpu("reception") / all;
         println!("Cost, medians of {} trainings each, seconds:", self.with.len());
         println!(
