@@ -9,6 +9,7 @@ use skein_protocol::config::Config;
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::Exploration;
 use skein_protocol::{IMAGE_PIXELS, LATENT};
 use tch::{Device, Kind, TchError, Tensor};
@@ -173,13 +174,15 @@ impl Trainer {
         self.replay.insert(flight)
     }
 
-    /// Trains the VAE as far as the steps flown ask for, and freezes it when its time is over. `after_each` may do something between steps, and give up.
+    /// Trains the VAE as far as the steps flown ask for, and freezes it when its time is over. `after_each` may do something between steps, and give up;
+    /// `timer` is told what the time went into.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
     pub fn train_vae<E: From<UpdateError>>(
         &mut self,
         epoch: Epoch,
+        timer: &mut LapTimer,
         mut after_each: impl FnMut(&VaeMetrics) -> Result<(), E>,
     ) -> Result<Option<VaeMetrics>, E> {
         if self.vae_is_frozen() {
@@ -194,12 +197,16 @@ impl Trainer {
         while self.vae.updates() < due {
             self.replay
                 .sample_images(&mut rng, self.config.vae.batch_size, &mut images);
-            let metrics = self.vae.update(&images_from_bytes(&images), &mut noise)?;
+            let batch = images_from_bytes(&images);
+            timer.lap(Stage::SampleImages, 1);
+            let metrics = self.vae.update(&batch, &mut noise)?;
+            timer.lap(Stage::VaeStep, 1);
             after_each(&metrics)?;
             last = Some(metrics);
         }
         if self.steps >= self.config.vae.train_steps as u64 {
             self.freeze_vae();
+            timer.lap(Stage::Recode, 1);
         }
         Ok(last)
     }
@@ -213,13 +220,14 @@ impl Trainer {
     }
 
     /// Does the SAC updates that the steps flown since the warm-up ask for; returns the means of their metrics. `after_each` may do something
-    /// between updates, and give up.
+    /// between updates, and give up; `timer` is told what the time went into.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
     pub fn train_policy<E: From<UpdateError>>(
         &mut self,
         epoch: Epoch,
+        timer: &mut LapTimer,
         mut after_each: impl FnMut(&SacMetrics) -> Result<(), E>,
     ) -> Result<Option<SacMetrics>, E> {
         let learning = &self.config.learning;
@@ -231,9 +239,10 @@ impl Trainer {
         let mut means = Means::default();
         while self.sac.updates() < due {
             self.replay.sample(&mut rng, self.config.sac.batch_size, &mut minibatch);
-            let metrics = self
-                .sac
-                .update(&Batch::new(columns(&minibatch), self.device), &mut noise)?;
+            let batch = Batch::new(columns(&minibatch), self.device);
+            timer.lap(Stage::Sample, 1);
+            let metrics = self.sac.update(&batch, &mut noise)?;
+            timer.lap(Stage::SacUpdate, 1);
             means.add(&metrics);
             after_each(&metrics)?;
         }

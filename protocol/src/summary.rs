@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::durable;
 use crate::ids::{PolicyVersion, RunId};
 use crate::run::RunDirectory;
+use crate::stages::Times;
 
 /// What a run came to.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -54,8 +55,10 @@ pub struct Summary {
     pub resumes: u64,
     /// Seconds from the learner's start to its end, over all its lives; what a death undid is not counted.
     pub wall_secs: f64,
-    /// Seconds of the learner's main thread by what it did, as far as `wall_secs`.
-    pub phase_secs: BTreeMap<String, f64>,
+    /// What the time of actors and learner went into, as far as `wall_secs`. An actor that was killed has told of it until its last heartbeat or the end of
+    /// its last flight, whichever was later.
+    #[serde(default)]
+    pub stages: Times,
     /// Seconds of processor time in the learner's last life by those of its threads that lived until its end; `reception` receives and assembles flights.
     #[serde(default)]
     pub thread_cpu_secs: BTreeMap<String, f64>,
@@ -89,7 +92,10 @@ pub enum Ending {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
+    use crate::stages::Stage;
 
     #[test]
     fn a_saved_summary_is_loaded_and_a_damaged_one_is_no_summary() {
@@ -97,6 +103,8 @@ mod tests {
         let run = RunDirectory::new(directory.path());
         let path = run.summary_json();
         assert_eq!(Summary::of(&run), None);
+        let mut stages = Times::default();
+        stages.add(Stage::Publish, 3, Duration::from_millis(500));
         let summary = Summary {
             skein_version: "0.1.0".to_owned(),
             run: RunId(3),
@@ -117,12 +125,23 @@ mod tests {
             refused_by_reason: BTreeMap::new(),
             resumes: 2,
             wall_secs: 1.5,
-            phase_secs: BTreeMap::from([("publish".to_owned(), 0.5)]),
+            stages,
             thread_cpu_secs: BTreeMap::from([("reception".to_owned(), 0.25)]),
         };
         summary.save(&path).unwrap();
         assert_eq!(Summary::of(&run), Some(summary));
         std::fs::write(&path, "{").unwrap();
         assert_eq!(Summary::of(&run), None);
+    }
+
+    #[test]
+    fn a_summary_from_before_there_were_stages_is_read() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let old = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"ab","final_version":80,"best_version":70,
+            "best_confirmed_walls_passed":4.9,"flights":800,"steps":42837,"updates":20418,"vae_updates":400,"evaluation_flights":400,
+            "tickets_reissued":0,"records_refused":0,"wall_secs":333.3,"phase_secs":{"publish":12.5}}"#;
+        std::fs::write(run.summary_json(), old).unwrap();
+        assert_eq!(Summary::of(&run).unwrap().stages, Times::default());
     }
 }

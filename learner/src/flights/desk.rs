@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use skein_protocol::config::TransportSection;
 use skein_protocol::ids::{ActorId, Attempt, Epoch, FlightId, Incarnation, RunId};
+use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus};
 use skein_protocol::ticket::{ControlRecord, Ticket};
 use skein_protocol::transition::{RecordFault, TransitionRecord};
@@ -58,6 +59,8 @@ pub struct Desk {
     actors: BTreeMap<ActorId, Actor>,
     failures: Failures,
     faults: Faults,
+    /// What the time of actors that are gone went into.
+    times_of_the_gone: Times,
     /// What is to be said to actors besides their tickets.
     letters: Vec<ControlRecord>,
 }
@@ -70,9 +73,16 @@ struct Actor {
     tickets: VecDeque<Issued>,
     /// Flights it has spoiled since the last one that was committed.
     spoiled: u32,
+    /// What its time had gone into when it was first heard of: an actor that was taken for dead and is not is not counted twice.
+    first_times: Times,
+    times: Times,
 }
 
 impl Actor {
+    fn times_since_it_came(&self) -> Times {
+        self.times.since(&self.first_times)
+    }
+
     fn is_trusted(&self) -> bool {
         self.spoiled < MOST_SPOILED
     }
@@ -95,6 +105,7 @@ impl Desk {
             actors: BTreeMap::new(),
             failures: Failures::default(),
             faults: Faults::default(),
+            times_of_the_gone: Times::default(),
             letters: Vec::new(),
         }
     }
@@ -107,6 +118,12 @@ impl Desk {
     /// What went wrong so far.
     pub fn faults(&self) -> Faults {
         self.faults
+    }
+
+    /// What the time of all actors went into, as far as they have told.
+    pub fn actor_times(&self) -> Times {
+        let living = self.actors.values().map(Actor::times_since_it_came);
+        living.fold(self.times_of_the_gone, |sum, times| sum.plus(&times))
     }
 
     /// Counts a sign of life that makes no sense.
@@ -151,6 +168,9 @@ impl Desk {
         match status.state {
             ActorState::Leaving => {
                 if known == Some(status.incarnation) {
+                    self.actors
+                        .entry(status.actor)
+                        .and_modify(|actor| actor.times = status.times);
                     self.dismiss(status.actor, Reissue::Left);
                 }
             }
@@ -174,9 +194,12 @@ impl Desk {
                         last_sign: now,
                         tickets: VecDeque::new(),
                         spoiled: 0,
+                        first_times: status.times,
+                        times: status.times,
                     }
                 });
                 actor.last_sign = now;
+                actor.times = status.times;
             }
         }
     }
@@ -348,7 +371,8 @@ impl Desk {
         while self.actors.get(&id).is_some_and(|actor| !actor.tickets.is_empty()) {
             self.reissue_last(id, why);
         }
-        if self.actors.remove(&id).is_some() {
+        if let Some(actor) = self.actors.remove(&id) {
+            self.times_of_the_gone = self.times_of_the_gone.plus(&actor.times_since_it_came());
             tracing::info!(actor = %id, "actor {}", why.name());
         }
     }

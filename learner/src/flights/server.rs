@@ -15,6 +15,7 @@ use skein_protocol::ids::RunId;
 use skein_protocol::run::RunIdentity;
 use skein_protocol::services::{LearnerPorts, ServiceError};
 use skein_protocol::snapshot::Snapshot;
+use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::ControlRecord;
 
 use super::desk::{Desk, HopelessFlight, Order, Place};
@@ -39,6 +40,7 @@ pub(super) struct Server {
     heartbeat: Duration,
     last_heartbeat: Option<Instant>,
     trouble: Trouble,
+    timer: LapTimer,
 }
 
 /// Flights of one batch that wait for an earlier one.
@@ -85,6 +87,7 @@ impl Server {
             heartbeat: config.transport.heartbeat(),
             last_heartbeat: None,
             trouble: Trouble::default(),
+            timer: LapTimer::start(),
         }
     }
 
@@ -103,13 +106,15 @@ impl Server {
                 Wish::Vanish => return Ok(()),
             }
             let now = Instant::now();
-            self.take_status(now);
+            self.take_status(now, shared);
+            self.timer.lap(Stage::HandOut, 0);
             let next = self.take_records(now)?;
             self.desk.on_time(now);
             self.hand_out(now);
             self.give_sign_of_life(now, shared);
             self.send_out();
             shared.update(&self.desk);
+            self.timer.lap(Stage::HandOut, 1);
             if let Some(error) = self.trouble.lasting(now) {
                 return Err(ReceptionError::Transport(error));
             }
@@ -154,8 +159,10 @@ impl Server {
         }
     }
 
-    fn take_status(&mut self, now: Instant) {
+    fn take_status(&mut self, now: Instant, shared: &Shared) {
+        let mut heard = false;
         while let Some(record) = self.trouble.unless(self.ports.receive_status()).flatten() {
+            heard = true;
             match record.read(self.run) {
                 Some(status) => self.desk.on_status(&status, now),
                 None => {
@@ -164,21 +171,35 @@ impl Server {
                 }
             }
         }
+        if heard {
+            self.tell_times(shared);
+        }
+    }
+
+    fn tell_times(&self, shared: &Shared) {
+        shared.update_times(self.desk.actor_times().plus(self.timer.times()));
     }
 
     /// Takes records in.
     fn take_records(&mut self, now: Instant) -> Result<Next, HopelessFlight> {
+        let mut unbooked = 0;
+        let mut next = Next::AtOnce;
         for _ in 0..RECORDS_AT_ONCE {
             let Some(record) = self.trouble.unless(self.ports.receive_transition()).flatten() else {
-                return Ok(Next::Wait);
+                next = Next::Wait;
+                break;
             };
+            unbooked += 1;
             if let Some((place, flight)) = self.desk.on_record(&record, now)? {
                 self.deliver(place, flight);
+                self.timer.lap(Stage::Assemble, std::mem::take(&mut unbooked));
                 self.hand_out(now);
                 self.send_out();
+                self.timer.lap(Stage::HandOut, 0);
             }
         }
-        Ok(Next::AtOnce)
+        self.timer.lap(Stage::Assemble, unbooked);
+        Ok(next)
     }
 
     /// Passes on what is next in its batch, and keeps what is early.
@@ -228,6 +249,7 @@ impl Server {
         }
         self.last_heartbeat = Some(now);
         shared.update_situation(self.desk.situation(now), now);
+        self.tell_times(shared);
         self.trouble.unless(self.ports.maintain());
         let heartbeat = ControlRecord::heartbeat(self.run);
         self.trouble.unless(self.ports.send_control(heartbeat));
@@ -242,6 +264,7 @@ impl Server {
         if self.trouble.unless(self.ports.wait(patience)).is_none() {
             sleep(RETRY_INTERVAL);
         }
+        self.timer.lap(Stage::ReceivingIdle, 1);
     }
 
     fn say_stop(&mut self) {

@@ -1,11 +1,11 @@
 //! Evaluation flights in a run: those that confirm a candidate for the best snapshot, and those that show in the end what it can do.
 
 use std::ops::Range;
-use std::time::Instant;
 
 use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::Phase;
+use skein_protocol::stages::Stage;
 
 use super::{Training, TrainingError};
 use crate::best::{is_better, is_candidate};
@@ -77,7 +77,7 @@ impl Training<'_> {
         flights: u64,
         keep: Keep,
     ) -> Result<Vec<CommittedFlight>, TrainingError> {
-        let started = Instant::now();
+        self.timer.lap(Stage::OtherTraining, 0);
         let (run, number) = (self.identity.run, self.progress.evaluations);
         let tickets = curriculum::evaluation(self.config, run, number, version, courses, flights);
         let total = tickets.len() as u64;
@@ -93,7 +93,7 @@ impl Training<'_> {
         }
         self.progress.evaluations += 1;
         self.progress.evaluation_flights += total;
-        self.progress.spent.add("evaluation", started);
+        self.timer.lap(Stage::Evaluate, total);
         Ok(flown)
     }
 
