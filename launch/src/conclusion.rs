@@ -7,7 +7,7 @@ use serde::de::DeserializeOwned;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::stages::Times;
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::summary::{Ending, Summary, Trained};
 
 use crate::display::Clock;
 
@@ -24,6 +24,9 @@ pub fn conclusion(run: &RunDirectory) -> String {
         );
     }
     if let Some(summary) = Summary::of(run) {
+        if let Some(trained) = &summary.trained {
+            push(&mut text, &trained_sentence(trained));
+        }
         push(&mut text, &sentence(&summary));
         if summary.stages != Times::default() {
             push(&mut text, &format!("{}\n", summary.stages));
@@ -43,6 +46,17 @@ fn push(text: &mut String, line: &str) {
 
 fn read<T: DeserializeOwned>(path: &Path) -> Option<T> {
     serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+}
+
+fn trained_sentence(trained: &Trained) -> String {
+    format!(
+        "Trained after {}: R {:.3} in evaluation flights after {} flights, {} steps, {} updates.",
+        Clock(trained.wall_secs),
+        trained.rate,
+        trained.flights,
+        trained.steps,
+        trained.updates
+    )
 }
 
 fn sentence(summary: &Summary) -> String {
@@ -120,6 +134,13 @@ mod tests {
             final_version: PolicyVersion(50),
             best_version: None,
             best_confirmed_walls_passed: None,
+            trained: Some(Trained {
+                rate: 0.93,
+                flights: 90,
+                steps: 1800,
+                updates: 270,
+                wall_secs: 61.0,
+            }),
             flights: 100,
             steps: 2000,
             updates: 300,
@@ -140,6 +161,7 @@ mod tests {
         for part in [
             "version 42",
             "training",
+            "Trained after 1:01: R 0.930 in evaluation flights after 90 flights, 1800 steps",
             "Completed after 1:15: 100 flights, 2000 steps",
             "│ actors, together    ┆ encoder ┆  2000 ┆ 1.50 s ┆ 750.00 µs ┆ 100.0 % │",
             "summary.json",

@@ -30,6 +30,9 @@ pub struct Summary {
     pub best_version: Option<PolicyVersion>,
     /// Walls passed in the best snapshot's confirmation flights, on average.
     pub best_confirmed_walls_passed: Option<f64>,
+    /// When a candidate for the best snapshot first passed the share `evaluation.trained_rate` of walls, if one did.
+    #[serde(default)]
+    pub trained: Option<Trained>,
     /// Training flights committed.
     pub flights: u64,
     /// Environment steps of training flights.
@@ -80,6 +83,21 @@ impl Summary {
     }
 }
 
+/// When a policy first did what it was trained for: what is behind it then.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Trained {
+    /// Share R of walls passed in its evaluation flights, without exploration noise, from the start of level 1.
+    pub rate: f64,
+    /// Training flights committed.
+    pub flights: u64,
+    /// Environment steps of training flights.
+    pub steps: u64,
+    /// SAC updates.
+    pub updates: u64,
+    /// Seconds from the learner's start until its evaluation flights were flown, over all lives; what a death undid is not counted.
+    pub wall_secs: f64,
+}
+
 /// How a run ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -114,6 +132,13 @@ mod tests {
             final_version: PolicyVersion(4),
             best_version: None,
             best_confirmed_walls_passed: None,
+            trained: Some(Trained {
+                rate: 0.95,
+                flights: 30,
+                steps: 300,
+                updates: 15,
+                wall_secs: 1.25,
+            }),
             flights: 40,
             steps: 400,
             updates: 20,

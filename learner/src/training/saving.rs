@@ -366,6 +366,7 @@ fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &P
         final_version: progress.version(),
         best_version: best.map(|best| PolicyVersion(best.policy_version)),
         best_confirmed_walls_passed: best.map(|best| best.confirmed_walls_passed),
+        trained: progress.trained,
         flights: progress.flights,
         steps: progress.environment_steps,
         updates: progress.sac_updates,
