@@ -34,6 +34,8 @@ pub(super) struct LearnerLine<'a> {
     parting: Option<Parting>,
     last_sign: Instant,
     last_said: Instant,
+    /// Whether the learner was told that there is nothing to fly, since there was.
+    has_told_of_waiting: bool,
     pub(super) flights_flown: u64,
 }
 
@@ -73,6 +75,7 @@ impl<'a> LearnerLine<'a> {
             parting: None,
             last_sign: service.last_sign,
             last_said: Instant::now(),
+            has_told_of_waiting: false,
             flights_flown: 0,
         }
     }
@@ -182,11 +185,16 @@ impl<'a> LearnerLine<'a> {
             .position(|queued| self.weights.holds(queued.ticket.policy_version))?;
         let ticket = self.tickets.remove(ready)?.ticket;
         let network = self.weights.network(ticket.policy_version)?;
+        self.has_told_of_waiting = false;
         Some((ticket, network))
     }
 
-    /// Waits for the learner, not longer than until the next sign of life.
-    pub(super) fn wait(&self) {
+    /// Waits for the learner, not longer than until the next sign of life. The learner is told first: it wakes actors only to what one that waits would miss.
+    pub(super) fn wait(&mut self) -> Result<(), ServiceError> {
+        if !self.has_told_of_waiting {
+            self.has_told_of_waiting = true;
+            self.report(ActorState::Serving)?;
+        }
         if let Err(error) = self
             .ports
             .wait(self.limits.heartbeat.saturating_sub(self.last_said.elapsed()))
@@ -195,6 +203,7 @@ impl<'a> LearnerLine<'a> {
             debug!(%error, "cannot wait for the learner");
             std::thread::sleep(Duration::from_millis(10));
         }
+        Ok(())
     }
 
     pub(super) fn report(&mut self, state: ActorState) -> Result<(), ServiceError> {

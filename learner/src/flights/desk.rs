@@ -60,6 +60,8 @@ pub struct Desk {
     faults: Faults,
     /// What is to be said to actors besides their tickets.
     letters: Vec<ControlRecord>,
+    /// Whether something was said to an actor that may not look by itself.
+    is_wake_due: bool,
 }
 
 #[derive(Debug)]
@@ -70,6 +72,8 @@ struct Actor {
     tickets: VecDeque<Issued>,
     /// Flights it has spoiled since the last one that was committed.
     spoiled: u32,
+    /// It has spoken since, and nothing shows that it has seen a ticket that it was given after: it may have found nothing to fly and be waiting.
+    may_wait: bool,
 }
 
 impl Actor {
@@ -83,6 +87,8 @@ struct Issued {
     order: Order,
     since: Instant,
     assembly: Assembly,
+    /// Whether its actor has not spoken since: one that flies it does not wait.
+    is_newest_word: bool,
 }
 
 impl Desk {
@@ -96,6 +102,7 @@ impl Desk {
             failures: Failures::default(),
             faults: Faults::default(),
             letters: Vec::new(),
+            is_wake_due: false,
         }
     }
 
@@ -174,9 +181,15 @@ impl Desk {
                         last_sign: now,
                         tickets: VecDeque::new(),
                         spoiled: 0,
+                        may_wait: true,
                     }
                 });
                 actor.last_sign = now;
+                // It speaks when it finds nothing to fly. What was on its way to it then, it finds when it is woken.
+                actor.may_wait = true;
+                for issued in &mut actor.tickets {
+                    self.is_wake_due |= std::mem::take(&mut issued.is_newest_word);
+                }
             }
         }
     }
@@ -208,6 +221,9 @@ impl Desk {
             self.faults.refuse(Refusal::NoTicket);
             return Ok(None);
         };
+        if actor.tickets[position].is_newest_word {
+            actor.may_wait = false;
+        }
         // Tickets are flown in order: those before this one never reached the actor, or their records never reached us.
         for _ in 0..position {
             self.reissue_first(id, Reissue::Skipped);
@@ -318,6 +334,7 @@ impl Desk {
     /// every flight while there are others. Returns what to send.
     pub fn issue(&mut self, now: Instant) -> Vec<ControlRecord> {
         let mut messages = std::mem::take(&mut self.letters);
+        self.is_wake_due |= !messages.is_empty();
         let credit = self.limits.tickets_per_actor;
         let any_trusted = self.actors.values().any(Actor::is_trusted);
         while !self.waiting.is_empty() {
@@ -334,13 +351,21 @@ impl Desk {
             messages.push(ControlRecord::fly(&order.ticket, id, actor.incarnation));
             let longest = self.limits.max_records_per_flight;
             let assembly = Assembly::new(order.ticket, order.epoch, order.keep, longest, id, actor.incarnation);
+            self.is_wake_due |= actor.may_wait || actor.tickets.is_empty();
             actor.tickets.push_back(Issued {
                 order,
                 since: now,
                 assembly,
+                is_newest_word: true,
             });
         }
         messages
+    }
+
+    /// Whether an actor may wait that was given something since this was last asked. One that flies looks by itself before each step, and to wake all actors
+    /// for every flight costs the more, the more of them there are.
+    pub fn take_wake(&mut self) -> bool {
+        std::mem::take(&mut self.is_wake_due)
     }
 
     /// Forgets an actor; its tickets are issued again.
@@ -395,3 +420,6 @@ impl Desk {
 #[cfg(test)]
 #[path = "desk_tests.rs"]
 mod tests;
+#[cfg(test)]
+#[path = "waking_tests.rs"]
+mod waking_tests;
