@@ -165,7 +165,7 @@ fn serve_life(pilot: &mut Pilot, line: &mut LearnerLine<'_>) -> Result<Parting, 
         }
         match line.take_ticket() {
             Some((ticket, network)) => fly(pilot, &ticket, &network, line)?,
-            None => line.wait(),
+            None => line.wait()?,
         }
     };
     info!(?parting, flights = line.flights_flown, "leaving");

@@ -37,6 +37,8 @@ pub(super) struct LearnerLine<'a> {
     /// When the last heartbeat was given: whoever missed some has been stopped.
     last_said: Instant,
     timer: LapTimer,
+    /// Whether the learner was told that there is nothing to fly, since there was.
+    has_told_of_waiting: bool,
     pub(super) flights_flown: u64,
 }
 
@@ -77,6 +79,7 @@ impl<'a> LearnerLine<'a> {
             last_sign: service.last_sign,
             last_said: Instant::now(),
             timer: LapTimer::start(),
+            has_told_of_waiting: false,
             flights_flown: 0,
         }
     }
@@ -189,12 +192,17 @@ impl<'a> LearnerLine<'a> {
             .position(|queued| self.weights.holds(queued.ticket.policy_version))?;
         let ticket = self.tickets.remove(ready)?.ticket;
         let network = self.weights.network(ticket.policy_version)?;
+        self.has_told_of_waiting = false;
         self.timer.lap(Stage::TakeSnapshot, 0);
         Some((ticket, network))
     }
 
-    /// Waits for the learner, not longer than until the next sign of life.
-    pub(super) fn wait(&mut self) {
+    /// Waits for the learner, not longer than until the next sign of life. The learner is told first: it wakes actors only to what one that waits would miss.
+    pub(super) fn wait(&mut self) -> Result<(), ServiceError> {
+        if !self.has_told_of_waiting {
+            self.has_told_of_waiting = true;
+            self.report(ActorState::Serving)?;
+        }
         if let Err(error) = self
             .ports
             .wait(self.limits.heartbeat.saturating_sub(self.last_said.elapsed()))
@@ -204,6 +212,7 @@ impl<'a> LearnerLine<'a> {
             std::thread::sleep(Duration::from_millis(10));
         }
         self.timer.lap(Stage::ActorIdle, 1);
+        Ok(())
     }
 
     /// Tells how this actor stands. It is no heartbeat: one that was missed is still found missing.

@@ -63,6 +63,8 @@ pub struct Desk {
     times_of_the_gone: Times,
     /// What is to be said to actors besides their tickets.
     letters: Vec<ControlRecord>,
+    /// Whether something was said to an actor that may not look by itself.
+    is_wake_due: bool,
 }
 
 #[derive(Debug)]
@@ -76,6 +78,8 @@ struct Actor {
     /// What its time had gone into when it was first heard of: an actor that was taken for dead and is not is not counted twice.
     first_times: Times,
     times: Times,
+    /// It has spoken since, and nothing shows that it has seen a ticket that it was given after: it may have found nothing to fly and be waiting.
+    may_wait: bool,
 }
 
 impl Actor {
@@ -93,6 +97,8 @@ struct Issued {
     order: Order,
     since: Instant,
     assembly: Assembly,
+    /// Whether its actor has not spoken since: one that flies it does not wait.
+    is_newest_word: bool,
 }
 
 impl Desk {
@@ -107,6 +113,7 @@ impl Desk {
             faults: Faults::default(),
             times_of_the_gone: Times::default(),
             letters: Vec::new(),
+            is_wake_due: false,
         }
     }
 
@@ -196,10 +203,16 @@ impl Desk {
                         spoiled: 0,
                         first_times: status.times,
                         times: status.times,
+                        may_wait: true,
                     }
                 });
                 actor.last_sign = now;
                 actor.times = status.times;
+                // It speaks when it finds nothing to fly. What was on its way to it then, it finds when it is woken.
+                actor.may_wait = true;
+                for issued in &mut actor.tickets {
+                    self.is_wake_due |= std::mem::take(&mut issued.is_newest_word);
+                }
             }
         }
     }
@@ -231,6 +244,9 @@ impl Desk {
             self.faults.refuse(Refusal::NoTicket);
             return Ok(None);
         };
+        if actor.tickets[position].is_newest_word {
+            actor.may_wait = false;
+        }
         // Tickets are flown in order: those before this one never reached the actor, or their records never reached us.
         for _ in 0..position {
             self.reissue_first(id, Reissue::Skipped);
@@ -341,6 +357,7 @@ impl Desk {
     /// every flight while there are others. Returns what to send.
     pub fn issue(&mut self, now: Instant) -> Vec<ControlRecord> {
         let mut messages = std::mem::take(&mut self.letters);
+        self.is_wake_due |= !messages.is_empty();
         let credit = self.limits.tickets_per_actor;
         let any_trusted = self.actors.values().any(Actor::is_trusted);
         while !self.waiting.is_empty() {
@@ -357,13 +374,21 @@ impl Desk {
             messages.push(ControlRecord::fly(&order.ticket, id, actor.incarnation));
             let longest = self.limits.max_records_per_flight;
             let assembly = Assembly::new(order.ticket, order.epoch, order.keep, longest, id, actor.incarnation);
+            self.is_wake_due |= actor.may_wait || actor.tickets.is_empty();
             actor.tickets.push_back(Issued {
                 order,
                 since: now,
                 assembly,
+                is_newest_word: true,
             });
         }
         messages
+    }
+
+    /// Whether an actor may wait that was given something since this was last asked. One that flies looks by itself before each step, and to wake all actors
+    /// for every flight costs the more, the more of them there are.
+    pub fn take_wake(&mut self) -> bool {
+        std::mem::take(&mut self.is_wake_due)
     }
 
     /// Forgets an actor; its tickets are issued again.
@@ -419,3 +444,6 @@ impl Desk {
 #[cfg(test)]
 #[path = "desk_tests.rs"]
 mod tests;
+#[cfg(test)]
+#[path = "waking_tests.rs"]
+mod waking_tests;

@@ -12,10 +12,10 @@ use skein_protocol::transition::{Outcome, RecordKind};
 use super::super::failures;
 use super::*;
 
-const RUN: RunId = RunId(1);
-const LIFE: Incarnation = Incarnation(100);
+pub(super) const RUN: RunId = RunId(1);
+pub(super) const LIFE: Incarnation = Incarnation(100);
 
-fn limits() -> TransportSection {
+pub(super) fn limits() -> TransportSection {
     TransportSection {
         tickets_per_actor: 2,
         actor_silence_secs: 5.0,
@@ -24,7 +24,7 @@ fn limits() -> TransportSection {
     }
 }
 
-fn order(flight: u64) -> Order {
+pub(super) fn order(flight: u64) -> Order {
     let ticket = Ticket {
         run: RUN,
         flight: FlightId(flight),
@@ -46,7 +46,7 @@ fn order(flight: u64) -> Order {
     }
 }
 
-fn attach(desk: &mut Desk, actor: u32, life: Incarnation, now: Instant) {
+pub(super) fn attach(desk: &mut Desk, actor: u32, life: Incarnation, now: Instant) {
     desk.on_status(&status(actor, life), now);
 }
 
@@ -73,7 +73,7 @@ fn flown(desk: &mut Desk, actor: u32, life: Incarnation, state: ActorState, secs
 }
 
 /// Tickets handed out to `actor`.
-fn tickets_for(messages: &[ControlRecord], actor: u32, life: Incarnation) -> Vec<Ticket> {
+pub(super) fn tickets_for(messages: &[ControlRecord], actor: u32, life: Incarnation) -> Vec<Ticket> {
     let own = messages.iter().filter(|message| message.is_for(ActorId(actor), life));
     own.filter_map(|message| match message.read(RUN) {
         Ok(Control::Fly(ticket)) => Some(ticket),
@@ -83,7 +83,7 @@ fn tickets_for(messages: &[ControlRecord], actor: u32, life: Incarnation) -> Vec
 }
 
 /// The records of a flight of `2 + flight % 3` steps.
-fn records(ticket: &Ticket, actor: u32, life: Incarnation) -> Vec<TransitionRecord> {
+pub(super) fn records(ticket: &Ticket, actor: u32, life: Incarnation) -> Vec<TransitionRecord> {
     let steps = 2 + (ticket.flight.0 % 3) as u32;
     (0..=steps)
         .map(|step| {
@@ -101,7 +101,7 @@ fn records(ticket: &Ticket, actor: u32, life: Incarnation) -> Vec<TransitionReco
         .collect()
 }
 
-fn feed(desk: &mut Desk, records: &[TransitionRecord], now: Instant) -> Vec<(Place, CommittedFlight)> {
+pub(super) fn feed(desk: &mut Desk, records: &[TransitionRecord], now: Instant) -> Vec<(Place, CommittedFlight)> {
     records
         .iter()
         .filter_map(|record| desk.on_record(record, now).unwrap())
@@ -109,7 +109,7 @@ fn feed(desk: &mut Desk, records: &[TransitionRecord], now: Instant) -> Vec<(Pla
 }
 
 /// A desk with one actor that holds tickets 0 and 1 of three orders.
-fn desk(now: Instant) -> (Desk, Vec<Ticket>) {
+pub(super) fn desk(now: Instant) -> (Desk, Vec<Ticket>) {
     let mut desk = Desk::new(RUN, &limits());
     (0..3).for_each(|flight| desk.order(order(flight)));
     attach(&mut desk, 0, LIFE, now);

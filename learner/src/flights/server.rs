@@ -37,6 +37,8 @@ pub(super) struct Server {
     ports: LearnerPorts,
     /// What is still to be sent, in this order.
     outbox: VecDeque<Outgoing>,
+    /// Whether an actor that may wait has not been woken to what was sent.
+    is_wake_due: bool,
     heartbeat: Duration,
     last_heartbeat: Option<Instant>,
     trouble: Trouble,
@@ -84,6 +86,7 @@ impl Server {
             deliveries: BTreeMap::new(),
             ports,
             outbox: VecDeque::new(),
+            is_wake_due: false,
             heartbeat: config.transport.heartbeat(),
             last_heartbeat: None,
             trouble: Trouble::default(),
@@ -113,6 +116,7 @@ impl Server {
             self.hand_out(now);
             self.give_sign_of_life(now, shared);
             self.send_out();
+            self.wake_actors();
             shared.update(&self.desk);
             self.timer.lap(Stage::HandOut, 1);
             if let Some(error) = self.trouble.lasting(now) {
@@ -160,11 +164,14 @@ impl Server {
     }
 
     fn take_status(&mut self, now: Instant, shared: &Shared) {
-        let mut heard = false;
+        let (mut heard, mut anyone_empty_handed) = (false, false);
         while let Some(record) = self.trouble.unless(self.ports.receive_status()).flatten() {
             heard = true;
             match record.read(self.run) {
-                Some(status) => self.desk.on_status(&status, now),
+                Some(status) => {
+                    anyone_empty_handed |= status.newest_policy.is_none();
+                    self.desk.on_status(&status, now);
+                }
                 None => {
                     tracing::debug!(?record, "status record refused");
                     self.desk.refuse_status();
@@ -173,6 +180,11 @@ impl Server {
         }
         if heard {
             self.tell_times(shared);
+        }
+        if anyone_empty_handed {
+            // Not only at the next heartbeat: an actor that has come cannot fly before it has a snapshot.
+            self.trouble.unless(self.ports.connect());
+            self.is_wake_due = true;
         }
     }
 
@@ -226,7 +238,6 @@ impl Server {
 
     /// Sends what is to be sent, as far as that works.
     fn send_out(&mut self) {
-        let before = self.outbox.len();
         while let Some(outgoing) = self.outbox.front() {
             let sent = match outgoing {
                 Outgoing::Snapshot(snapshot) => self.ports.publish(snapshot),
@@ -235,10 +246,17 @@ impl Server {
             if self.trouble.unless(sent).is_none() {
                 break;
             }
+            self.is_wake_due |= matches!(outgoing, Outgoing::Snapshot(_));
             self.outbox.pop_front();
         }
-        if self.outbox.len() < before {
-            self.trouble.unless(self.ports.wake_actors());
+    }
+
+    /// Wakes the actors to what was sent in this round, if one of them may wait.
+    fn wake_actors(&mut self) {
+        self.is_wake_due |= self.desk.take_wake();
+        // What could not be sent yet is nothing to wake anybody for.
+        if self.is_wake_due && self.outbox.is_empty() {
+            self.is_wake_due = self.trouble.unless(self.ports.wake_actors()).is_none();
         }
     }
 
