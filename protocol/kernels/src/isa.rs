@@ -1,0 +1,245 @@
+//! Which vector instructions are used, chosen once at run time, and what a product's inner loop needs of them.
+
+use std::fmt;
+use std::sync::OnceLock;
+
+/// A set of vector instructions that the kernels are written for.
+///
+/// Every kernel does the same operations on every number in the same order whichever is used: only how many numbers are in a register differs. So
+/// the results are equal bit for bit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Isa {
+    /// Whatever the compiler makes of plain arithmetic. Fused multiply-add is a call where the processor lacks it: slow, and equal.
+    Portable,
+    /// 256 bits: AVX2 and FMA.
+    Avx2,
+    /// 512 bits: AVX-512 F, VL, BW and DQ.
+    Avx512,
+}
+
+impl Isa {
+    /// All of them, the widest last.
+    pub const ALL: [Self; 3] = [Self::Portable, Self::Avx2, Self::Avx512];
+
+    /// The widest that this machine has.
+    pub fn best() -> Self {
+        static BEST: OnceLock<Isa> = OnceLock::new();
+        *BEST.get_or_init(|| {
+            let mut all = Self::ALL.into_iter().rev();
+            all.find(|isa| isa.is_available()).unwrap_or(Self::Portable)
+        })
+    }
+
+    /// Whether this machine has it.
+    pub fn is_available(self) -> bool {
+        match self {
+            Self::Portable => true,
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => {
+                Self::Avx2.is_available()
+                    && is_x86_feature_detected!("avx512f")
+                    && is_x86_feature_detected!("avx512vl")
+                    && is_x86_feature_detected!("avx512bw")
+                    && is_x86_feature_detected!("avx512dq")
+            }
+            #[cfg(not(target_arch = "x86_64"))]
+            _ => false,
+        }
+    }
+
+    /// Columns of a panel: two registers.
+    pub(crate) fn panel_width(self) -> usize {
+        match self {
+            Self::Portable | Self::Avx2 => 16,
+            Self::Avx512 => 32,
+        }
+    }
+
+    /// Rows of a tile: as many as leave registers for a panel's row and one broadcast.
+    pub(crate) fn tile_rows(self) -> usize {
+        match self {
+            Self::Portable => Scalar8::ROWS,
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => x86::Avx2::ROWS,
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => x86::Avx512::ROWS,
+            #[cfg(not(target_arch = "x86_64"))]
+            _ => Scalar8::ROWS,
+        }
+    }
+}
+
+impl fmt::Display for Isa {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Portable => "portable",
+            Self::Avx2 => "AVX2",
+            Self::Avx512 => "AVX-512",
+        })
+    }
+}
+
+/// Registers of one kind, as the inner loops need them.
+///
+/// # Safety
+/// Every function asks for the processor to have the instructions, and `load` and `store` for [`Simd::LANES`] numbers at the pointer.
+pub(crate) trait Simd {
+    /// A register.
+    type Vector: Copy;
+    /// Numbers in it.
+    const LANES: usize;
+    /// Rows of the largest tile.
+    const ROWS: usize;
+
+    unsafe fn splat(value: f32) -> Self::Vector;
+    unsafe fn load(from: *const f32) -> Self::Vector;
+    unsafe fn store(to: *mut f32, vector: Self::Vector);
+    /// a · b + c, rounded once.
+    unsafe fn fused(a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
+    /// Zero for what is below zero. Not a number stays what it is.
+    unsafe fn rectified(vector: Self::Vector) -> Self::Vector;
+    /// `vector` where `by` is above zero, else zero.
+    unsafe fn gated(vector: Self::Vector, by: Self::Vector) -> Self::Vector;
+}
+
+/// Eight numbers without any instruction of their own.
+pub(crate) struct Scalar8;
+
+impl Simd for Scalar8 {
+    type Vector = [f32; 8];
+    const LANES: usize = 8;
+    const ROWS: usize = 4;
+
+    #[inline(always)]
+    unsafe fn splat(value: f32) -> Self::Vector {
+        [value; 8]
+    }
+
+    #[inline(always)]
+    unsafe fn load(from: *const f32) -> Self::Vector {
+        // SAFETY: the caller vouches for eight numbers; an array of them needs no other alignment than they do.
+        unsafe { from.cast::<Self::Vector>().read() }
+    }
+
+    #[inline(always)]
+    unsafe fn store(to: *mut f32, vector: Self::Vector) {
+        // SAFETY: as for `load`.
+        unsafe { to.cast::<Self::Vector>().write(vector) }
+    }
+
+    #[inline(always)]
+    unsafe fn fused(a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector {
+        std::array::from_fn(|lane| a[lane].mul_add(b[lane], c[lane]))
+    }
+
+    #[inline(always)]
+    unsafe fn rectified(vector: Self::Vector) -> Self::Vector {
+        vector.map(|value| if value < 0.0 { 0.0 } else { value })
+    }
+
+    #[inline(always)]
+    unsafe fn gated(vector: Self::Vector, by: Self::Vector) -> Self::Vector {
+        std::array::from_fn(|lane| if by[lane] > 0.0 { vector[lane] } else { 0.0 })
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod x86 {
+    //! The registers of x86-64.
+
+    use std::arch::x86_64::*;
+
+    use super::Simd;
+
+    pub(crate) struct Avx2;
+
+    // 6 x 2 accumulators, 2 registers for the panel's row, 1 for a broadcast: 15 of 16.
+    impl Simd for Avx2 {
+        type Vector = __m256;
+        const LANES: usize = 8;
+        const ROWS: usize = 6;
+
+        #[inline(always)]
+        unsafe fn splat(value: f32) -> __m256 {
+            // SAFETY: the processor has the instruction, the caller says.
+            unsafe { _mm256_set1_ps(value) }
+        }
+
+        #[inline(always)]
+        unsafe fn load(from: *const f32) -> __m256 {
+            // SAFETY: the caller vouches for instruction and memory.
+            unsafe { _mm256_loadu_ps(from) }
+        }
+
+        #[inline(always)]
+        unsafe fn store(to: *mut f32, vector: __m256) {
+            // SAFETY: as for `load`.
+            unsafe { _mm256_storeu_ps(to, vector) }
+        }
+
+        #[inline(always)]
+        unsafe fn fused(a: __m256, b: __m256, c: __m256) -> __m256 {
+            // SAFETY: as for `splat`.
+            unsafe { _mm256_fmadd_ps(a, b, c) }
+        }
+
+        #[inline(always)]
+        unsafe fn rectified(vector: __m256) -> __m256 {
+            // SAFETY: as for `splat`. Where the two do not compare, the instruction gives its second operand.
+            unsafe { _mm256_max_ps(_mm256_setzero_ps(), vector) }
+        }
+
+        #[inline(always)]
+        unsafe fn gated(vector: __m256, by: __m256) -> __m256 {
+            // SAFETY: as for `splat`.
+            unsafe { _mm256_and_ps(vector, _mm256_cmp_ps::<_CMP_GT_OQ>(by, _mm256_setzero_ps())) }
+        }
+    }
+
+    pub(crate) struct Avx512;
+
+    // 12 x 2 accumulators, 2 registers for the panel's row; broadcasts are operands in memory: 26 of 32.
+    impl Simd for Avx512 {
+        type Vector = __m512;
+        const LANES: usize = 16;
+        const ROWS: usize = 12;
+
+        #[inline(always)]
+        unsafe fn splat(value: f32) -> __m512 {
+            // SAFETY: the processor has the instruction, the caller says.
+            unsafe { _mm512_set1_ps(value) }
+        }
+
+        #[inline(always)]
+        unsafe fn load(from: *const f32) -> __m512 {
+            // SAFETY: the caller vouches for instruction and memory.
+            unsafe { _mm512_loadu_ps(from) }
+        }
+
+        #[inline(always)]
+        unsafe fn store(to: *mut f32, vector: __m512) {
+            // SAFETY: as for `load`.
+            unsafe { _mm512_storeu_ps(to, vector) }
+        }
+
+        #[inline(always)]
+        unsafe fn fused(a: __m512, b: __m512, c: __m512) -> __m512 {
+            // SAFETY: as for `splat`.
+            unsafe { _mm512_fmadd_ps(a, b, c) }
+        }
+
+        #[inline(always)]
+        unsafe fn rectified(vector: __m512) -> __m512 {
+            // SAFETY: as for `splat`. Where the two do not compare, the instruction gives its second operand.
+            unsafe { _mm512_max_ps(_mm512_setzero_ps(), vector) }
+        }
+
+        #[inline(always)]
+        unsafe fn gated(vector: __m512, by: __m512) -> __m512 {
+            // SAFETY: as for `splat`.
+            unsafe { _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(by, _mm512_setzero_ps()), vector) }
+        }
+    }
+}

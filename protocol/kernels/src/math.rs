@@ -1,0 +1,121 @@
+//! Functions of one number that loops over many can be vectorised with, equal bit for bit on every processor; and the loops themselves.
+
+use crate::isa::Isa;
+
+/// e to the power of `x`, within two units in the last place; infinite above 88.72, nought below -87.33. Not a number stays what it is.
+///
+/// x = n ln 2 + r, |r| ≤ ½ ln 2; e^r by its Taylor polynomial (degree 7: remainder below 1e-8), 2ⁿ by its bits.
+#[inline(always)]
+pub fn exp(x: f32) -> f32 {
+    const LN_2_HIGH: f32 = 0.693_359_4;
+    const LN_2_LOW: f32 = -2.121_944_4e-4;
+    /// Added and taken away again, it leaves the nearest whole number, as f32 has no fractions up there.
+    const ROUND: f32 = 12_582_912.0;
+    const LARGEST: f32 = 88.722_83;
+    const SMALLEST: f32 = -87.336_54;
+    let bounded = x.clamp(SMALLEST, LARGEST);
+    let n = bounded.mul_add(std::f32::consts::LOG2_E, ROUND) - ROUND;
+    let r = n.mul_add(-LN_2_LOW, n.mul_add(-LN_2_HIGH, bounded));
+    let mut sum = 1.0 / 5040.0;
+    for factor in [1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0] {
+        sum = r.mul_add(sum, factor);
+    }
+    // In two halves: 2ⁿ alone would overflow at n = 128, where e^x does not yet.
+    let half = (n * 0.5).floor();
+    let power = |n: f32| f32::from_bits((((n as i32) + 127) << 23) as u32);
+    let value = sum * power(half) * power(n - half);
+    if x > LARGEST {
+        f32::INFINITY
+    } else if x < SMALLEST {
+        0.0
+    } else if x.is_nan() {
+        x
+    } else {
+        value
+    }
+}
+
+/// 1 / (1 + e^-x).
+#[inline(always)]
+pub fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + exp(-x))
+}
+
+impl Isa {
+    /// Runs `work` compiled for these instructions: loops in it are vectorised with them, `mul_add` is an instruction. `work` should be a closure of loops, not call what
+    /// was compiled elsewhere.
+    ///
+    /// # Panics
+    /// When this machine does not have the instructions.
+    #[inline]
+    pub fn vectorised<R>(self, work: impl FnOnce() -> R) -> R {
+        assert!(self.is_available(), "{self} is not to be had here");
+        match self {
+            // SAFETY: the instructions are there, as just asked.
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => unsafe { avx512(work) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => unsafe { avx2(work) },
+            _ => work(),
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq")]
+fn avx512<R>(work: impl FnOnce() -> R) -> R {
+    work()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn avx2<R>(work: impl FnOnce() -> R) -> R {
+    work()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn range() -> impl Iterator<Item = f32> {
+        (-880_000..=890_000).map(|step| step as f32 * 1e-4)
+    }
+
+    #[test]
+    fn exp_is_within_two_units_in_the_last_place() {
+        for x in range().filter(|x| (-87.3..88.7).contains(x)) {
+            let (found, exact) = (exp(x), f64::from(x).exp());
+            let error = (f64::from(found) - exact).abs() / exact;
+            assert!(error < 2.4e-7, "exp({x}) = {found}, not {exact}: off by {error}");
+        }
+    }
+
+    #[test]
+    fn exp_ends_where_numbers_do() {
+        assert_eq!(exp(0.0), 1.0);
+        assert_eq!(exp(200.0), f32::INFINITY);
+        assert_eq!(exp(f32::INFINITY), f32::INFINITY);
+        assert_eq!(exp(-200.0), 0.0);
+        assert_eq!(exp(f32::NEG_INFINITY), 0.0);
+        assert!(exp(f32::NAN).is_nan());
+    }
+
+    #[test]
+    fn loops_give_the_same_bits_with_all_instructions() {
+        let inputs: Vec<f32> = range().step_by(7).collect();
+        let run = |isa: Isa| {
+            let mut outputs = vec![0.0; inputs.len()];
+            isa.vectorised(|| {
+                for (output, input) in outputs.iter_mut().zip(&inputs) {
+                    *output = sigmoid(*input) + exp(*input);
+                }
+            });
+            outputs.into_iter().map(f32::to_bits).collect::<Vec<_>>()
+        };
+        let portable = run(Isa::Portable);
+        for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
+            assert_eq!(run(isa), portable, "{isa}");
+        }
+    }
+}

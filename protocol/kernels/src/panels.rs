@@ -1,0 +1,224 @@
+//! The right operand of a product, packed so that the inner loop reads it from the first byte to the last.
+//!
+//! Columns are gathered in panels as wide as a tile, and each panel is laid out term by term. Left where it lies, a matrix whose rows are a power of two apart
+//! would fall into a few sets of the cache.
+
+use crate::isa::Isa;
+
+/// A matrix seen in either direction: element (row, column) lies at `row · row_stride + column · column_stride`.
+#[derive(Debug, Clone, Copy)]
+pub struct Matrix<'a> {
+    data: &'a [f32],
+    rows: usize,
+    columns: usize,
+    row_stride: usize,
+    column_stride: usize,
+}
+
+impl<'a> Matrix<'a> {
+    /// `data` as rows of `columns` numbers.
+    ///
+    /// # Panics
+    /// When there are no whole rows.
+    pub fn of_rows(data: &'a [f32], columns: usize) -> Self {
+        assert!(
+            columns > 0 && data.len().is_multiple_of(columns),
+            "{} numbers are no rows of {columns}",
+            data.len()
+        );
+        Self {
+            data,
+            rows: data.len() / columns,
+            columns,
+            row_stride: columns,
+            column_stride: 1,
+        }
+    }
+
+    /// Rows and columns exchanged.
+    pub fn transposed(self) -> Self {
+        Self {
+            rows: self.columns,
+            columns: self.rows,
+            row_stride: self.column_stride,
+            column_stride: self.row_stride,
+            ..self
+        }
+    }
+
+    /// A row, whose columns lie side by side.
+    ///
+    /// # Panics
+    /// When they do not, or there is no such row.
+    pub(crate) fn row(&self, row: usize) -> &'a [f32] {
+        assert_eq!(self.column_stride, 1, "a matrix seen along its rows");
+        &self.data[row * self.row_stride..][..self.columns]
+    }
+
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.rows
+    }
+
+    /// Number of columns.
+    pub fn columns(&self) -> usize {
+        self.columns
+    }
+}
+
+/// Numbers in a cache line.
+const LINE: usize = 16;
+
+/// Numbers that begin where a cache line does.
+#[derive(Debug, Clone, Copy)]
+#[repr(C, align(64))]
+struct Line([f32; LINE]);
+
+/// Memory for numbers, from the beginning of a cache line; kept from use to use.
+#[derive(Debug, Default)]
+pub(crate) struct Aligned {
+    lines: Vec<Line>,
+}
+
+impl Aligned {
+    /// `len` numbers, whatever they are.
+    pub(crate) fn of_len(&mut self, len: usize) -> &mut [f32] {
+        let lines = len.div_ceil(LINE);
+        if self.lines.len() < lines {
+            self.lines.resize(lines, Line([0.0; LINE]));
+        }
+        // SAFETY: a line is sixteen numbers and nothing else, so `lines` of them are at least `len` numbers side by side, borrowed from `self`.
+        unsafe { std::slice::from_raw_parts_mut(self.lines.as_mut_ptr().cast(), len) }
+    }
+
+    fn as_ptr(&self) -> *const f32 {
+        self.lines.as_ptr().cast()
+    }
+}
+
+/// A packed right operand: [`Panels::terms`] rows, [`Panels::columns`] columns.
+#[derive(Debug)]
+pub struct Panels {
+    isa: Isa,
+    terms: usize,
+    columns: usize,
+    data: Aligned,
+}
+
+/// One panel.
+#[derive(Clone, Copy)]
+pub(crate) struct Panel {
+    /// The first column.
+    pub(crate) first: usize,
+    /// Columns that there are.
+    pub(crate) columns: usize,
+    /// Columns that are laid out, those behind the last one as noughts: one register or two.
+    pub(crate) width: usize,
+}
+
+impl Panels {
+    /// Nothing yet, for products with these instructions.
+    pub fn new(isa: Isa) -> Self {
+        Self {
+            isa,
+            terms: 0,
+            columns: 0,
+            data: Aligned::default(),
+        }
+    }
+
+    /// Takes over a matrix of terms by columns; memory is used again.
+    pub fn pack(&mut self, matrix: Matrix<'_>) {
+        (self.terms, self.columns) = (matrix.rows, matrix.columns);
+        let (isa, terms) = (self.isa, self.terms);
+        let data = self.data.of_len(padded(isa, matrix.columns) * terms);
+        for panel in panels(isa, matrix.columns) {
+            let into = &mut data[panel.first * terms..][..panel.width * terms];
+            pack_panel(matrix, panel, into);
+        }
+    }
+
+    /// [`Panels::new`] and [`Panels::pack`].
+    pub fn of(isa: Isa, matrix: Matrix<'_>) -> Self {
+        let mut panels = Self::new(isa);
+        panels.pack(matrix);
+        panels
+    }
+
+    /// Length of the sums.
+    pub fn terms(&self) -> usize {
+        self.terms
+    }
+
+    /// Columns of the product.
+    pub fn columns(&self) -> usize {
+        self.columns
+    }
+
+    pub(crate) fn isa(&self) -> Isa {
+        self.isa
+    }
+
+    pub(crate) fn panels(&self) -> impl Iterator<Item = Panel> + use<> {
+        panels(self.isa, self.columns)
+    }
+
+    /// Where `panel` begins at `term`.
+    pub(crate) fn at(&self, panel: Panel, term: usize) -> *const f32 {
+        debug_assert!(term < self.terms.max(1));
+        // Inside the allocation: `pack` has laid out all terms of all panels.
+        self.data
+            .as_ptr()
+            .wrapping_add(panel.first * self.terms + term * panel.width)
+    }
+}
+
+/// The panels of so many columns.
+pub(crate) fn panels(isa: Isa, columns: usize) -> impl Iterator<Item = Panel> + use<> {
+    let full = isa.panel_width();
+    (0..columns).step_by(full).map(move |first| {
+        let columns = (columns - first).min(full);
+        Panel {
+            first,
+            columns,
+            // A register is half a panel.
+            width: if columns <= full / 2 { full / 2 } else { full },
+        }
+    })
+}
+
+/// Columns with those laid out behind the last one.
+fn padded(isa: Isa, columns: usize) -> usize {
+    panels(isa, columns).last().map_or(0, |last| last.first + last.width)
+}
+
+fn pack_panel(matrix: Matrix<'_>, panel: Panel, into: &mut [f32]) {
+    let Matrix {
+        data,
+        row_stride,
+        column_stride,
+        ..
+    } = matrix;
+    if column_stride == 1 {
+        for (term, row) in into.chunks_exact_mut(panel.width).enumerate() {
+            let from = &data[term * row_stride + panel.first..][..panel.columns];
+            row[..panel.columns].copy_from_slice(from);
+            row[panel.columns..].fill(0.0);
+        }
+        return;
+    }
+    if panel.columns < panel.width {
+        into.fill(0.0);
+    }
+    // Along the columns, which lie side by side when the matrix is seen transposed; a few terms at a time, so that what is written stays near.
+    const TERMS: usize = 16;
+    for (block, into) in into.chunks_mut(TERMS * panel.width).enumerate() {
+        let terms = into.len() / panel.width;
+        for column in 0..panel.columns {
+            let start = (panel.first + column) * column_stride + block * TERMS * row_stride;
+            for term in 0..terms {
+                into[term * panel.width + column] = data[start + term * row_stride];
+            }
+        }
+    }
+}

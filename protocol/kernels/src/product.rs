@@ -1,0 +1,259 @@
+//! Rows times packed panels: every forward pass, and what flows back to a layer's input.
+
+use crate::isa::{Isa, Scalar8, Simd};
+use crate::panels::{Panel, Panels};
+use crate::tile::{Begin, End, InPlace, Output, Run, of_height, panel_tile};
+use crate::windows::Windows;
+
+/// Terms done before the next panel's turn: a panel's part then stays in the first cache beside the rows it meets.
+const TERMS_AT_ONCE: usize = 256;
+/// Rows done before the next ones' turn: their terms stay in the second cache while all panels meet them.
+const ROWS_AT_ONCE: usize = 192;
+
+/// The left operand: rows of numbers, read where they lie.
+#[derive(Debug, Clone, Copy)]
+pub enum Rows<'a> {
+    /// A matrix, row by row; as many numbers in a row as the product has terms.
+    Matrix(&'a [f32]),
+    /// What windows on an image see, a row each.
+    Windows(&'a Windows, &'a [f32]),
+}
+
+/// What an element's sum begins with.
+#[derive(Debug, Clone, Copy)]
+pub enum Start<'a> {
+    /// Nothing.
+    Zero,
+    /// Its column's bias, `[columns]`.
+    Bias(&'a [f32]),
+}
+
+/// What becomes of a finished sum.
+#[derive(Debug, Clone, Copy)]
+pub enum Finish<'a> {
+    /// Nothing.
+    Plain,
+    /// Zero if it is below zero (ReLU). Not a number stays what it is.
+    Rectified,
+    /// Zero where this matrix, `[rows, columns]`, is not above zero: the gradient through a ReLU whose output it is.
+    Gated(&'a [f32]),
+}
+
+/// `output = finish(start + rows · panels)`, `[rows, columns]`; everything row-major.
+///
+/// Each element is the sum of its terms in order, one fused multiply-add each: the same bits for every instruction set, and however the rows are parted.
+///
+/// # Panics
+/// When lengths do not belong together.
+pub fn product(rows: Rows<'_>, panels: &Panels, start: Start<'_>, finish: Finish<'_>, output: &mut [f32]) {
+    let columns = panels.columns();
+    let count = check(rows, panels, start, finish, output.len());
+    let single;
+    let (data, starts, runs) = match rows {
+        Rows::Matrix(data) => {
+            single = [Run {
+                offset: 0,
+                len: panels.terms(),
+            }];
+            (data, Starts::Even(panels.terms()), &single[..])
+        }
+        Rows::Windows(windows, image) => (image, Starts::Listed(windows.starts()), windows.runs()),
+    };
+    let blocks = blocks(runs);
+    for first in (0..count).step_by(ROWS_AT_ONCE) {
+        let rows = (count - first).min(ROWS_AT_ONCE);
+        for (index, block) in blocks.iter().enumerate() {
+            for panel in panels.panels() {
+                let corner = first * columns + panel.first;
+                let work = Work {
+                    left: data.as_ptr(),
+                    starts,
+                    first,
+                    rows,
+                    runs: &block.runs,
+                    right: panels.at(panel, block.first_term),
+                    panel,
+                    begin: match start {
+                        _ if index > 0 => Begin::Output,
+                        Start::Zero => Begin::Zero,
+                        Start::Bias(bias) => Begin::Bias(bias[panel.first..].as_ptr()),
+                    },
+                    end: match finish {
+                        _ if index + 1 < blocks.len() => End::Plain,
+                        Finish::Plain => End::Plain,
+                        Finish::Rectified => End::Rectified,
+                        Finish::Gated(by) => End::Gated(by[corner..].as_ptr()),
+                    },
+                    output: Output {
+                        data: output[corner..].as_mut_ptr(),
+                        stride: columns,
+                    },
+                };
+                // SAFETY: `check` has seen to it that every row has all terms, bias, gate and output all columns of all rows; `panels` was packed for
+                // its instructions, which `Isa` has looked for.
+                unsafe { do_work(panels.isa(), &work) };
+            }
+        }
+    }
+}
+
+/// Looks at all lengths; returns the number of rows.
+fn check(rows: Rows<'_>, panels: &Panels, start: Start<'_>, finish: Finish<'_>, output: usize) -> usize {
+    let (terms, columns) = (panels.terms(), panels.columns());
+    assert!(panels.isa().is_available(), "{} is not to be had here", panels.isa());
+    assert!(terms > 0 && columns > 0, "an empty product");
+    let count = match rows {
+        Rows::Matrix(data) => {
+            assert!(
+                data.len().is_multiple_of(terms),
+                "{} numbers are no rows of {terms}",
+                data.len()
+            );
+            data.len() / terms
+        }
+        Rows::Windows(windows, image) => {
+            assert_eq!(image.len(), windows.image_len(), "the image the windows are of");
+            assert_eq!(windows.window_len(), terms, "a window has all terms");
+            windows.count()
+        }
+    };
+    assert_eq!(
+        output,
+        count * columns,
+        "a place for each of {count} x {columns} elements"
+    );
+    if let Start::Bias(bias) = start {
+        assert_eq!(bias.len(), columns, "a bias for each column");
+    }
+    if let Finish::Gated(by) = finish {
+        assert_eq!(by.len(), output, "a gate for each element");
+    }
+    count
+}
+
+/// Some of a product's terms.
+struct Block {
+    first_term: usize,
+    runs: Vec<Run>,
+}
+
+/// Cuts the terms into blocks of at most [`TERMS_AT_ONCE`].
+fn blocks(runs: &[Run]) -> Vec<Block> {
+    let mut blocks: Vec<Block> = Vec::new();
+    let (mut first_term, mut room) = (0, 0);
+    for run in runs {
+        let mut run = *run;
+        while run.len > 0 {
+            if room == 0 {
+                room = TERMS_AT_ONCE;
+                let runs = Vec::new();
+                blocks.push(Block { first_term, runs });
+            }
+            let len = run.len.min(room);
+            if let Some(block) = blocks.last_mut() {
+                block.runs.push(Run { len, ..run });
+            }
+            run = Run {
+                offset: run.offset + len,
+                len: run.len - len,
+            };
+            first_term += len;
+            room -= len;
+        }
+    }
+    blocks
+}
+
+/// Where rows begin.
+#[derive(Clone, Copy)]
+enum Starts<'a> {
+    /// So far apart.
+    Even(usize),
+    /// Here.
+    Listed(&'a [usize]),
+}
+
+/// Some rows, some terms, one panel.
+struct Work<'a> {
+    left: *const f32,
+    starts: Starts<'a>,
+    first: usize,
+    rows: usize,
+    runs: &'a [Run],
+    right: *const f32,
+    panel: Panel,
+    begin: Begin,
+    end: End,
+    /// Of the first row and the panel's first column; a gate likewise.
+    output: Output,
+}
+
+impl Work<'_> {
+    /// Where a row begins.
+    #[inline(always)]
+    fn row(&self, row: usize) -> *const f32 {
+        let row = self.first + row;
+        self.left.wrapping_add(match self.starts {
+            Starts::Even(stride) => row * stride,
+            Starts::Listed(starts) => starts[row],
+        })
+    }
+}
+
+/// # Safety
+/// The instructions are there; pointers and numbers of `work` belong together.
+unsafe fn do_work(isa: Isa, work: &Work<'_>) {
+    // SAFETY: as the caller says.
+    unsafe {
+        match isa {
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx512 => avx512(work),
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx2 => avx2(work),
+            _ => all_tiles::<Scalar8>(work),
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq")]
+unsafe fn avx512(work: &Work<'_>) {
+    // SAFETY: as the caller says.
+    unsafe { all_tiles::<crate::isa::x86::Avx512>(work) }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+unsafe fn avx2(work: &Work<'_>) {
+    // SAFETY: as the caller says.
+    unsafe { all_tiles::<crate::isa::x86::Avx2>(work) }
+}
+
+#[inline(always)]
+unsafe fn all_tiles<S: Simd>(work: &Work<'_>) {
+    let mut row = 0;
+    while row < work.rows {
+        let rows = (work.rows - row).min(S::ROWS);
+        // SAFETY: as the caller says.
+        unsafe { of_height!(S, rows, tile_of(work, row)) };
+        row += rows;
+    }
+}
+
+#[inline(always)]
+unsafe fn tile_of<S: Simd, const M: usize>(work: &Work<'_>, row: usize) {
+    let left = InPlace::<M>(std::array::from_fn(|index| work.row(row + index)));
+    let down = row * work.output.stride;
+    // SAFETY: as the caller says.
+    unsafe {
+        panel_tile::<S, _, M>(
+            left,
+            work.runs,
+            work.right,
+            work.panel,
+            work.begin,
+            work.end.down(down),
+            work.output.down(down),
+        );
+    }
+}

@@ -1,0 +1,204 @@
+//! Products and gradients against their definition, and every instruction set against every other, bit for bit.
+
+use proptest::prelude::*;
+
+use crate::*;
+
+/// Numbers of no pattern, in [-1, 1).
+fn numbers(len: usize, seed: u64) -> Vec<f32> {
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    (0..len)
+        .map(|_| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state >> 40) as f32 / (1 << 23) as f32 - 1.0
+        })
+        .collect()
+}
+
+fn available() -> impl Iterator<Item = Isa> {
+    Isa::ALL.into_iter().filter(|isa| isa.is_available())
+}
+
+/// The definition: every element's terms in order, one fused multiply-add each.
+fn defined(
+    rows: &[Vec<f32>],
+    right: impl Fn(usize, usize) -> f32,
+    columns: usize,
+    start: impl Fn(usize) -> f32,
+) -> Vec<f32> {
+    let element = |row: &[f32], column: usize| {
+        let terms = row.iter().enumerate();
+        terms.fold(start(column), |sum, (term, left)| {
+            left.mul_add(right(term, column), sum)
+        })
+    };
+    let elements = |row: &Vec<f32>| (0..columns).map(|column| element(row, column)).collect::<Vec<f32>>();
+    rows.iter().flat_map(elements).collect()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+
+    #[test]
+    fn a_product_is_its_definition_to_the_last_bit(
+        count in 0_usize..40, terms in 1_usize..600, columns in 1_usize..70, way in 0..4, seed in 1_u64..1000,
+    ) {
+        let (left, right) = (numbers(count * terms, seed), numbers(terms * columns, seed + 1));
+        let (bias, gate) = (numbers(columns, seed + 2), numbers(count * columns, seed + 3));
+        let matrix = if way % 2 == 0 {
+            Matrix::of_rows(&right, columns)
+        } else {
+            Matrix::of_rows(&right, terms).transposed()
+        };
+        let at = |term: usize, column: usize| if way % 2 == 0 { right[term * columns + column] } else { right[column * terms + term] };
+        let rows: Vec<Vec<f32>> = left.chunks(terms).map(<[f32]>::to_vec).collect();
+        let (start, finish) = match way {
+            0 => (Start::Zero, Finish::Plain),
+            1 => (Start::Bias(&bias), Finish::Rectified),
+            2 => (Start::Zero, Finish::Gated(&gate)),
+            _ => (Start::Bias(&bias), Finish::Plain),
+        };
+        let mut expected = defined(&rows, at, columns, |column| if way % 2 == 0 { 0.0 } else { bias[column] });
+        for (element, gate) in expected.iter_mut().zip(&gate) {
+            if way == 1 && *element < 0.0 || way == 2 && *gate <= 0.0 {
+                *element = 0.0;
+            }
+        }
+        for isa in available() {
+            let mut output = vec![f32::NAN; count * columns];
+            product(Rows::Matrix(&left), &Panels::of(isa, matrix), start, finish, &mut output);
+            prop_assert_eq!(&output, &expected, "{}", isa);
+        }
+    }
+
+    #[test]
+    fn a_convolution_is_its_definition_and_so_is_its_gradient(
+        height in 1_usize..9, width in 1_usize..9, channels in 1_usize..20, kernel_height in 1_usize..4, kernel_width in 1_usize..4,
+        stride in 1_usize..3, outputs in 1_usize..20, images in 1_usize..4, seed in 1_u64..1000,
+    ) {
+        prop_assume!(kernel_height <= height && kernel_width <= width);
+        let windows = Windows::new([height, width], channels, [kernel_height, kernel_width], stride);
+        let input = numbers(images * windows.image_len(), seed);
+        let weights = numbers(outputs * windows.window_len(), seed + 1);
+        let flowing = numbers(images * windows.count() * outputs, seed + 2);
+        let [_, across] = windows.positions();
+        let seen: Vec<Vec<f32>> = input
+            .chunks(windows.image_len())
+            .flat_map(|image| (0..windows.count()).map(move |window| (image, window)))
+            .map(|(image, window)| {
+                let (top, left) = (window / across * stride, window % across * stride);
+                let places = (0..kernel_height).flat_map(|y| (0..kernel_width).map(move |x| (y, x)));
+                places.flat_map(|(y, x)| &image[((top + y) * width + left + x) * channels..][..channels]).copied().collect()
+            })
+            .collect();
+        let len = windows.window_len();
+        let expected = defined(&seen, |term, output| weights[output * len + term], outputs, |_| 0.0);
+        let flowing_columns: Vec<Vec<f32>> = (0..outputs)
+            .map(|output| flowing.iter().skip(output).step_by(outputs).copied().collect())
+            .collect();
+        let expected_gradient = defined(&flowing_columns, |term, number| seen[term][number], len, |_| 0.0);
+        for isa in available() {
+            let panels = Panels::of(isa, Matrix::of_rows(&weights, len).transposed());
+            let mut output = vec![f32::NAN; expected.len()];
+            for (image, output) in input.chunks(windows.image_len()).zip(output.chunks_mut(windows.count() * outputs)) {
+                product(Rows::Windows(&windows, image), &panels, Start::Zero, Finish::Plain, output);
+            }
+            prop_assert_eq!(&output, &expected, "{}", isa);
+            let mut found = vec![f32::NAN; expected_gradient.len()];
+            let flowing = Matrix::of_rows(&flowing, outputs);
+            gradient(&mut Team::new(1), isa, flowing, Terms::Windows(&windows, &input), &mut found);
+            prop_assert_eq!(&found, &expected_gradient, "{}", isa);
+        }
+    }
+}
+
+#[test]
+fn a_gradient_is_its_definition_for_any_number_of_members() {
+    // More terms than are done at once, columns that fill no panel, rows that fill no tile.
+    for (terms, rows, columns) in [(600, 7, 70), (1, 13, 4), (300, 64, 33), (0, 3, 5)] {
+        let (left, right) = (numbers(terms * rows, 1), numbers(terms * columns, 2));
+        let by_column: Vec<Vec<f32>> = (0..rows)
+            .map(|row| left.iter().skip(row).step_by(rows).copied().collect())
+            .collect();
+        let expected = defined(
+            &by_column,
+            |term, column| right[term * columns + column],
+            columns,
+            |_| 0.0,
+        );
+        for isa in available() {
+            for size in 1..=3 {
+                let mut output = vec![f32::NAN; rows * columns];
+                let left = Matrix::of_rows(&left, rows);
+                gradient(
+                    &mut Team::new(size),
+                    isa,
+                    left,
+                    Terms::Matrix(&right, columns),
+                    &mut output,
+                );
+                assert_eq!(output, expected, "{isa}, {size} members");
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_not_a_number_is_not_hidden() {
+    let weights = numbers(4 * 20, 1);
+    for isa in available() {
+        let mut output = [0.0; 20];
+        let left = [1.0, f32::NAN, 0.0, 0.0];
+        let panels = Panels::of(isa, Matrix::of_rows(&weights, 20));
+        product(
+            Rows::Matrix(&left),
+            &panels,
+            Start::Zero,
+            Finish::Rectified,
+            &mut output,
+        );
+        assert!(output.iter().all(|value| value.is_nan()), "{isa}: {output:?}");
+    }
+}
+
+#[test]
+#[should_panic(expected = "a place for each")]
+fn an_output_that_is_too_short_is_refused() {
+    let panels = Panels::of(Isa::best(), Matrix::of_rows(&[1.0; 6], 3));
+    product(
+        Rows::Matrix(&[1.0; 4]),
+        &panels,
+        Start::Zero,
+        Finish::Plain,
+        &mut [0.0; 5],
+    );
+}
+
+#[test]
+#[should_panic(expected = "a bias for each column")]
+fn a_bias_that_is_too_short_is_refused() {
+    let panels = Panels::of(Isa::best(), Matrix::of_rows(&[1.0; 6], 3));
+    product(
+        Rows::Matrix(&[1.0; 2]),
+        &panels,
+        Start::Bias(&[1.0; 2]),
+        Finish::Plain,
+        &mut [0.0; 3],
+    );
+}
+
+#[test]
+#[should_panic(expected = "the image the windows are of")]
+fn an_image_of_another_size_is_refused() {
+    let windows = Windows::new([3, 3], 1, [2, 2], 1);
+    let panels = Panels::of(Isa::best(), Matrix::of_rows(&[1.0; 4], 1));
+    product(
+        Rows::Windows(&windows, &[0.0; 8]),
+        &panels,
+        Start::Zero,
+        Finish::Plain,
+        &mut [0.0; 4],
+    );
+}

@@ -1,0 +1,254 @@
+//! The inner loop of every product: a tile of the output, held in registers from its first term to its last.
+//!
+//! An element of the output is the sum of its terms in the order of k, each added by one fused multiply-add. Neither the width of a register nor the
+//! size of a tile changes that, so all instruction sets give the same bits.
+
+use crate::isa::Simd;
+use crate::panels::Panel;
+
+/// Terms that lie side by side in the left operand.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Run {
+    /// From where a row begins.
+    pub(crate) offset: usize,
+    /// How many.
+    pub(crate) len: usize,
+}
+
+/// What an element's sum begins with.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Begin {
+    /// Nothing.
+    Zero,
+    /// What is in the output.
+    Output,
+    /// The column's bias, at this pointer for the tile's first column.
+    Bias(*const f32),
+}
+
+/// What becomes of a finished sum.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum End {
+    /// Nothing.
+    Plain,
+    /// Zero if it is below zero.
+    Rectified,
+    /// Zero where this matrix, laid out as the output and pointed at where the tile begins, is not above zero.
+    Gated(*const f32),
+}
+
+/// How a tile reads the left operand.
+pub(crate) trait LeftTile: Copy {
+    /// Term `k` of the run that begins at `offset`, in this row.
+    ///
+    /// # Safety
+    /// The term exists.
+    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const f32;
+}
+
+/// Rows where they lie, each at a place of its own, terms of a run side by side.
+#[derive(Clone, Copy)]
+pub(crate) struct InPlace<const M: usize>(pub(crate) [*const f32; M]);
+
+impl<const M: usize> LeftTile for InPlace<M> {
+    #[inline(always)]
+    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const f32 {
+        // SAFETY: as the caller says.
+        unsafe { self.0[row].add(offset + k) }
+    }
+}
+
+/// Rows packed together: term by term, `stride` rows each.
+#[derive(Clone, Copy)]
+pub(crate) struct Packed {
+    pub(crate) data: *const f32,
+    pub(crate) stride: usize,
+}
+
+impl LeftTile for Packed {
+    #[inline(always)]
+    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const f32 {
+        // SAFETY: as the caller says.
+        unsafe { self.data.add((offset + k) * self.stride + row) }
+    }
+}
+
+/// The place of a tile in the output, row-major.
+#[derive(Clone, Copy)]
+pub(crate) struct Output {
+    pub(crate) data: *mut f32,
+    pub(crate) stride: usize,
+}
+
+impl Output {
+    /// So many numbers further on.
+    pub(crate) fn down(self, numbers: usize) -> Self {
+        Self {
+            data: self.data.wrapping_add(numbers),
+            ..self
+        }
+    }
+}
+
+impl End {
+    /// For an output so many numbers further on.
+    pub(crate) fn down(self, numbers: usize) -> Self {
+        match self {
+            Self::Gated(by) => Self::Gated(by.wrapping_add(numbers)),
+            end => end,
+        }
+    }
+}
+
+/// The tallest tile of any instruction set, and its columns.
+const MOST_ROWS: usize = 12;
+const MOST_COLUMNS: usize = 32;
+
+/// Calls a function that is generic over instruction set and height with the height that is only known now. No tile is made that the instruction set has no
+/// registers for: the guards are decided when the code is compiled.
+macro_rules! of_height {
+    ($simd:ident, $rows:expr, $function:ident($($argument:expr),*)) => {
+        of_height!(@ $simd, $rows, $function ($($argument),*) 1 2 3 4 5 6 7 8 9 10 11 12)
+    };
+    (@ $simd:ident, $rows:expr, $function:ident $arguments:tt $($height:literal)*) => {
+        match $rows {
+            $($height if $height <= $simd::ROWS => of_height!(# $function, $simd, $height, $arguments),)*
+            _ => unreachable!("a tile has 1 to {} rows", $simd::ROWS),
+        }
+    };
+    (# $function:ident, $simd:ident, $height:literal, ($($argument:expr),*)) => {
+        $function::<$simd, $height>($($argument),*)
+    };
+}
+pub(crate) use of_height;
+
+/// A tile under `panel`, which may have fewer columns than it lays out.
+///
+/// # Safety
+/// As for [`tile`], but that output, bias and gate need only have the columns that there are.
+#[inline(always)]
+pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile, const M: usize>(
+    left: L,
+    runs: &[Run],
+    right: *const f32,
+    panel: Panel,
+    begin: Begin,
+    end: End,
+    output: Output,
+) {
+    // SAFETY: as the caller says; where columns are missing, the tile works on memory of its own, which has them all.
+    unsafe {
+        if panel.columns == panel.width {
+            return if panel.width == S::LANES {
+                tile::<S, L, M, 1>(left, runs, right, panel.width, begin, end, output)
+            } else {
+                tile::<S, L, M, 2>(left, runs, right, panel.width, begin, end, output)
+            };
+        }
+        let mut whole = [0.0; MOST_ROWS * MOST_COLUMNS];
+        let aside = Output {
+            data: whole.as_mut_ptr(),
+            stride: panel.width,
+        };
+        let row_of = |row: usize| output.data.add(row * output.stride);
+        let begin = match begin {
+            Begin::Zero => Begin::Zero,
+            Begin::Output => {
+                for row in 0..M {
+                    aside.data.add(row * aside.stride).copy_from(row_of(row), panel.columns);
+                }
+                Begin::Output
+            }
+            Begin::Bias(bias) => {
+                for row in 0..M {
+                    aside.data.add(row * aside.stride).copy_from(bias, panel.columns);
+                }
+                Begin::Output
+            }
+        };
+        let (inner, gate) = match end {
+            End::Gated(by) => (End::Plain, Some(by)),
+            end => (end, None),
+        };
+        if panel.width == S::LANES {
+            tile::<S, L, M, 1>(left, runs, right, panel.width, begin, inner, aside);
+        } else {
+            tile::<S, L, M, 2>(left, runs, right, panel.width, begin, inner, aside);
+        }
+        for row in 0..M {
+            for column in 0..panel.columns {
+                let open = gate.is_none_or(|by| *by.add(row * output.stride + column) > 0.0);
+                *row_of(row).add(column) = if open {
+                    *aside.data.add(row * aside.stride + column)
+                } else {
+                    0.0
+                };
+            }
+        }
+    }
+}
+
+/// A tile of `M` rows and `N` registers: output = end(begin + left · panel).
+///
+/// # Safety
+/// `S`'s instructions are there. The left tile has `M` rows with all terms of `runs`; `panel` has as many rows of `panel_width` numbers as the runs have terms;
+/// `output`, a bias and a gate have `M` rows (a bias one) of `N · LANES` numbers. Nothing else touches the output meanwhile.
+#[inline(always)]
+pub(crate) unsafe fn tile<S: Simd, L: LeftTile, const M: usize, const N: usize>(
+    left: L,
+    runs: &[Run],
+    panel: *const f32,
+    panel_width: usize,
+    begin: Begin,
+    end: End,
+    output: Output,
+) {
+    // SAFETY: all pointers are offset within what the caller vouches for.
+    unsafe {
+        let mut sums = [[S::splat(0.0); N]; M];
+        match begin {
+            Begin::Zero => {}
+            Begin::Output => {
+                for (row, sums) in sums.iter_mut().enumerate() {
+                    for (part, sum) in sums.iter_mut().enumerate() {
+                        *sum = S::load(output.data.add(row * output.stride + part * S::LANES));
+                    }
+                }
+            }
+            Begin::Bias(bias) => {
+                for sums in &mut sums {
+                    for (part, sum) in sums.iter_mut().enumerate() {
+                        *sum = S::load(bias.add(part * S::LANES));
+                    }
+                }
+            }
+        }
+        let mut right = panel;
+        for run in runs {
+            for k in 0..run.len {
+                let mut parts = [S::splat(0.0); N];
+                for (part, value) in parts.iter_mut().enumerate() {
+                    *value = S::load(right.add(part * S::LANES));
+                }
+                for (row, sums) in sums.iter_mut().enumerate() {
+                    let term = S::splat(*left.term(row, run.offset, k));
+                    for (sum, part) in sums.iter_mut().zip(parts) {
+                        *sum = S::fused(term, part, *sum);
+                    }
+                }
+                right = right.add(panel_width);
+            }
+        }
+        for (row, sums) in sums.iter().enumerate() {
+            for (part, sum) in sums.iter().enumerate() {
+                let at = row * output.stride + part * S::LANES;
+                let value = match end {
+                    End::Plain => *sum,
+                    End::Rectified => S::rectified(*sum),
+                    End::Gated(by) => S::gated(*sum, S::load(by.add(at))),
+                };
+                S::store(output.data.add(at), value);
+            }
+        }
+    }
+}
