@@ -62,17 +62,21 @@ cargo bench --locked --workspace --no-run "${named[@]}"
 
 while read -r name kind; do
     started=$SECONDS
+    "${pin[@]}" "$target/release/skein-bench" core >>"$results/machine.jsonl"
     run=(cargo bench --quiet --locked --workspace --bench "$name" --)
     case $kind in
     one-core) run=("${pin[@]}" "${run[@]}" --noplot "${timing[@]}") ;;
     processes) run+=(${quick:+"$quick"}) ;;
     esac
-    "${run[@]}" >"$results/$name.jsonl" 2>"$results/$name.log" </dev/null || {
-        tail -n 20 "$results/$name.jsonl" "$results/$name.log" >&2
+    "${run[@]}" >"$results/$name.figures" 2>"$results/$name.log" </dev/null || {
+        tail -n 20 "$results/$name.figures" "$results/$name.log" >&2
         echo "bench.sh: the benchmark $name failed" >&2
         exit 1
     }
     printf '%-20s measured in %d s\n' "$name" $((SECONDS - started))
 done <<<"$benches"
 
-"${pin[@]}" "$target/release/skein-bench" table "$results" ${quick:+"$quick"} ${growth:+--pictures launch/pictures} "${only[@]}"
+# Pictures of times that mean nothing are none for the documents.
+pictures=$repository/launch/pictures
+[[ -z $quick ]] || pictures=$results
+"${pin[@]}" "$target/release/skein-bench" table "$results" ${quick:+"$quick"} ${growth:+--pictures "$pictures"} "${only[@]}"

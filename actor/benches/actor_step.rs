@@ -1,41 +1,42 @@
 //! One actor's whole step, from the camera to the record sent, against the sum of its stages.
 //!
-//! An iteration is five training flights, one from each level, through real shared memory; every stage is given exactly what those flights were made of,
+//! An iteration is two training flights from different levels through real shared memory; every stage is given exactly what those flights were made of,
 //! so that whatever the whole takes beyond the sum of the stages is the loop's own. The learner's end is emptied after each flight, outside the time taken.
 
+mod common;
+
 use std::hint::black_box;
-use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, Throughput};
-use rand::{RngExt, SeedableRng};
+use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_actor::agent::Agent;
 use skein_actor::courses::{Courses, Simulators};
 use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
 use skein_actor::inference::{Network, Scratch};
-use skein_protocol::config::{Config, Observation};
-use skein_protocol::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion};
-use skein_protocol::run::{LearnerSeat, RunDirectory};
+use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::seeds::{Purpose, derive};
-use skein_protocol::services::{ActorPorts, LearnerPorts, LoanedTransition, ServiceError};
-use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
-use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
+use skein_protocol::snapshot::SnapshotLayout;
+use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{RecordKind, TransitionRecord};
 use skein_protocol::{ACTION, IMAGE_PIXELS};
 
-const OBSERVATION: Observation = Observation::LatentVelocity;
+use common::{Learner, OBSERVATION, ticket};
+
 const ACTOR: ActorId = ActorId(0);
 const INCARNATION: Incarnation = Incarnation(0);
 
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     let transport = Transport::open();
-    let network = network(&transport.config);
-    let courses = Arc::new(Courses::of_run(&transport.config).expect("shipped courses can be flown"));
-    let tickets: Vec<_> = (1..=5).map(|level| transport.ticket(level)).collect();
+    let config = &transport.learner.config;
+    let network = Network::new(&transport.learner.snapshot(), &SnapshotLayout::of(config));
+    let courses = Arc::new(Courses::of_run(config).expect("shipped courses can be flown"));
+    let tickets = [1, 4].map(|level| ticket(transport.learner.identity.run, level.into(), level));
     let mut pilot = Pilot::new(
         ACTOR,
         INCARNATION,
@@ -55,8 +56,8 @@ fn main() {
     group.throughput(Throughput::Elements(steps as u64));
     group.bench_function("whole", |bencher| {
         bencher.iter_custom(|iterations| {
-            timed(iterations, &tickets, &transport, |ticket| {
-                fly(&mut pilot, ticket, &network, &transport);
+            timed(iterations, flights.len(), &transport, |flight| {
+                fly(&mut pilot, &tickets[flight], &network, &transport);
             })
         });
     });
@@ -85,7 +86,9 @@ fn environment(
             for (ticket, records) in tickets.iter().zip(flights) {
                 let simulator = simulators.of(ticket.course).expect("the course is loaded");
                 let mut start = Pcg64Mcg::seed_from_u64(derive(ticket.seed, Purpose::StartPosition, 0));
-                simulator.reset(ticket.start_level, &mut start).expect("it has this level");
+                simulator
+                    .reset(ticket.start_level, &mut start)
+                    .expect("it has this level");
                 simulator.render(&mut image);
                 for record in steps_of(records) {
                     black_box(simulator.step(record.action).expect("the flight was flown before"));
@@ -134,10 +137,10 @@ fn sending(
     let send = |record| transport.actor.send_transition(record).expect("the learner is there");
     group.bench_function("sending", |bencher| {
         bencher.iter_custom(|iterations| {
-            timed(iterations, tickets, transport, |ticket| {
-                let mut record = begin(ticket, 0);
-                for step in 1..flights[usize::from(ticket.start_level) - 1].len() as u32 {
-                    let next = begin(ticket, step);
+            timed(iterations, flights.len(), transport, |flight| {
+                let mut record = begin(&tickets[flight], 0);
+                for step in 1..flights[flight].len() as u32 {
+                    let next = begin(&tickets[flight], step);
                     send(std::mem::replace(&mut record, next));
                 }
                 send(record);
@@ -146,13 +149,13 @@ fn sending(
     });
 }
 
-/// Time that `work` takes on all tickets, `iterations` times; the learner's end is emptied after each, at nobody's cost.
-fn timed(iterations: u64, tickets: &[Ticket], transport: &Transport, mut work: impl FnMut(&Ticket)) -> Duration {
+/// Time that `work` takes on all of so many flights, `iterations` times; the learner's end is emptied after each, at nobody's cost.
+fn timed(iterations: u64, flights: usize, transport: &Transport, mut work: impl FnMut(usize)) -> Duration {
     let mut spent = Duration::ZERO;
     for _ in 0..iterations {
-        for ticket in tickets {
+        for flight in 0..flights {
             let start = Instant::now();
-            work(ticket);
+            work(flight);
             spent += start.elapsed();
             transport.empty();
         }
@@ -161,67 +164,42 @@ fn timed(iterations: u64, tickets: &[Ticket], transport: &Transport, mut work: i
 }
 
 fn steps_of(records: &[TransitionRecord]) -> impl Iterator<Item = &TransitionRecord> {
-    records
-        .iter()
-        .filter(|record| record.kind == RecordKind::Step.code())
+    records.iter().filter(|record| record.kind == RecordKind::Step.code())
 }
 
 /// Both ends of a run's services, on one thread.
 struct Transport {
-    config: Config,
     actor: ActorPorts,
-    learner: LearnerPorts,
-    _seat: LearnerSeat,
-    _directory: tempfile::TempDir,
+    learner: Learner,
 }
 
 impl Transport {
     fn open() -> Self {
-        let directory = tempfile::tempdir().expect("there is room for a configuration");
-        let run = RunDirectory::new(directory.path());
-        let mut config = Config::default();
-        config.learning.observation = OBSERVATION;
-        config.transport.max_actors = 1;
-        let courses = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/courses");
-        config.courses.training = courses.join("training.toml");
-        config.courses.evaluation = vec![courses.join("training.toml")];
-        run.create(&config).expect("the directory is new");
-        let (identity, config) = run.open().expect("it was just created");
-        let seat = LearnerSeat::take(&run, &identity).expect("nobody else knows of it");
-        let learner = LearnerPorts::open(&identity, seat.life(), &config).expect("services can be created");
-        let actor = ActorPorts::join(&identity, &config).expect("the learner is there");
-        learner.maintain().expect("the actor's memory can be mapped");
-        Self {
-            config,
-            actor,
-            learner,
-            _seat: seat,
-            _directory: directory,
-        }
-    }
-
-    fn ticket(&self, level: u8) -> Ticket {
-        Ticket {
-            run: self.actor.run(),
-            flight: FlightId(level.into()),
-            attempt: Attempt(0),
-            policy_version: PolicyVersion(0),
-            course: CourseChoice::Training,
-            start_level: level,
-            exploration: Exploration::Sample,
-            seed: level.into(),
-        }
+        let learner = Learner::open();
+        let actor = ActorPorts::join(&learner.identity, &learner.config).expect("the learner is there");
+        learner.ports.maintain().expect("the actor's memory can be mapped");
+        Self { actor, learner }
     }
 
     fn empty(&self) {
-        while let Some(record) = self.learner.receive_transition().expect("the actor's memory is mapped") {
+        while let Some(record) = self
+            .learner
+            .ports
+            .receive_transition()
+            .expect("the actor's memory is mapped")
+        {
             drop(record);
         }
     }
 
     fn received(&self) -> Vec<TransitionRecord> {
         let mut records = Vec::new();
-        while let Some(record) = self.learner.receive_transition().expect("the actor's memory is mapped") {
+        while let Some(record) = self
+            .learner
+            .ports
+            .receive_transition()
+            .expect("the actor's memory is mapped")
+        {
             records.push(*record);
         }
         records
@@ -245,17 +223,4 @@ impl RecordLink for Link<'_> {
     fn directive(&mut self) -> Result<Directive, ServiceError> {
         Ok(Directive::Continue)
     }
-}
-
-/// A network of random parameters, uniform in about PyTorch's default range: numbers of ordinary size run through all layers.
-fn network(config: &Config) -> Network {
-    let layout = SnapshotLayout::of(config);
-    let mut rng = Pcg64Mcg::seed_from_u64(1);
-    let mut values = vec![0.0; layout.values()];
-    for tensor in layout.tensors() {
-        let bound = (tensor.shape[0] as f32 / tensor.range.len() as f32).sqrt().min(0.5);
-        values[tensor.range.clone()].fill_with(|| rng.random_range(-bound..bound));
-    }
-    let version = PolicyVersion(0);
-    Network::new(&Snapshot { version, values }, &layout)
 }

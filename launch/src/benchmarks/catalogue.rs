@@ -181,10 +181,19 @@ mod tests {
             Show::Rate | Show::Value => true,
         };
         for row in &catalogue.rows {
-            assert!(timed(row.show, &row.unit), "{} is no unit of time: {}", row.unit, row.stage);
+            assert!(
+                timed(row.show, &row.unit),
+                "{} is no unit of time: {}",
+                row.unit,
+                row.stage
+            );
             assert!(row.at_least.is_none() || row.at_most.is_none(), "{}", row.stage);
             let compared = row.baseline.as_ref().is_some_and(|baseline| !baseline.of.is_empty());
-            assert!(row.ratio_at_least.is_none() || compared, "{} has no baseline", row.stage);
+            assert!(
+                row.ratio_at_least.is_none() || compared,
+                "{} has no baseline",
+                row.stage
+            );
             for figure in row.baseline.iter().flat_map(|baseline| &baseline.of) {
                 assert_eq!(bench_of(figure), bench_of(&row.figure), "one run measures both");
             }

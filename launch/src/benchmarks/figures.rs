@@ -1,4 +1,7 @@
-//! What the benchmarks left: criterion's estimates, and lines of JSON of those that criterion cannot run.
+//! What the benchmarks left: criterion's samples, and lines of JSON of those that criterion cannot run.
+//!
+//! The figure is the fastest sample. Virtual machines share their cores with strangers, who slow whole seconds down by half, unseen from within; nothing
+//! makes code faster than it is. The median is kept beside it, so that it is seen how much the machine was disturbed.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -18,10 +21,10 @@ pub struct Figures(BTreeMap<String, Figure>);
 pub enum Figure {
     /// By criterion.
     Timed {
-        /// Seconds an iteration takes, the median of the samples.
+        /// Seconds an iteration takes, in the fastest of the samples.
         secs: f64,
-        /// Between which the median lies with 95 % confidence.
-        confidence_secs: [f64; 2],
+        /// The same, in their median.
+        median_secs: f64,
         /// What an iteration counts for.
         elements: f64,
     },
@@ -80,26 +83,15 @@ struct Throughput {
     elements: Option<f64>,
 }
 
-/// Of criterion's `estimates.json`, what is needed; nanoseconds.
+/// Of criterion's `sample.json`, what is needed: iterations and nanoseconds of each sample.
 #[derive(Deserialize)]
-struct Estimates {
-    median: Estimate,
-}
-
-#[derive(Deserialize)]
-struct Estimate {
-    point_estimate: f64,
-    confidence_interval: Interval,
-}
-
-#[derive(Deserialize)]
-struct Interval {
-    lower_bound: f64,
-    upper_bound: f64,
+struct Samples {
+    iters: Vec<f64>,
+    times: Vec<f64>,
 }
 
 impl Figures {
-    /// All figures that `directory` holds: criterion's in `criterion/`, and those in the lines of `*.jsonl` that begin with a brace.
+    /// All figures that `directory` holds: criterion's in `criterion/`, and those in the lines of `*.figures` that begin with a brace.
     ///
     /// # Errors
     /// [`FiguresError`] names the file.
@@ -107,7 +99,7 @@ impl Figures {
         let mut figures = Self::default();
         figures.read_criterion(&directory.join("criterion"))?;
         for path in entries(directory)? {
-            if path.extension().is_some_and(|extension| extension == "jsonl") {
+            if path.extension().is_some_and(|extension| extension == "figures") {
                 figures.read_lines(&path)?;
             }
         }
@@ -117,6 +109,14 @@ impl Figures {
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
+    }
+
+    /// The figure that others held up longest, and how many times longer its median is than its fastest sample.
+    pub fn most_disturbed(&self) -> Option<(&str, f64)> {
+        self.0
+            .iter()
+            .filter_map(|(name, figure)| Some((name.as_str(), figure.disturbance()?)))
+            .max_by(|(_, a), (_, b)| a.total_cmp(b))
     }
 
     /// The figure called `name`.
@@ -141,15 +141,15 @@ impl Figures {
         let about = folder.join("new/benchmark.json");
         if about.exists() {
             let About { full_id, throughput } = json(&about)?;
-            let Estimates { median } = json(&folder.join("new/estimates.json"))?;
-            let secs = |nanos: f64| nanos / 1e9;
-            let interval = median.confidence_interval;
-            let figure = Figure::Timed {
-                secs: secs(median.point_estimate),
-                confidence_secs: [secs(interval.lower_bound), secs(interval.upper_bound)],
-                elements: throughput.and_then(|count| count.elements).unwrap_or(1.0),
-            };
-            self.0.insert(full_id, figure);
+            let samples: Samples = json(&folder.join("new/sample.json"))?;
+            if let Some((secs, median_secs)) = samples.secs() {
+                let figure = Figure::Timed {
+                    secs,
+                    median_secs,
+                    elements: throughput.and_then(|count| count.elements).unwrap_or(1.0),
+                };
+                self.0.insert(full_id, figure);
+            }
         }
         for path in entries(folder)? {
             if path.is_dir() {
@@ -175,6 +175,20 @@ impl Figures {
     }
 }
 
+impl Samples {
+    /// Seconds of an iteration: the fastest, and the median. `None` without samples.
+    fn secs(&self) -> Option<(f64, f64)> {
+        let mut secs: Vec<f64> = self
+            .times
+            .iter()
+            .zip(&self.iters)
+            .map(|(nanos, iterations)| nanos / iterations / 1e9)
+            .collect();
+        secs.sort_by(f64::total_cmp);
+        Some((*secs.first()?, secs[secs.len() / 2]))
+    }
+}
+
 impl Figure {
     /// The number that is shown, in `unit` and `scale` times; of a share of the peak, the time. `None` when this kind of figure has no such number.
     pub fn shown(&self, show: Show, unit: &str, scale: f64) -> Option<f64> {
@@ -183,15 +197,17 @@ impl Figure {
             (Self::Timed { secs, elements, .. }, Show::Time) => secs / elements * per_second(unit)?,
             (Self::Timed { secs, .. }, Show::PeakShare) => secs * per_second(unit)?,
             (Self::Told(told), Show::Value) => told.figure,
-            (Self::Timed { .. }, Show::Value) | (Self::Told(_), Show::Rate | Show::Time | Show::PeakShare) => return None,
+            (Self::Timed { .. }, Show::Value) | (Self::Told(_), Show::Rate | Show::Time | Show::PeakShare) => {
+                return None;
+            }
         };
         Some(value * scale)
     }
 
-    /// Seconds of an iteration, if it was timed.
-    pub fn secs(&self) -> Option<f64> {
+    /// How many times longer than the fastest sample the median took, if it was timed.
+    pub fn disturbance(&self) -> Option<f64> {
         match self {
-            Self::Timed { secs, .. } => Some(*secs),
+            Self::Timed { secs, median_secs, .. } => Some(median_secs / secs),
             Self::Told(_) => None,
         }
     }
@@ -231,10 +247,9 @@ pub(super) mod tests {
     pub(in super::super) fn timed(figures: &[(&str, f64, f64)]) -> Figures {
         let figure = |&(name, nanos, elements): &(&str, f64, f64)| {
             let secs = nanos / 1e9;
-            let confidence_secs = [secs, secs];
             let figure = Figure::Timed {
                 secs,
-                confidence_secs,
+                median_secs: secs,
                 elements,
             };
             (name.to_owned(), figure)
@@ -249,23 +264,24 @@ pub(super) mod tests {
         fs::create_dir_all(&new).unwrap();
         let about = r#"{"full_id":"replay/sample/1024","throughput":{"Elements":4},"title":"any"}"#;
         fs::write(new.join("benchmark.json"), about).unwrap();
-        let estimate = r#"{"median":{"confidence_interval":{"confidence_level":0.95,"lower_bound":1000.0,"upper_bound":4000.0},
-            "point_estimate":2000.0,"standard_error":1.0}}"#;
-        fs::write(new.join("estimates.json"), estimate).unwrap();
-        let line = r#"{"name":"transport/records","figure":3e5,"unit":"records/s","baseline":"memcpy","baseline_figure":6e5}"#;
-        fs::write(directory.path().join("transport.jsonl"), format!("a word\n{line}\n")).unwrap();
+        let samples = r#"{"sampling_mode":"Flat","iters":[2.0,2.0,2.0],"times":[8000.0,4000.0,6000.0]}"#;
+        fs::write(new.join("sample.json"), samples).unwrap();
+        let line =
+            r#"{"name":"transport/records","figure":3e5,"unit":"records/s","baseline":"memcpy","baseline_figure":6e5}"#;
+        fs::write(directory.path().join("transport.figures"), format!("a word\n{line}\n")).unwrap();
 
         let figures = Figures::read(directory.path()).unwrap();
         let timed = figures.get("replay/sample/1024").unwrap();
         assert_eq!(timed.shown(Show::Time, "µs", 1.0), Some(0.5));
         assert_eq!(timed.shown(Show::Rate, "any", 0.5), Some(1e6));
+        assert_eq!(timed.disturbance(), Some(1.5));
         assert_eq!(timed.shown(Show::Value, "any", 1.0), None);
         let told = figures.get("transport/records").unwrap();
         assert_eq!(told.shown(Show::Value, "records/s", 1.0), Some(3e5));
 
-        fs::write(directory.path().join("bad.jsonl"), "{\"name\":1}\n").unwrap();
+        fs::write(directory.path().join("bad.figures"), "{\"name\":1}\n").unwrap();
         let refused = Figures::read(directory.path()).unwrap_err().to_string();
-        assert!(refused.contains("bad.jsonl"), "{refused}");
+        assert!(refused.contains("bad.figures"), "{refused}");
     }
 
     #[test]

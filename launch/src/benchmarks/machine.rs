@@ -2,11 +2,18 @@
 
 use std::fmt;
 use std::fs;
+use std::hint::black_box;
+use std::path::Path;
 use std::thread;
+use std::time::Instant;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use skein_kernels::{Isa, peak_flops};
 
-use super::peak;
+/// Bytes copied at a time, beyond any cache.
+const COPIED: usize = 128 << 20;
+/// Times that they are copied; the fastest counts.
+const COPIES: usize = 4;
 
 /// Instruction sets that decide how fast kernels are, as `/proc/cpuinfo` spells them.
 const INSTRUCTIONS: [&str; 10] = [
@@ -22,6 +29,16 @@ const INSTRUCTIONS: [&str; 10] = [
     "amx_int8",
 ];
 
+/// What one core can do at best, measured. A line of `machine.jsonl`, written between two benchmarks: what holds the core up then must not pass for all it
+/// can do, so the best of all lines counts.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Core {
+    /// f32 operations a second.
+    pub f32_flops: f64,
+    /// Bytes a second copied from memory to memory.
+    pub copied_bytes_per_sec: f64,
+}
+
 /// What is known of it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Machine {
@@ -31,10 +48,8 @@ pub struct Machine {
     pub cores: usize,
     /// Of the instruction sets that matter, those it has.
     pub instructions: Vec<&'static str>,
-    /// f32 operations a second of one core, measured.
-    pub f32_flops: f64,
-    /// Bytes a second that one core copies, measured.
-    pub copied_bytes_per_sec: f64,
+    /// One of them.
+    pub core: Core,
     /// Memory, bytes.
     pub memory_bytes: u64,
     /// The kernel.
@@ -43,9 +58,31 @@ pub struct Machine {
     pub load: f64,
 }
 
-impl Machine {
-    /// This machine, measured on the core that the calling thread runs on.
+impl Core {
+    /// The core that the calling thread runs on.
     pub fn measure() -> Self {
+        Self {
+            f32_flops: peak_flops(Isa::best()),
+            copied_bytes_per_sec: copied_bytes_per_sec(),
+        }
+    }
+
+    /// The best of what the lines of `path` say; measured now where there are none.
+    pub fn best_of(path: &Path) -> Self {
+        let text = fs::read_to_string(path).unwrap_or_default();
+        let lines = text.lines().filter_map(|line| serde_json::from_str(line).ok());
+        lines
+            .reduce(|a: Self, b: Self| Self {
+                f32_flops: a.f32_flops.max(b.f32_flops),
+                copied_bytes_per_sec: a.copied_bytes_per_sec.max(b.copied_bytes_per_sec),
+            })
+            .unwrap_or_else(Self::measure)
+    }
+}
+
+impl Machine {
+    /// This machine, whose cores are like `core`.
+    pub fn with(core: Core) -> Self {
         let load = read("/proc/loadavg");
         let info = read("/proc/cpuinfo");
         let field = |name: &str| {
@@ -71,13 +108,28 @@ impl Machine {
                 .into_iter()
                 .filter(|set| flags.split_whitespace().any(|flag| flag == *set))
                 .collect(),
-            f32_flops: peak::f32_flops(),
-            copied_bytes_per_sec: peak::copied_bytes_per_sec(),
+            core,
             memory_bytes: memory_kib.unwrap_or(0_u64) << 10,
             kernel: read("/proc/sys/kernel/osrelease").trim().to_owned(),
-            load: load.split_whitespace().nth(1).and_then(|word| word.parse().ok()).unwrap_or(0.0),
+            load: load
+                .split_whitespace()
+                .nth(1)
+                .and_then(|word| word.parse().ok())
+                .unwrap_or(0.0),
         }
     }
+}
+
+fn copied_bytes_per_sec() -> f64 {
+    let source = vec![1_u8; COPIED];
+    let mut target = vec![2_u8; COPIED];
+    let copies = (0..COPIES).map(|_| {
+        let start = Instant::now();
+        target.copy_from_slice(black_box(&source));
+        black_box(&target);
+        start.elapsed().as_secs_f64()
+    });
+    COPIED as f64 / copies.fold(f64::INFINITY, f64::min)
 }
 
 /// The machine's cores; the calling thread itself may be pinned to one.
@@ -106,8 +158,29 @@ impl fmt::Display for Machine {
             f,
             "{}; one core: {:.1} GFLOP/s in f32, {:.1} GB/s copied",
             self.instructions.join(" "),
-            self.f32_flops / 1e9,
-            self.copied_bytes_per_sec / 1e9
+            self.core.f32_flops / 1e9,
+            self.core.copied_bytes_per_sec / 1e9
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_best_of_what_was_measured_counts() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("machine.jsonl");
+        let line = |f32_flops, copied_bytes_per_sec| {
+            let core = Core {
+                f32_flops,
+                copied_bytes_per_sec,
+            };
+            serde_json::to_string(&core).unwrap()
+        };
+        fs::write(&path, format!("{}\n{}\n", line(2e9, 1e9), line(1e9, 3e9))).unwrap();
+        let best = Core::best_of(&path);
+        assert_eq!((best.f32_flops, best.copied_bytes_per_sec), (2e9, 3e9));
     }
 }

@@ -7,5 +7,4 @@
 pub mod catalogue;
 pub mod figures;
 pub mod machine;
-pub mod peak;
 pub mod table;

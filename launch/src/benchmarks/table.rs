@@ -92,7 +92,11 @@ impl Table {
                 right(line.figure_text()),
                 right(line.target.clone()),
                 Cell::new(line.baseline_text()),
-                right(line.ratio.map(|ratio| format!("{} ×", number(ratio))).unwrap_or_default()),
+                right(
+                    line.ratio
+                        .map(|ratio| format!("{} ×", number(ratio)))
+                        .unwrap_or_default(),
+                ),
                 Cell::new(match (judging, line.verdict) {
                     (Judging::Times, Verdict::Met) => "yes",
                     (Judging::Times, Verdict::Missed) => "NO",
@@ -140,7 +144,7 @@ impl Line {
     }
 
     fn baseline_text(&self) -> String {
-        let text = |baseline: &Compared| format!("{}: {} {}", baseline.what, number(baseline.figure), self.unit);
+        let text = |baseline: &Compared| format!("{}: {}", baseline.what, number(baseline.figure));
         self.baseline.as_ref().map(text).unwrap_or_default()
     }
 }
@@ -156,31 +160,38 @@ fn less_is_better(row: &Row) -> bool {
 
 /// What `measured` is compared with, if that was measured too.
 fn compared(row: &Row, measured: &Figure, figures: &Figures) -> Option<Compared> {
-    if let Figure::Told(told) = measured {
-        let (what, figure) = (told.baseline.clone()?, told.baseline_figure?);
-        return Some(Compared { what, figure });
-    }
-    let baseline = row.baseline.as_ref()?;
+    let Some(baseline) = &row.baseline else {
+        return match measured {
+            Figure::Told(told) => Some(Compared {
+                what: told.baseline.clone()?,
+                figure: told.baseline_figure? * row.scale,
+            }),
+            Figure::Timed { .. } => None,
+        };
+    };
     // Times add up, rates do not.
-    let time = match row.show {
-        Show::PeakShare => Show::PeakShare,
-        Show::Rate | Show::Time | Show::Value => Show::Time,
+    let added = match row.show {
+        Show::Rate => Show::Time,
+        show @ (Show::Time | Show::PeakShare | Show::Value) => show,
     };
-    let parts = baseline.of.iter().map(|of| figures.get(of)?.shown(time, "s", 1.0));
-    let secs: f64 = parts.sum::<Option<f64>>()?;
+    let parts = baseline.of.iter().map(|of| figures.get(of)?.shown(added, "s", 1.0));
+    let sum: f64 = parts.sum::<Option<f64>>()?;
     let figure = match row.show {
-        Show::Rate => row.scale / secs,
-        Show::Time | Show::PeakShare | Show::Value => secs * per_second(&row.unit)? * row.scale,
+        Show::Rate => 1.0 / sum,
+        Show::Time | Show::PeakShare => sum * per_second(&row.unit)?,
+        Show::Value => sum,
     };
-    let what = baseline.what.clone();
-    Some(Compared { what, figure })
+    Some(Compared {
+        what: baseline.what.clone(),
+        figure: figure * row.scale,
+    })
 }
 
 fn target(row: &Row) -> String {
     let figure = match (row.show, row.at_least, row.at_most) {
         (Show::PeakShare, Some(share), _) => Some(format!("≥ {}", of_peak(share))),
-        (_, Some(least), _) => Some(format!("≥ {} {}", number(least), row.unit)),
-        (_, _, Some(most)) => Some(format!("≤ {} {}", number(most), row.unit)),
+        (_, Some(least), _) => Some(format!("≥ {}", number(least))),
+        (_, _, Some(most)) => Some(format!("≤ {}", number(most))),
         (_, None, None) => None,
     };
     let ratio = row.ratio_at_least.map(|ratio| format!("≥ {} ×", number(ratio)));
@@ -194,7 +205,8 @@ fn judge(row: &Row, figure: Option<f64>, peak_share: Option<f64>, ratio: Option<
     let reached = [
         row.at_least.map(|least| peak_share.unwrap_or(figure) >= least),
         row.at_most.map(|most| figure <= most),
-        row.ratio_at_least.map(|least| ratio.is_some_and(|ratio| ratio >= least)),
+        row.ratio_at_least
+            .map(|least| ratio.is_some_and(|ratio| ratio >= least)),
     ];
     let mut reached = reached.into_iter().flatten().peekable();
     if reached.peek().is_none() {
@@ -293,7 +305,10 @@ mod tests {
         let found = line(&compared, &figures);
         // 10 ns an element, and 30 + 20 ns.
         assert!((found.figure.unwrap() / 1e8 - 1.0).abs() < 1e-9, "{found:?}");
-        assert!((found.baseline.as_ref().unwrap().figure / 2e7 - 1.0).abs() < 1e-9, "{found:?}");
+        assert!(
+            (found.baseline.as_ref().unwrap().figure / 2e7 - 1.0).abs() < 1e-9,
+            "{found:?}"
+        );
         assert!((found.ratio.unwrap() - 5.0).abs() < 1e-9, "{found:?}");
         assert_eq!(found.verdict, Verdict::Missed, "the ratio falls short");
         let met = Row {
@@ -325,6 +340,9 @@ mod tests {
             ..row(Show::Value, "MB")
         };
         let found = line(&asked, &Figures::default());
-        assert_eq!((found.verdict, found.figure_text().as_str()), (Verdict::NotMeasured, "not measured"));
+        assert_eq!(
+            (found.verdict, found.figure_text().as_str()),
+            (Verdict::NotMeasured, "not measured")
+        );
     }
 }

@@ -13,7 +13,12 @@ const WIDTH: u32 = 760;
 const HEIGHT: u32 = 420;
 
 /// One colour a line; a picture has no more lines than these.
-const COLOURS: [RGBColor; 4] = [STRONG, REFERENCE, RGBColor(0x3a, 0x8a, 0x5f), RGBColor(0x7a, 0x5a, 0xa8)];
+const COLOURS: [RGBColor; 4] = [
+    STRONG,
+    REFERENCE,
+    RGBColor(0x3a, 0x8a, 0x5f),
+    RGBColor(0x7a, 0x5a, 0xa8),
+];
 
 struct Line<'a> {
     label: &'a str,
@@ -60,10 +65,7 @@ fn draw_lines(area: &Area<'_>, growth: &Growth, lines: &[Line<'_>]) -> Result<()
         .margin_right(px(26))
         .x_label_area_size(px(46))
         .y_label_area_size(px(76))
-        .build_cartesian_2d(
-            (xs.0 / 1.15..xs.1 * 1.15).log_scale(),
-            decades(ys).log_scale(),
-        )?;
+        .build_cartesian_2d((xs.0 / 1.15..xs.1 * 1.15).log_scale(), decades(ys).log_scale())?;
     chart
         .configure_mesh()
         .label_style(font(14))

@@ -9,7 +9,7 @@ use clap::{Parser, Subcommand};
 use serde::Serialize;
 use skein_launch::benchmarks::catalogue::{BenchKind, Catalogue, When, bench_of};
 use skein_launch::benchmarks::figures::Figures;
-use skein_launch::benchmarks::machine::Machine;
+use skein_launch::benchmarks::machine::{Core, Machine};
 use skein_launch::benchmarks::table::{Judging, Table};
 use skein_launch::reports::growth;
 use skein_protocol::failure::with_causes;
@@ -33,6 +33,8 @@ enum Command {
         #[arg(long)]
         growth: bool,
     },
+    /// Measure what this core can do at best, and print it as a line of JSON.
+    Core,
     /// Print the table of what was measured, and write it beside the figures.
     Table {
         /// Where the figures are.
@@ -60,6 +62,7 @@ struct Results<'a> {
 fn main() -> ExitCode {
     let done = match Cli::parse().command {
         Command::List { only, growth } => list(&only, if growth { When::Growth } else { When::Always }),
+        Command::Core => core(),
         Command::Table {
             directory,
             only,
@@ -81,7 +84,10 @@ fn main() -> ExitCode {
 
 fn list(only: &[String], when: When) -> Result<()> {
     let benches = Catalogue::load().benches;
-    if let Some(unknown) = only.iter().find(|name| benches.iter().all(|bench| bench.name != **name)) {
+    if let Some(unknown) = only
+        .iter()
+        .find(|name| benches.iter().all(|bench| bench.name != **name))
+    {
         let names: Vec<_> = benches.into_iter().map(|bench| bench.name).collect();
         bail!("no benchmark is called {unknown}; there are {}", names.join(", "));
     }
@@ -101,6 +107,11 @@ fn list(only: &[String], when: When) -> Result<()> {
     Ok(())
 }
 
+fn core() -> Result<()> {
+    println!("{}", serde_json::to_string(&Core::measure())?);
+    Ok(())
+}
+
 fn tell(directory: &Path, only: &[String], judging: Judging, pictures: Option<&Path>) -> Result<()> {
     let Catalogue { mut rows, growths, .. } = Catalogue::load();
     rows.retain(|row| only.is_empty() || only.iter().any(|name| name == bench_of(&row.figure)));
@@ -108,11 +119,15 @@ fn tell(directory: &Path, only: &[String], judging: Judging, pictures: Option<&P
     if figures.is_empty() {
         bail!("{} holds no figures: run launch/bench.sh", directory.display());
     }
-    let machine = Machine::measure();
-    let table = Table::new(&rows, &figures, machine.f32_flops);
+    let machine = Machine::with(Core::best_of(&directory.join("machine.jsonl")));
+    let table = Table::new(&rows, &figures, machine.core.f32_flops);
     println!("{machine}\n{}", table.to_terminal(judging));
-    if judging == Judging::Nothing {
-        println!("Run to see that the benchmarks work: these times mean nothing.");
+    match (judging, figures.most_disturbed()) {
+        (Judging::Nothing, _) => println!("Run to see that the benchmarks work: these times mean nothing."),
+        (Judging::Times, None) => {}
+        (Judging::Times, Some((name, times))) => println!(
+            "Times are those of the fastest of 30 samples; the median was up to {times:.2} times that, at {name}."
+        ),
     }
 
     let write = |name: &str, text: String| {
