@@ -71,7 +71,11 @@ fn every_package_keeps_to_its_side_of_the_fence() {
         ),
         ("skein-kernels", &[], [torch, physics].concat()),
         ("skein-learner", &["skein-kernels", "skein-protocol"], physics.to_vec()),
-        ("skein-launch", &["skein-protocol", "skein-simulator"], torch.to_vec()),
+        (
+            "skein-launch",
+            &["skein-kernels", "skein-protocol", "skein-simulator"],
+            torch.to_vec(),
+        ),
     ] {
         for of in [Of::Programs, Of::Tests] {
             let found = dependencies(&metadata, package, of);
