@@ -5,24 +5,25 @@
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_protocol::config::Config;
+use skein_kernels::{Isa, Team};
+use skein_protocol::config::{Config, Engine};
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::Exploration;
 use skein_protocol::{IMAGE_PIXELS, LATENT};
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Device, Kind};
 
-use crate::checkpoint::{NamedTensor, Progress, TensorValues};
+use crate::checkpoint::Progress;
 use crate::device::{self, DeviceError};
 use crate::error::UpdateError;
 use crate::flight::CommittedFlight;
 use crate::flights::assembly::Keep;
 use crate::noise::Noise;
 use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
-use crate::sac::{Batch, Columns, Sac, SacMetrics};
-use crate::state::{self, NamedTensors, Stateful};
+use crate::sac::{Columns, Sac, SacMetrics};
+use crate::state::{self, NamedTensor, Stateful};
 use crate::vae::{Vae, VaeMetrics, images_from_bytes};
 
 /// Images encoded at once when stored codes are made anew.
@@ -34,15 +35,6 @@ pub enum TrainerRestoreError {
     /// Of the networks.
     #[error(transparent)]
     Networks(#[from] state::RestoreError),
-    /// A tensor of a shape that there cannot be.
-    #[error("the stored tensor {name} is none: {source}")]
-    Tensor {
-        /// Its name.
-        name: String,
-        /// What the tensor library says of it.
-        #[source]
-        source: TchError,
-    },
     /// Of the replay buffer.
     #[error(transparent)]
     Replay(#[from] replay::RestoreError),
@@ -63,7 +55,8 @@ pub enum TrainerRestoreError {
 pub struct Trainer {
     config: Config,
     layout: SnapshotLayout,
-    device: Device,
+    /// Threads of the native engine.
+    team: Team,
     vae: Vae,
     sac: Sac,
     replay: Replay,
@@ -71,18 +64,30 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Untrained networks and an empty buffer. Sets the calling thread's tensor threads: training belongs on this thread.
+    /// Untrained networks and an empty buffer. Starts the native engine's threads, and sets the calling thread's tensor threads: training belongs on this thread.
     ///
     /// # Errors
     /// [`DeviceError`] when the configured device does not exist.
     pub fn new(config: &Config) -> Result<Self, DeviceError> {
         device::use_threads(config.run.learner_threads);
         let device = device::open(config.run.device)?;
+        let engine = config.run.engine();
+        let (isa, threads) = (Isa::best(), config.run.learner_threads);
+        tracing::info!(%engine, device = %config.run.device, %isa, threads, "networks are computed");
         Ok(Self {
             layout: SnapshotLayout::of(config),
-            device,
+            team: Team::new(match engine {
+                Engine::Native => threads,
+                Engine::Libtorch => 1,
+            }),
             vae: Vae::new(&config.vae, config.run.seed, device),
-            sac: Sac::new(&config.sac, config.learning.observation, config.run.seed, device),
+            sac: Sac::new(
+                &config.sac,
+                config.learning.observation,
+                config.run.seed,
+                engine,
+                device,
+            ),
             replay: Replay::new(config),
             steps: 0,
             config: config.clone(),
@@ -99,9 +104,8 @@ impl Trainer {
         tensors: &[NamedTensor],
         replay: ReplayState,
     ) -> Result<(), TrainerRestoreError> {
-        let tensors: NamedTensors = tensors.iter().map(restored).collect::<Result<_, _>>()?;
-        self.vae.load_named(&tensors)?;
-        self.sac.load_named(&tensors)?;
+        self.vae.load_named(tensors)?;
+        self.sac.load_named(tensors)?;
         self.replay = Replay::restore(&self.config, replay)?;
         self.steps = progress.environment_steps;
         for (what, found, expected) in [
@@ -239,9 +243,8 @@ impl Trainer {
         let mut means = Means::default();
         while self.sac.updates() < due {
             self.replay.sample(&mut rng, self.config.sac.batch_size, &mut minibatch);
-            let batch = Batch::new(columns(&minibatch), self.device);
             timer.lap(Stage::Sample, 1);
-            let metrics = self.sac.update(&batch, &mut noise)?;
+            let metrics = self.sac.update(&mut self.team, columns(&minibatch), &mut noise)?;
             timer.lap(Stage::SacUpdate, 1);
             means.add(&metrics);
             after_each(&metrics)?;
@@ -278,10 +281,11 @@ impl Trainer {
         encode(&self.vae, images)
     }
 
-    /// All tensors that updates change, copied to the processor.
-    pub fn tensors(&self) -> Vec<NamedTensor> {
-        let all = self.vae.named_tensors().into_iter().chain(self.sac.named_tensors());
-        all.map(|(name, tensor)| stored(name, &tensor)).collect()
+    /// Copies of all tensors that updates change.
+    pub fn tensors(&mut self) -> Vec<NamedTensor> {
+        let mut all = self.vae.named_tensors();
+        all.extend(self.sac.named_tensors());
+        all
     }
 }
 
@@ -302,36 +306,6 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
         rewards: &minibatch.rewards,
         next_observations: &minibatch.next_observations,
         terminated: &minibatch.terminated,
-    }
-}
-
-fn stored(name: String, tensor: &Tensor) -> NamedTensor {
-    let tensor = tensor.detach().to_device(Device::Cpu).contiguous();
-    let count = tensor.numel();
-    macro_rules! values {
-        ($variant:ident, $zero:expr) => {{
-            let mut values = vec![$zero; count];
-            tensor.copy_data(&mut values, count);
-            TensorValues::$variant(values)
-        }};
-    }
-    let values = match tensor.kind() {
-        Kind::Int64 => values!(I64, 0_i64),
-        Kind::Double => values!(F64, 0.0_f64),
-        _ => values!(F32, 0.0_f32),
-    };
-    NamedTensor {
-        name,
-        shape: tensor.size().into_iter().map(|size| size as usize).collect(),
-        values,
-    }
-}
-
-fn restored(stored: &NamedTensor) -> Result<(String, Tensor), TrainerRestoreError> {
-    let name = stored.name.clone();
-    match stored.to_tensor() {
-        Ok(tensor) => Ok((name, tensor)),
-        Err(source) => Err(TrainerRestoreError::Tensor { name, source }),
     }
 }
 
