@@ -7,7 +7,7 @@ use std::time::Instant;
 use skein_learner::device::use_threads;
 use skein_learner::noise::Noise;
 use skein_learner::sac::{Batch, Columns, Sac};
-use skein_learner::vae::{Vae, images_from_bytes};
+use skein_learner::vae::{TorchVae as Vae, images_from_bytes};
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{Observation, SacSection, VaeSection};
 use tch::Device;

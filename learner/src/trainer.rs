@@ -22,7 +22,7 @@ use crate::noise::Noise;
 use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
 use crate::sac::{Batch, Columns, Sac, SacMetrics};
 use crate::state::{self, NamedTensors, Stateful};
-use crate::vae::{Vae, VaeMetrics, images_from_bytes};
+use crate::vae::{TorchVae as Vae, VaeMetrics, images_from_bytes};
 
 /// Images encoded at once when stored codes are made anew.
 const ENCODE_CHUNK: usize = 64;

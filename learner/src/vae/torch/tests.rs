@@ -17,9 +17,9 @@ fn synthetic_images(count: usize, seed: u64) -> Tensor {
     images_from_bytes(&bytes)
 }
 
-fn vae(seed: u64) -> Vae {
+fn vae(seed: u64) -> TorchVae {
     crate::device::use_threads(1);
-    Vae::new(&VaeSection::default(), seed, Device::Cpu)
+    TorchVae::new(&VaeSection::default(), seed, Device::Cpu)
 }
 
 fn bits(tensor: &Tensor) -> Vec<f32> {
@@ -87,7 +87,7 @@ fn gradient_matches_finite_differences() {
     vae.parameters = vae.parameters.to_double();
     let pixels = pixels(&synthetic_images(1, 1)).to_kind(Kind::Double);
     let code_noise = Noise::new(2).normal(&[1, 32], Device::Cpu);
-    let loss = |vae: &Vae| vae.objective(&pixels, &code_noise).loss;
+    let loss = |vae: &TorchVae| vae.objective(&pixels, &code_noise).loss;
     let gradient = vae.parameters.gradient(&loss(&vae));
 
     // Along its own gradient, the loss of each tensor rises by the gradient's length: a tensor out of place in the flat vector would show.
@@ -122,7 +122,7 @@ fn a_vae_learns_to_reproduce_images_it_was_not_trained_on() {
     let mut vae = vae(3);
     let (seen, unseen) = (synthetic_images(64, 1), synthetic_images(16, 2));
     let code_noise = Noise::new(5).normal(&[16, 32], Device::Cpu);
-    let error = |vae: &Vae| {
+    let error = |vae: &TorchVae| {
         let _guard = no_grad_guard();
         vae.objective(&pixels(&unseen), &code_noise).error.double_value(&[]) / IMAGE_PIXELS as f64
     };
