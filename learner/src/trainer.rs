@@ -11,9 +11,9 @@ use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::Exploration;
 use skein_protocol::{IMAGE_PIXELS, LATENT};
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Device, Kind};
 
-use crate::checkpoint::{NamedTensor, Progress, TensorValues};
+use crate::checkpoint::Progress;
 use crate::device::{self, DeviceError};
 use crate::error::UpdateError;
 use crate::flight::CommittedFlight;
@@ -21,7 +21,7 @@ use crate::flights::assembly::Keep;
 use crate::noise::Noise;
 use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
 use crate::sac::{Batch, Columns, Sac, SacMetrics};
-use crate::state::{self, NamedTensors, Stateful};
+use crate::state::{self, NamedTensor, Stateful};
 use crate::vae::{TorchVae as Vae, VaeMetrics, images_from_bytes};
 
 /// Images encoded at once when stored codes are made anew.
@@ -33,15 +33,6 @@ pub enum TrainerRestoreError {
     /// Of the networks.
     #[error(transparent)]
     Networks(#[from] state::RestoreError),
-    /// A tensor of a shape that there cannot be.
-    #[error("the stored tensor {name} is none: {source}")]
-    Tensor {
-        /// Its name.
-        name: String,
-        /// What the tensor library says of it.
-        #[source]
-        source: TchError,
-    },
     /// Of the replay buffer.
     #[error(transparent)]
     Replay(#[from] replay::RestoreError),
@@ -98,9 +89,8 @@ impl Trainer {
         tensors: &[NamedTensor],
         replay: ReplayState,
     ) -> Result<(), TrainerRestoreError> {
-        let tensors: NamedTensors = tensors.iter().map(restored).collect::<Result<_, _>>()?;
-        self.vae.load_named(&tensors)?;
-        self.sac.load_named(&tensors)?;
+        self.vae.load_named(tensors)?;
+        self.sac.load_named(tensors)?;
         self.replay = Replay::restore(&self.config, replay)?;
         self.steps = progress.environment_steps;
         for (what, found, expected) in [
@@ -269,10 +259,11 @@ impl Trainer {
         encode(&self.vae, images)
     }
 
-    /// All tensors that updates change, copied to the processor.
-    pub fn tensors(&self) -> Vec<NamedTensor> {
-        let all = self.vae.named_tensors().into_iter().chain(self.sac.named_tensors());
-        all.map(|(name, tensor)| stored(name, &tensor)).collect()
+    /// Copies of all tensors that updates change.
+    pub fn tensors(&mut self) -> Vec<NamedTensor> {
+        let mut all = self.vae.named_tensors();
+        all.extend(self.sac.named_tensors());
+        all
     }
 }
 
@@ -293,36 +284,6 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
         rewards: &minibatch.rewards,
         next_observations: &minibatch.next_observations,
         terminated: &minibatch.terminated,
-    }
-}
-
-fn stored(name: String, tensor: &Tensor) -> NamedTensor {
-    let tensor = tensor.detach().to_device(Device::Cpu).contiguous();
-    let count = tensor.numel();
-    macro_rules! values {
-        ($variant:ident, $zero:expr) => {{
-            let mut values = vec![$zero; count];
-            tensor.copy_data(&mut values, count);
-            TensorValues::$variant(values)
-        }};
-    }
-    let values = match tensor.kind() {
-        Kind::Int64 => values!(I64, 0_i64),
-        Kind::Double => values!(F64, 0.0_f64),
-        _ => values!(F32, 0.0_f32),
-    };
-    NamedTensor {
-        name,
-        shape: tensor.size().into_iter().map(|size| size as usize).collect(),
-        values,
-    }
-}
-
-fn restored(stored: &NamedTensor) -> Result<(String, Tensor), TrainerRestoreError> {
-    let name = stored.name.clone();
-    match stored.to_tensor() {
-        Ok(tensor) => Ok((name, tensor)),
-        Err(source) => Err(TrainerRestoreError::Tensor { name, source }),
     }
 }
 

@@ -11,7 +11,7 @@ use crate::error::{UpdateError, finite};
 use crate::networks::{Critic, Layout, Parameters, Policy};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
-use crate::state::{NamedTensors, Stateful};
+use crate::state::{Part, Stateful};
 
 /// Policy, critic, target critic and temperature, each with its optimizer.
 #[derive(Debug)]
@@ -196,25 +196,18 @@ impl Sac {
 }
 
 impl Stateful for Sac {
-    fn named_tensors(&self) -> NamedTensors {
-        let mut tensors = vec![
-            (
-                "sac.policy.parameters".to_owned(),
-                self.policy_parameters.flat().shallow_clone(),
-            ),
-            (
-                "sac.critic.parameters".to_owned(),
-                self.critic_parameters.flat().shallow_clone(),
-            ),
-            (
-                "sac.target.parameters".to_owned(),
-                self.target_parameters.flat().shallow_clone(),
-            ),
-            ("sac.log_temperature".to_owned(), self.log_temperature.detach()),
+    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        let own = [
+            ("sac.policy.parameters", self.policy_parameters.flat().shallow_clone()),
+            ("sac.critic.parameters", self.critic_parameters.flat().shallow_clone()),
+            ("sac.target.parameters", self.target_parameters.flat().shallow_clone()),
+            ("sac.log_temperature", self.log_temperature.detach()),
         ];
-        tensors.extend(self.policy_optimizer.named_tensors("sac.policy.adam"));
-        tensors.extend(self.critic_optimizer.named_tensors("sac.critic.adam"));
-        tensors.extend(self.temperature_optimizer.named_tensors("sac.temperature.adam"));
-        tensors
+        let own = own.map(|(name, tensor)| (name.to_owned(), Part::Tensor(tensor)));
+        let mut parts = Vec::from(own);
+        parts.extend(self.policy_optimizer.parts("sac.policy.adam"));
+        parts.extend(self.critic_optimizer.parts("sac.critic.adam"));
+        parts.extend(self.temperature_optimizer.parts("sac.temperature.adam"));
+        parts
     }
 }

@@ -13,7 +13,7 @@ use crate::error::{UpdateError, finite};
 use crate::networks::{Decoder, Encoder, Layout, Parameters, pixels};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
-use crate::state::{NamedTensors, Stateful};
+use crate::state::{Part, Stateful};
 
 /// Images encoded or reconstructed at once outside of training: bounds memory at some 50 MB, and loses no speed.
 const CHUNK: i64 = 64;
@@ -155,10 +155,13 @@ impl TorchVae {
 }
 
 impl Stateful for TorchVae {
-    fn named_tensors(&self) -> NamedTensors {
-        let mut tensors = self.optimizer.named_tensors("vae.adam");
-        tensors.push(("vae.parameters".into(), self.parameters.flat().shallow_clone()));
-        tensors
+    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        let mut parts = self.optimizer.parts("vae.adam");
+        parts.push((
+            "vae.parameters".into(),
+            Part::Tensor(self.parameters.flat().shallow_clone()),
+        ));
+        parts
     }
 }
 
