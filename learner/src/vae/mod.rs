@@ -1,13 +1,31 @@
 //! The variational auto-encoder: gives the policy its eyes.
 //!
 //! It learns to reproduce depth images through a code of 32 numbers, during the first steps of a run, and is then frozen (paper, section 3.3). The
-//! policy sees the code's mean.
+//! policy sees the code's mean. Two engines compute it, which begin with the same parameters and are held to each other by tests.
 
 mod native;
 mod torch;
 
+use skein_protocol::config::{Engine, RunSection, VaeSection};
+use skein_protocol::{IMAGE_PIXELS, LATENT};
+use tch::{Device, Tensor};
+
+use crate::error::UpdateError;
+use crate::noise::Noise;
+use crate::state::{Part, Stateful};
+
 pub use native::{LAYERS, NativeVae, Pass, Spent};
 pub use torch::{TorchVae, images_from_bytes};
+
+/// Encoder, decoder and their optimizer, computed by the configured engine.
+#[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "there is one of them in a process")]
+pub enum Vae {
+    /// Kernels of our own, on the processor.
+    Native(NativeVae),
+    /// libtorch, on any device.
+    Libtorch(TorchVae),
+}
 
 /// What one VAE step reports.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -19,3 +37,94 @@ pub struct VaeMetrics {
     /// Kullback-Leibler divergence of the code's distribution from the standard normal, in nats, mean over the batch: how much the code tells.
     pub divergence: f32,
 }
+
+impl Vae {
+    /// An untrained VAE whose parameters depend on the run's seed alone. `device` is libtorch's; the native engine has the processor.
+    pub fn new(section: &VaeSection, run: &RunSection, device: Device) -> Self {
+        match run.engine() {
+            Engine::Native => Self::Native(NativeVae::new(section, run.seed, run.learner_threads)),
+            Engine::Libtorch => Self::Libtorch(TorchVae::new(section, run.seed, device)),
+        }
+    }
+
+    /// One step of Adam on a minibatch of depth images, `[n, 72, 128]`.
+    ///
+    /// # Errors
+    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was changed then.
+    pub fn update(&mut self, images: &[u8], noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
+        match self {
+            Self::Native(vae) => vae.update(images, noise),
+            Self::Libtorch(vae) => vae.update(&images_from_bytes(images), noise),
+        }
+    }
+
+    /// The code's mean for each image. `images`: `[n, 72, 128]`, any number of them.
+    pub fn encode(&mut self, images: &[u8]) -> Vec<[f32; LATENT]> {
+        match self {
+            Self::Native(vae) => vae.encode(images),
+            Self::Libtorch(vae) => {
+                let mut codes = vec![[0.0; LATENT]; images.len() / IMAGE_PIXELS];
+                copy(&vae.encode(&images_from_bytes(images)), codes.as_flattened_mut());
+                codes
+            }
+        }
+    }
+
+    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1]. `images`: `[n, 72, 128]`.
+    pub fn reconstruct(&mut self, images: &[u8]) -> Vec<f32> {
+        match self {
+            Self::Native(vae) => vae.reconstruct(images),
+            Self::Libtorch(vae) => {
+                let mut seen = vec![0.0; images.len()];
+                copy(&vae.reconstruct(&images_from_bytes(images)), &mut seen);
+                seen
+            }
+        }
+    }
+
+    /// Length of the part of the parameters that actors need.
+    pub fn published_len(&self) -> usize {
+        match self {
+            Self::Native(vae) => vae.published_len(),
+            Self::Libtorch(vae) => vae.published_len(),
+        }
+    }
+
+    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot layout's order.
+    ///
+    /// # Panics
+    /// When `into` is not [`Vae::published_len`] long.
+    pub fn publish(&self, into: &mut [f32]) {
+        match self {
+            Self::Native(vae) => vae.publish(into),
+            Self::Libtorch(vae) => vae.publish(into),
+        }
+    }
+
+    /// VAE steps done so far.
+    pub fn updates(&self) -> u64 {
+        match self {
+            Self::Native(vae) => vae.updates(),
+            Self::Libtorch(vae) => vae.updates(),
+        }
+    }
+}
+
+impl Stateful for Vae {
+    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        match self {
+            Self::Native(vae) => vae.parts(),
+            Self::Libtorch(vae) => vae.parts(),
+        }
+    }
+}
+
+fn copy(tensor: &Tensor, into: &mut [f32]) {
+    tensor
+        .to_device(Device::Cpu)
+        .contiguous()
+        .copy_data(into, into.len());
+}
+
+#[cfg(test)]
+mod tests;

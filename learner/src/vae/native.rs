@@ -12,7 +12,6 @@ mod layer;
 mod members;
 mod network;
 mod order;
-mod spread;
 mod step;
 mod stopwatch;
 mod unfold;
@@ -21,7 +20,6 @@ use skein_kernels::{AdamStep, Isa, Team};
 use skein_protocol::config::VaeSection;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::{IMAGE_PIXELS, LATENT};
-use tch::Device;
 
 use self::batch::Batch;
 use self::buffer::Buffer;
@@ -33,8 +31,9 @@ use self::step::{Objective, Step};
 use self::stopwatch::Pass as LayerPass;
 use super::VaeMetrics;
 use crate::error::UpdateError;
-use crate::networks::{Decoder, Encoder, Layout, Parameters};
+use crate::networks::{Decoder, Encoder, Layout};
 use crate::noise::Noise;
+use crate::state::{Part, Stateful};
 
 pub use stopwatch::{LAYERS, Pass, Spent};
 
@@ -75,10 +74,8 @@ impl NativeVae {
         let published_len = Encoder::describe(&mut layout).published_len();
         let _ = Decoder::describe(&mut layout);
         let order = Order::of(&layout);
-        let initial = Parameters::initialise(layout, derive(run_seed, Purpose::VaeParameters, 0), Device::Cpu);
-        let len = initial.layout().len();
-        let mut values = vec![0.0; len];
-        initial.copy_range(0..len, &mut values);
+        let initial = layout.initial_values(derive(run_seed, Purpose::VaeParameters, 0));
+        let len = initial.len();
         let team = Team::new(threads);
         let mut vae = Self {
             isa,
@@ -97,7 +94,7 @@ impl NativeVae {
             kl_weight: section.kl_weight,
             order,
         };
-        vae.parameters.copy_from_slice(&vae.order.from_pytorch(&values));
+        vae.parameters.copy_from_slice(&vae.order.from_pytorch(&initial));
         vae
     }
 
@@ -107,9 +104,8 @@ impl NativeVae {
     /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was changed then.
     pub fn update(&mut self, images: &[u8], noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
         let count = images.len() / IMAGE_PIXELS;
-        let drawn = noise.normal(&[count as i64, LATENT as i64], Device::Cpu);
         self.noise.resize(count * LATENT, 0.0);
-        drawn.copy_data(&mut self.noise, count * LATENT);
+        noise.fill_normal(&mut self.noise);
 
         let objective = self.objective(images);
         self.check(&objective)?;
@@ -272,5 +268,53 @@ impl NativeVae {
         let mut operations = self.network.operations().map(|pass| [pass; 3]);
         operations[0][Pass::Backward as usize] = 0.0;
         operations
+    }
+}
+
+#[cfg(test)]
+impl NativeVae {
+    /// Makes a tensor's first number something else.
+    pub(super) fn spoil(&mut self, tensor: &str, value: f32) {
+        let place = self.order.tensor(tensor).start;
+        self.parameters[place] = value;
+        self.packed = false;
+    }
+
+    /// Loss, squared error and divergence, and the whole gradient in PyTorch's order. `noise`: standard normal, `[n, 32]`.
+    pub(super) fn loss_and_gradient(&mut self, images: &[u8], noise: &[f32]) -> ([f32; 3], Vec<f32>) {
+        self.noise = noise.to_vec();
+        let Objective {
+            loss,
+            error,
+            divergence,
+        } = self.objective(images);
+        let (mut whole, place) = (self.gradient.to_vec(), self.network.unfold.place.weight.clone());
+        let [first, second] = &mut self.moments;
+        let blocks = self.network.unfold.blocks(&mut self.parameters, [first, second]);
+        let len = place.len() / blocks.len();
+        for (block, into) in blocks.iter().zip(whole[place].chunks_exact_mut(len)) {
+            let scratch = &mut self.members[0].unfold;
+            into.copy_from_slice(block.gradient(self.isa, &self.batch.unfolded, scratch));
+        }
+        let mut gradient = vec![0.0; whole.len()];
+        self.order.to_pytorch(&whole, &mut gradient);
+        ([loss, error, divergence], gradient)
+    }
+}
+
+impl Stateful for NativeVae {
+    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        // Whoever asks may change them.
+        self.packed = false;
+        let [first, second] = &mut self.moments;
+        // Names of its own: another engine's numbers lie in another order.
+        let parts = [
+            ("parameters", Part::Numbers(&mut self.parameters)),
+            ("adam.first_moment", Part::Numbers(first)),
+            ("adam.second_moment", Part::Numbers(second)),
+            ("adam.steps", Part::Count(&mut self.steps)),
+        ];
+        let named = |(name, part)| (format!("vae.native.{name}"), part);
+        parts.into_iter().map(named).collect()
     }
 }

@@ -154,6 +154,34 @@ impl TorchVae {
     }
 }
 
+#[cfg(test)]
+impl TorchVae {
+    /// With its parameters in double precision.
+    pub(super) fn in_double(mut self) -> Self {
+        self.parameters = self.parameters.to_double();
+        self
+    }
+
+    pub(super) fn layout(&self) -> &Layout {
+        self.parameters.layout()
+    }
+
+    /// Loss, squared error and divergence in the parameters' precision, and the gradient. `images`: `[n, 72, 128]` u8; `noise`: standard normal, `[n, 32]`.
+    pub(super) fn loss_and_gradient(&self, images: &Tensor, noise: &[f32]) -> ([f64; 3], Vec<f32>) {
+        let kind = self.parameters.flat().kind();
+        let pixels = pixels(images).to_kind(kind);
+        let noise = Tensor::from_slice(noise).view([-1, LATENT as i64]).to_kind(kind);
+        let Objective {
+            loss,
+            error,
+            divergence,
+        } = self.objective(&pixels, &noise);
+        let values = [&loss, &error, &divergence].map(|scalar| scalar.double_value(&[]));
+        let gradient = self.parameters.gradient(&loss).to_kind(Kind::Float);
+        (values, Vec::try_from(gradient).expect("a flat vector of numbers"))
+    }
+}
+
 impl Stateful for TorchVae {
     fn parts(&mut self) -> Vec<(String, Part<'_>)> {
         let mut parts = self.optimizer.parts("vae.adam");

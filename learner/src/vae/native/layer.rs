@@ -3,10 +3,9 @@
 //! Both tie an image to rows of channels, one for each place of a kernel on the image. A convolution *looks* through the windows: image to rows. A transposed one *spreads*
 //! rows back through them: rows to image. The gradient goes the other way in both, and the weights' gradient is the same product for either.
 
-use skein_kernels::{Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product};
+use skein_kernels::{Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product, spread};
 
 use super::order::Affine;
-use super::spread::spread;
 
 /// Step of every kernel.
 pub(super) const STRIDE: usize = 2;

@@ -3,18 +3,10 @@
 use skein_protocol::snapshot::SnapshotLayout;
 
 use super::*;
+use crate::vae::tests::synthetic_bytes;
 
-/// Depth images of one wall each with a square opening at some place: near, far, and nothing in between.
 fn synthetic_images(count: usize, seed: u64) -> Tensor {
-    let mut noise = Noise::new(seed);
-    let mut bytes = vec![60; count * IMAGE_PIXELS];
-    for image in bytes.chunks_exact_mut(IMAGE_PIXELS) {
-        let (top, left) = (26.0 + noise.uniform(20.0), 54.0 + noise.uniform(40.0));
-        for row in top as usize..top as usize + 20 {
-            image[row * IMAGE_WIDTH..][left as usize..left as usize + 20].fill(220);
-        }
-    }
-    images_from_bytes(&bytes)
+    images_from_bytes(&synthetic_bytes(count, seed))
 }
 
 fn vae(seed: u64) -> TorchVae {
