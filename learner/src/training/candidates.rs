@@ -143,7 +143,7 @@ impl Training<'_> {
         pass(FaultPoint::LearnerEvaluated);
         Ok(self.disk.with_room(self.directory.root(), || {
             evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;
-            evaluation::write_reconstructions(self.directory, &self.trainer, &pictured)
+            evaluation::write_reconstructions(self.directory, &mut self.trainer, &pictured)
         })?)
     }
 }
