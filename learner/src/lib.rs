@@ -3,6 +3,7 @@
 //! Training is a function of configuration and seed: flights are taken in flight order, every random draw has a seed of its own, and nothing here
 //! depends on who flew a flight, or when.
 
+pub mod allocation;
 pub mod best;
 pub mod checkpoint;
 pub mod curriculum;
@@ -22,7 +23,7 @@ pub mod report;
 pub mod sac;
 pub mod spent;
 pub mod state;
-mod threads;
+pub mod threads;
 pub mod trainer;
 pub mod training;
 pub mod vae;

@@ -23,13 +23,17 @@ impl Noise {
 
     /// Independent standard normal numbers, f32, of this shape.
     pub fn normal(&mut self, shape: &[i64], device: Device) -> Tensor {
-        let count = shape.iter().product::<i64>() as usize;
-        let mut numbers = Vec::with_capacity(count + 1);
-        while numbers.len() < count {
-            numbers.extend(self.normal_pair());
-        }
-        numbers.truncate(count);
+        let mut numbers = vec![0.0; shape.iter().product::<i64>() as usize];
+        self.fill_normal(&mut numbers);
         Tensor::from_slice(&numbers).view(shape).to_device(device)
+    }
+
+    /// Independent standard normal numbers: those that [`Noise::normal`] would give. Of an odd number of them, the other half of the last pair is lost.
+    pub fn fill_normal(&mut self, numbers: &mut [f32]) {
+        for pair in numbers.chunks_mut(2) {
+            let drawn = self.normal_pair();
+            pair.copy_from_slice(&drawn[..pair.len()]);
+        }
     }
 
     /// A number drawn evenly from `[-bound, bound)`. Exact arithmetic only, hence the same on every machine.

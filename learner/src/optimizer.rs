@@ -5,7 +5,7 @@
 
 use tch::{Device, Kind, Tensor, no_grad_guard};
 
-use crate::state::NamedTensors;
+use crate::state::Part;
 
 const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
@@ -58,13 +58,15 @@ impl Adam {
         let _ = parameters.addcdiv_(&self.first_moment, &denominator);
     }
 
-    /// The state under names that begin with `prefix`, sharing its storage.
-    pub fn named_tensors(&self, prefix: &str) -> NamedTensors {
-        vec![
-            (format!("{prefix}.first_moment"), self.first_moment.shallow_clone()),
-            (format!("{prefix}.second_moment"), self.second_moment.shallow_clone()),
-            (format!("{prefix}.steps"), self.steps.shallow_clone()),
+    /// The state under names that begin with `prefix`.
+    pub fn parts(&mut self, prefix: &str) -> Vec<(String, Part<'_>)> {
+        [
+            ("first_moment", &self.first_moment),
+            ("second_moment", &self.second_moment),
+            ("steps", &self.steps),
         ]
+        .map(|(name, tensor)| (format!("{prefix}.{name}"), Part::Tensor(tensor.shallow_clone())))
+        .into()
     }
 }
 
@@ -77,8 +79,8 @@ mod tests {
     use crate::state::Stateful;
 
     impl Stateful for Adam {
-        fn named_tensors(&self) -> NamedTensors {
-            Adam::named_tensors(self, "adam")
+        fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+            Adam::parts(self, "adam")
         }
     }
 
@@ -140,7 +142,7 @@ mod tests {
 
         let mut resumed_parameters = parameters.copy();
         let mut resumed = Adam::new(&parameters, 1e-2);
-        resumed.load_named(&Stateful::named_tensors(&adam)).unwrap();
+        resumed.load_named(&adam.named_tensors()).unwrap();
         for gradient in &gradients[3..] {
             adam.step(&mut parameters, gradient);
             resumed.step(&mut resumed_parameters, gradient);

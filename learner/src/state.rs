@@ -1,52 +1,180 @@
-//! What a checkpoint must hold of the networks, as tensors with names.
+//! What a checkpoint must hold of the networks, as values with names.
 //!
-//! Everything that an update changes is a tensor and is listed once, by [`Stateful::named_tensors`]; storing and restoring both go through that list,
-//! so that nothing can be stored and not restored, or the other way round.
+//! Everything that an update changes is listed once, by [`Stateful::parts`]; storing and restoring both go through that list, so that nothing can be stored
+//! and not restored, or the other way round. What is stored says nothing of the engine that computed it.
 
 use std::collections::HashMap;
 
-use tch::{Kind, Tensor, no_grad_guard};
+use tch::{Device, Kind, Tensor, no_grad_guard};
 
-/// Tensors by name.
-pub type NamedTensors = Vec<(String, Tensor)>;
+/// A tensor on the processor, by name.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NamedTensor {
+    /// Its name, unique in a checkpoint.
+    pub name: String,
+    /// Its shape, outermost first.
+    pub shape: Vec<usize>,
+    /// Its values in row-major order, as many as the shape says.
+    pub values: TensorValues,
+}
 
-/// Something whose whole state is tensors.
+/// A tensor's values.
+#[derive(Debug, Clone, PartialEq)]
+pub enum TensorValues {
+    /// Parameters, moments.
+    F32(Vec<f32>),
+    /// What must be exact in double precision.
+    F64(Vec<f64>),
+    /// Counters.
+    I64(Vec<i64>),
+}
+
+impl TensorValues {
+    fn len(&self) -> usize {
+        match self {
+            Self::F32(values) => values.len(),
+            Self::F64(values) => values.len(),
+            Self::I64(values) => values.len(),
+        }
+    }
+
+    fn kind(&self) -> &'static str {
+        match self {
+            Self::F32(_) => "f32",
+            Self::F64(_) => "f64",
+            Self::I64(_) => "i64",
+        }
+    }
+}
+
+/// Where a part of a state lies.
+#[derive(Debug)]
+pub enum Part<'a> {
+    /// In the tensor library's memory, on whatever device: f32, f64 or i64. Shares its storage with the state.
+    Tensor(Tensor),
+    /// A flat vector, `[len]`.
+    Numbers(&'a mut [f32]),
+    /// A counter, `[1]`.
+    Count(&'a mut u64),
+}
+
+impl Part<'_> {
+    /// A copy of the values, with their shape.
+    fn read(&self) -> (Vec<usize>, TensorValues) {
+        match self {
+            Self::Tensor(tensor) => (shape(tensor), values(tensor)),
+            Self::Numbers(numbers) => (vec![numbers.len()], TensorValues::F32(numbers.to_vec())),
+            Self::Count(count) => (vec![1], TensorValues::I64(vec![count.cast_signed()])),
+        }
+    }
+
+    fn kind(&self) -> &'static str {
+        match self {
+            Self::Tensor(tensor) => match tensor.kind() {
+                Kind::Int64 => "i64",
+                Kind::Double => "f64",
+                _ => "f32",
+            },
+            Self::Numbers(_) => "f32",
+            Self::Count(_) => "i64",
+        }
+    }
+
+    fn shape(&self) -> Vec<usize> {
+        match self {
+            Self::Tensor(tensor) => shape(tensor),
+            Self::Numbers(numbers) => vec![numbers.len()],
+            Self::Count(_) => vec![1],
+        }
+    }
+
+    /// Takes over the values of a tensor of this kind and shape.
+    fn write(self, values: &TensorValues) {
+        match (self, values) {
+            (Self::Tensor(mut own), values) => {
+                let flat = match values {
+                    TensorValues::F32(values) => Tensor::from_slice(values),
+                    TensorValues::F64(values) => Tensor::from_slice(values),
+                    TensorValues::I64(values) => Tensor::from_slice(values),
+                };
+                own.copy_(&flat.view(own.size().as_slice()));
+            }
+            (Self::Numbers(own), TensorValues::F32(values)) => own.copy_from_slice(values),
+            (Self::Count(own), TensorValues::I64(values)) => *own = values[0].cast_unsigned(),
+            (part, values) => unreachable!("{} was compared with {}", values.kind(), part.kind()),
+        }
+    }
+}
+
+fn shape(tensor: &Tensor) -> Vec<usize> {
+    tensor.size().into_iter().map(|size| size as usize).collect()
+}
+
+fn values(tensor: &Tensor) -> TensorValues {
+    let tensor = tensor.detach().to_device(Device::Cpu).contiguous();
+    let count = tensor.numel();
+    macro_rules! values {
+        ($variant:ident, $zero:expr) => {{
+            let mut values = vec![$zero; count];
+            tensor.copy_data(&mut values, count);
+            TensorValues::$variant(values)
+        }};
+    }
+    match tensor.kind() {
+        Kind::Int64 => values!(I64, 0_i64),
+        Kind::Double => values!(F64, 0.0_f64),
+        _ => values!(F32, 0.0_f32),
+    }
+}
+
+/// Something whose whole state has names.
 pub trait Stateful {
-    /// Every tensor of the state, under a name that is unique in the learner.
-    ///
-    /// The tensors share their storage with the state: whoever writes them later than the next update copies them first.
-    fn named_tensors(&self) -> NamedTensors;
+    /// Every part of the state, under a name that is unique in the learner. To be changed in place: one list serves both ways.
+    fn parts(&mut self) -> Vec<(String, Part<'_>)>;
+
+    /// A copy of the whole state.
+    fn named_tensors(&mut self) -> Vec<NamedTensor> {
+        let parts = self.parts().into_iter();
+        parts
+            .map(|(name, part)| {
+                let (shape, values) = part.read();
+                NamedTensor { name, shape, values }
+            })
+            .collect()
+    }
 
     /// Takes the state from `stored`, which may hold other tensors besides. The next update is then bit for bit the one that would have followed.
     ///
     /// # Errors
     /// [`RestoreError`] names the first tensor that does not fit; the state is untouched then.
-    fn load_named(&mut self, stored: &[(String, Tensor)]) -> Result<(), RestoreError> {
-        let stored: HashMap<&str, &Tensor> = stored.iter().map(|(name, tensor)| (name.as_str(), tensor)).collect();
+    fn load_named(&mut self, stored: &[NamedTensor]) -> Result<(), RestoreError> {
+        let stored: HashMap<&str, &NamedTensor> = stored.iter().map(|tensor| (tensor.name.as_str(), tensor)).collect();
         let mut pairs = Vec::new();
-        for (name, own) in self.named_tensors() {
-            let found = *stored
+        for (name, own) in self.parts() {
+            let NamedTensor { shape, values, .. } = *stored
                 .get(name.as_str())
                 .ok_or_else(|| RestoreError::Missing { name: name.clone() })?;
-            if (found.size(), found.kind()) != (own.size(), own.kind()) {
+            let expected = own.shape();
+            let len: usize = expected.iter().product();
+            if (shape, values.kind(), values.len()) != (&expected, own.kind(), len) {
                 return Err(RestoreError::Shape {
                     name,
-                    expected: (own.kind(), own.size()),
-                    found: (found.kind(), found.size()),
+                    expected: format!("{} {expected:?}", own.kind()),
+                    found: format!("{} {shape:?} with {} values", values.kind(), values.len()),
                 });
             }
-            pairs.push((own, found));
+            pairs.push((own, values));
         }
         let _guard = no_grad_guard();
-        for (mut own, found) in pairs {
-            own.copy_(found);
+        for (own, values) in pairs {
+            own.write(values);
         }
         Ok(())
     }
 }
 
 /// Why a stored state cannot be taken over.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RestoreError {
     /// A tensor is not there.
     #[error("the stored state lacks the tensor {name}: it comes from another version or is damaged")]
@@ -56,15 +184,15 @@ pub enum RestoreError {
     },
     /// A tensor has another shape or kind of number.
     #[error(
-        "the stored tensor {name} is {found:?}, not {expected:?}: it was stored under another configuration of the networks"
+        "the stored tensor {name} is {found}, not {expected}: it was stored under another configuration of the networks"
     )]
     Shape {
         /// Its name.
         name: String,
         /// Kind and shape this configuration needs.
-        expected: (Kind, Vec<i64>),
-        /// Kind and shape found.
-        found: (Kind, Vec<i64>),
+        expected: String,
+        /// Kind, shape and number of values found.
+        found: String,
     },
 }
 
@@ -72,40 +200,65 @@ pub enum RestoreError {
 mod tests {
     use super::*;
 
-    struct Pair(Tensor, Tensor);
+    /// A part of each sort.
+    struct Three(Tensor, Vec<f32>, u64);
 
-    impl Stateful for Pair {
-        fn named_tensors(&self) -> NamedTensors {
+    impl Stateful for Three {
+        fn parts(&mut self) -> Vec<(String, Part<'_>)> {
             vec![
-                ("first".into(), self.0.shallow_clone()),
-                ("second".into(), self.1.shallow_clone()),
+                ("first".into(), Part::Tensor(self.0.shallow_clone())),
+                ("second".into(), Part::Numbers(&mut self.1)),
+                ("third".into(), Part::Count(&mut self.2)),
             ]
         }
     }
 
-    fn pair(values: [f32; 2]) -> Pair {
-        Pair(Tensor::from_slice(&values[..1]), Tensor::from_slice(&values[1..]))
+    fn three(values: [f32; 2], count: u64) -> Three {
+        let first = Tensor::from_slice(&[values[0] as f64, -1.5]).view([1, 2]);
+        Three(first, vec![values[1]; 3], count)
     }
 
     #[test]
     fn a_state_is_taken_over_by_name() {
-        let mut stored = pair([1.0, 2.0]).named_tensors();
+        let mut stored = three([1.0, 2.0], 7).named_tensors();
+        assert_eq!(
+            stored[0],
+            NamedTensor {
+                name: "first".into(),
+                shape: vec![1, 2],
+                values: TensorValues::F64(vec![1.0, -1.5])
+            }
+        );
+        let mut state = three([0.0, 0.0], 0);
         stored.reverse();
-        let mut state = pair([0.0, 0.0]);
         state.load_named(&stored).unwrap();
-        assert_eq!((state.0.double_value(&[0]), state.1.double_value(&[0])), (1.0, 2.0));
+        stored.reverse();
+        assert_eq!(state.named_tensors(), stored);
+        assert_eq!(
+            (state.0.double_value(&[0, 0]), &state.1[..], state.2),
+            (1.0, &[2.0; 3][..], 7)
+        );
     }
 
     #[test]
     fn a_state_that_does_not_fit_changes_nothing() {
-        let mut state = pair([0.0, 0.0]);
-        let first = || ("first".to_owned(), Tensor::from_slice(&[1.0_f32]));
-        let missing = state.load_named(&[first()]).unwrap_err();
-        assert_eq!(missing, RestoreError::Missing { name: "second".into() });
-        let misshapen = state
-            .load_named(&[first(), ("second".into(), Tensor::from_slice(&[1.0_f64]))])
-            .unwrap_err();
-        assert!(misshapen.to_string().contains("second"), "{misshapen}");
-        assert_eq!(state.0.double_value(&[0]), 0.0);
+        let stored = three([1.0, 2.0], 7).named_tensors();
+        let mut state = three([0.0, 0.0], 0);
+        let before = state.named_tensors();
+        let missing = state.load_named(&stored[..2]).unwrap_err();
+        assert_eq!(missing, RestoreError::Missing { name: "third".into() });
+        let misfits: [(usize, &[usize], TensorValues); 4] = [
+            (0, &[1, 2], TensorValues::F32(vec![1.0; 2])),
+            (1, &[1, 3], TensorValues::F32(vec![1.0; 3])),
+            (1, &[3], TensorValues::F32(vec![1.0; 2])),
+            (2, &[0], TensorValues::I64(vec![])),
+        ];
+        for (place, shape, values) in misfits {
+            let mut stored = stored.clone();
+            (stored[place].shape, stored[place].values) = (shape.to_vec(), values);
+            let error = state.load_named(&stored).unwrap_err().to_string();
+            assert!(error.contains(&stored[place].name), "{error}");
+        }
+        assert_eq!(state.named_tensors(), before);
     }
 }

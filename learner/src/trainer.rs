@@ -5,24 +5,24 @@
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_protocol::config::Config;
+use skein_kernels::{Isa, Team};
+use skein_protocol::config::{Config, Engine};
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::Exploration;
-use skein_protocol::{IMAGE_PIXELS, LATENT};
-use tch::{Device, Kind, TchError, Tensor};
 
-use crate::checkpoint::{NamedTensor, Progress, TensorValues};
+use crate::checkpoint::Progress;
 use crate::device::{self, DeviceError};
 use crate::error::UpdateError;
 use crate::flight::CommittedFlight;
 use crate::flights::assembly::Keep;
 use crate::noise::Noise;
 use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
-use crate::sac::{Batch, Columns, Sac, SacMetrics};
-use crate::state::{self, NamedTensors, Stateful};
-use crate::vae::{Vae, VaeMetrics, images_from_bytes};
+use crate::sac::{Columns, Sac, SacMetrics};
+use crate::state::{self, NamedTensor, Stateful};
+use crate::vae::{Vae, VaeMetrics};
 
 /// Images encoded at once when stored codes are made anew.
 const ENCODE_CHUNK: usize = 64;
@@ -33,15 +33,6 @@ pub enum TrainerRestoreError {
     /// Of the networks.
     #[error(transparent)]
     Networks(#[from] state::RestoreError),
-    /// A tensor of a shape that there cannot be.
-    #[error("the stored tensor {name} is none: {source}")]
-    Tensor {
-        /// Its name.
-        name: String,
-        /// What the tensor library says of it.
-        #[source]
-        source: TchError,
-    },
     /// Of the replay buffer.
     #[error(transparent)]
     Replay(#[from] replay::RestoreError),
@@ -62,7 +53,8 @@ pub enum TrainerRestoreError {
 pub struct Trainer {
     config: Config,
     layout: SnapshotLayout,
-    device: Device,
+    /// Threads of the native engine.
+    team: Team,
     vae: Vae,
     sac: Sac,
     replay: Replay,
@@ -70,18 +62,30 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Untrained networks and an empty buffer. Sets the calling thread's tensor threads: training belongs on this thread.
+    /// Untrained networks and an empty buffer. Starts the native engine's threads, and sets the calling thread's tensor threads: training belongs on this thread.
     ///
     /// # Errors
     /// [`DeviceError`] when the configured device does not exist.
     pub fn new(config: &Config) -> Result<Self, DeviceError> {
         device::use_threads(config.run.learner_threads);
         let device = device::open(config.run.device)?;
+        let engine = config.run.engine();
+        let (isa, threads) = (Isa::best(), config.run.learner_threads);
+        tracing::info!(%engine, device = %config.run.device, %isa, threads, "networks are computed");
         Ok(Self {
             layout: SnapshotLayout::of(config),
-            device,
-            vae: Vae::new(&config.vae, config.run.seed, device),
-            sac: Sac::new(&config.sac, config.learning.observation, config.run.seed, device),
+            team: Team::new(match engine {
+                Engine::Native => threads,
+                Engine::Libtorch => 1,
+            }),
+            vae: Vae::new(&config.vae, &config.run, device),
+            sac: Sac::new(
+                &config.sac,
+                config.learning.observation,
+                config.run.seed,
+                engine,
+                device,
+            ),
             replay: Replay::new(config),
             steps: 0,
             config: config.clone(),
@@ -98,9 +102,8 @@ impl Trainer {
         tensors: &[NamedTensor],
         replay: ReplayState,
     ) -> Result<(), TrainerRestoreError> {
-        let tensors: NamedTensors = tensors.iter().map(restored).collect::<Result<_, _>>()?;
-        self.vae.load_named(&tensors)?;
-        self.sac.load_named(&tensors)?;
+        self.vae.load_named(tensors)?;
+        self.sac.load_named(tensors)?;
         self.replay = Replay::restore(&self.config, replay)?;
         self.steps = progress.environment_steps;
         for (what, found, expected) in [
@@ -165,7 +168,7 @@ impl Trainer {
         if self.vae_is_frozen()
             && let Some(depth) = flight.depth.take()
         {
-            for (observation, latent) in flight.observations.iter_mut().zip(self.encode(&depth)) {
+            for (observation, latent) in flight.observations.iter_mut().zip(self.vae.encode(&depth)) {
                 observation.latent = latent;
             }
         }
@@ -173,13 +176,15 @@ impl Trainer {
         self.replay.insert(flight)
     }
 
-    /// Trains the VAE as far as the steps flown ask for, and freezes it when its time is over. `after_each` may do something between steps, and give up.
+    /// Trains the VAE as far as the steps flown ask for, and freezes it when its time is over. `after_each` may do something between steps, and give up;
+    /// `timer` is told what the time went into.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
     pub fn train_vae<E: From<UpdateError>>(
         &mut self,
         epoch: Epoch,
+        timer: &mut LapTimer,
         mut after_each: impl FnMut(&VaeMetrics) -> Result<(), E>,
     ) -> Result<Option<VaeMetrics>, E> {
         if self.vae_is_frozen() {
@@ -194,12 +199,15 @@ impl Trainer {
         while self.vae.updates() < due {
             self.replay
                 .sample_images(&mut rng, self.config.vae.batch_size, &mut images);
-            let metrics = self.vae.update(&images_from_bytes(&images), &mut noise)?;
+            timer.lap(Stage::SampleImages, 1);
+            let metrics = self.vae.update(&images, &mut noise)?;
+            timer.lap(Stage::VaeStep, 1);
             after_each(&metrics)?;
             last = Some(metrics);
         }
         if self.steps >= self.config.vae.train_steps as u64 {
             self.freeze_vae();
+            timer.lap(Stage::Recode, 1);
         }
         Ok(last)
     }
@@ -208,18 +216,19 @@ impl Trainer {
         tracing::info!(steps = self.steps, vae_updates = self.vae.updates(), "VAE frozen");
         let Self { vae, replay, .. } = self;
         let frozen: Result<(), std::convert::Infallible> =
-            replay.freeze_latents(ENCODE_CHUNK, |images| Ok(encode(vae, images)));
+            replay.freeze_latents(ENCODE_CHUNK, |images| Ok(vae.encode(images)));
         let Ok(()) = frozen;
     }
 
     /// Does the SAC updates that the steps flown since the warm-up ask for; returns the means of their metrics. `after_each` may do something
-    /// between updates, and give up.
+    /// between updates, and give up; `timer` is told what the time went into.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
     pub fn train_policy<E: From<UpdateError>>(
         &mut self,
         epoch: Epoch,
+        timer: &mut LapTimer,
         mut after_each: impl FnMut(&SacMetrics) -> Result<(), E>,
     ) -> Result<Option<SacMetrics>, E> {
         let learning = &self.config.learning;
@@ -231,9 +240,9 @@ impl Trainer {
         let mut means = Means::default();
         while self.sac.updates() < due {
             self.replay.sample(&mut rng, self.config.sac.batch_size, &mut minibatch);
-            let metrics = self
-                .sac
-                .update(&Batch::new(columns(&minibatch), self.device), &mut noise)?;
+            timer.lap(Stage::Sample, 1);
+            let metrics = self.sac.update(&mut self.team, columns(&minibatch), &mut noise)?;
+            timer.lap(Stage::SacUpdate, 1);
             means.add(&metrics);
             after_each(&metrics)?;
         }
@@ -253,37 +262,17 @@ impl Trainer {
     }
 
     /// `images` as the VAE sees them: `[n, 72, 128]` u8, both ways.
-    pub fn reconstruct(&self, images: &[u8]) -> Vec<u8> {
-        let depth = self.vae.reconstruct(&images_from_bytes(images));
-        let grey = (depth * 255.0)
-            .round()
-            .clamp(0.0, 255.0)
-            .to_kind(Kind::Uint8)
-            .to_device(Device::Cpu);
-        let mut bytes = vec![0; images.len()];
-        grey.copy_data(&mut bytes, images.len());
-        bytes
+    pub fn reconstruct(&mut self, images: &[u8]) -> Vec<u8> {
+        let depth = self.vae.reconstruct(images).into_iter();
+        depth.map(|depth| (depth * 255.0).round_ties_even() as u8).collect()
     }
 
-    fn encode(&self, images: &[u8]) -> Vec<[f32; LATENT]> {
-        encode(&self.vae, images)
+    /// Copies of all tensors that updates change.
+    pub fn tensors(&mut self) -> Vec<NamedTensor> {
+        let mut all = self.vae.named_tensors();
+        all.extend(self.sac.named_tensors());
+        all
     }
-
-    /// All tensors that updates change, copied to the processor.
-    pub fn tensors(&self) -> Vec<NamedTensor> {
-        let all = self.vae.named_tensors().into_iter().chain(self.sac.named_tensors());
-        all.map(|(name, tensor)| stored(name, &tensor)).collect()
-    }
-}
-
-fn encode(vae: &Vae, images: &[u8]) -> Vec<[f32; LATENT]> {
-    let codes = vae
-        .encode(&images_from_bytes(images))
-        .to_device(Device::Cpu)
-        .contiguous();
-    let mut values = vec![[0.0_f32; LATENT]; images.len() / IMAGE_PIXELS];
-    codes.copy_data(values.as_flattened_mut(), images.len() / IMAGE_PIXELS * LATENT);
-    values
 }
 
 fn columns(minibatch: &Minibatch) -> Columns<'_> {
@@ -293,36 +282,6 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
         rewards: &minibatch.rewards,
         next_observations: &minibatch.next_observations,
         terminated: &minibatch.terminated,
-    }
-}
-
-fn stored(name: String, tensor: &Tensor) -> NamedTensor {
-    let tensor = tensor.detach().to_device(Device::Cpu).contiguous();
-    let count = tensor.numel();
-    macro_rules! values {
-        ($variant:ident, $zero:expr) => {{
-            let mut values = vec![$zero; count];
-            tensor.copy_data(&mut values, count);
-            TensorValues::$variant(values)
-        }};
-    }
-    let values = match tensor.kind() {
-        Kind::Int64 => values!(I64, 0_i64),
-        Kind::Double => values!(F64, 0.0_f64),
-        _ => values!(F32, 0.0_f32),
-    };
-    NamedTensor {
-        name,
-        shape: tensor.size().into_iter().map(|size| size as usize).collect(),
-        values,
-    }
-}
-
-fn restored(stored: &NamedTensor) -> Result<(String, Tensor), TrainerRestoreError> {
-    let name = stored.name.clone();
-    match stored.to_tensor() {
-        Ok(tensor) => Ok((name, tensor)),
-        Err(source) => Err(TrainerRestoreError::Tensor { name, source }),
     }
 }
 

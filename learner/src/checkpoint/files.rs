@@ -13,8 +13,9 @@ use skein_protocol::snapshot::Snapshot;
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, durable};
 
 use super::manifest::Manifest;
-use super::{CheckpointError, CheckpointState, NamedTensor, Progress, TensorValues};
+use super::{CheckpointError, CheckpointState, Progress};
 use crate::replay::{ReplayState, RingState};
+use crate::state::{NamedTensor, TensorValues};
 
 const TENSORS: &str = "tensors.safetensors";
 const REPLAY: &str = "replay.safetensors";

@@ -26,13 +26,14 @@ mod writer;
 use serde::{Deserialize, Serialize};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::Snapshot;
+use skein_protocol::summary::Trained;
 use skein_protocol::ticket::Exploration;
-use tch::{TchError, Tensor};
 
 use crate::flights::assembly::Keep;
 use crate::metrics::MetricsState;
 use crate::replay::ReplayState;
 use crate::spent::Spent;
+use crate::state::NamedTensor;
 
 pub use error::CheckpointError;
 pub use store::{CheckpointStore, checkpoint_directory};
@@ -76,6 +77,8 @@ pub struct Progress {
     pub latest_candidate: Option<u64>,
     /// The best snapshot so far.
     pub best: Option<BestSnapshot>,
+    /// When a candidate first did what it was trained for.
+    pub trained: Option<Trained>,
     /// Averages over the latest flights, and where the files of metrics end.
     pub metrics: MetricsState,
     /// Time and losses so far.
@@ -97,6 +100,7 @@ impl Progress {
             evaluation_flights: 0,
             latest_candidate: None,
             best: None,
+            trained: None,
             metrics: MetricsState::new(window_flights),
             spent: Spent::default(),
         }
@@ -132,45 +136,4 @@ pub struct BestSnapshot {
     pub window_walls_passed: f64,
     /// Walls passed in the evaluation flights that confirmed it, on average.
     pub confirmed_walls_passed: f64,
-}
-
-/// A tensor on the processor, by name.
-#[derive(Debug, Clone, PartialEq)]
-pub struct NamedTensor {
-    /// Its name, unique in a checkpoint.
-    pub name: String,
-    /// Its shape, outermost first.
-    pub shape: Vec<usize>,
-    /// Its values in row-major order, as many as the shape says.
-    pub values: TensorValues,
-}
-
-impl NamedTensor {
-    /// In the tensor library's memory.
-    ///
-    /// # Errors
-    /// What the library says of a shape that it cannot count, or that is not one of so many values.
-    pub fn to_tensor(&self) -> Result<Tensor, TchError> {
-        let flat = match &self.values {
-            TensorValues::F32(values) => Tensor::from_slice(values),
-            TensorValues::F64(values) => Tensor::from_slice(values),
-            TensorValues::I64(values) => Tensor::from_slice(values),
-        };
-        let size = |&size: &usize| {
-            i64::try_from(size).map_err(|_| TchError::Shape(format!("{size} elements cannot be counted")))
-        };
-        let shape: Vec<i64> = self.shape.iter().map(size).collect::<Result<_, _>>()?;
-        flat.f_reshape(shape)
-    }
-}
-
-/// A tensor's values.
-#[derive(Debug, Clone, PartialEq)]
-pub enum TensorValues {
-    /// Parameters, moments.
-    F32(Vec<f32>),
-    /// What must be exact in double precision.
-    F64(Vec<f64>),
-    /// Counters.
-    I64(Vec<i64>),
 }

@@ -14,6 +14,7 @@ use crate::disk::Disk;
 use crate::flight::samples::{flight, with_images};
 use crate::metrics::{EventFile, Windows};
 use crate::replay::Replay;
+use crate::state::TensorValues;
 
 /// With bit patterns that only survive a copy: a negative zero, the smallest number, a NaN with a payload.
 fn state(flights: u64) -> CheckpointState {

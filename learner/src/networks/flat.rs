@@ -59,6 +59,16 @@ impl Layout {
         self.tensors.iter().map(ParameterSpec::len).sum()
     }
 
+    /// Initial values, drawn tensor by tensor in order. They depend on the seed alone.
+    pub fn initial_values(&self, seed: u64) -> Vec<f32> {
+        let mut noise = Noise::new(seed);
+        let mut values = Vec::with_capacity(self.len());
+        for tensor in &self.tensors {
+            values.extend((0..tensor.len()).map(|_| noise.uniform(tensor.initial_bound)));
+        }
+        values
+    }
+
     /// Whether nothing was described yet.
     pub fn is_empty(&self) -> bool {
         self.tensors.is_empty()
@@ -75,14 +85,10 @@ pub struct Parameters {
 }
 
 impl Parameters {
-    /// Draws initial values, tensor by tensor in order. They depend on the seed alone, not on the device.
+    /// With the layout's initial values, the same on every device.
     pub fn initialise(layout: Layout, seed: u64, device: Device) -> Self {
-        let mut noise = Noise::new(seed);
-        let mut values = Vec::with_capacity(layout.len());
-        for tensor in layout.tensors() {
-            values.extend((0..tensor.len()).map(|_| noise.uniform(tensor.initial_bound)));
-        }
-        Self::of(layout, Tensor::from_slice(&values).to_device(device))
+        let values = Tensor::from_slice(&layout.initial_values(seed));
+        Self::of(layout, values.to_device(device))
     }
 
     /// The same numbers once more, in storage of their own.

@@ -18,9 +18,34 @@ pub struct Columns<'a> {
     pub terminated: &'a [f32],
 }
 
+impl Columns<'_> {
+    /// Looks whether the columns belong together; returns the number of their rows.
+    ///
+    /// # Panics
+    /// When they have different numbers of rows, or none.
+    pub(super) fn check(&self, observation: usize) -> usize {
+        let rows = self.rewards.len();
+        assert!(rows > 0, "a minibatch has at least one transition");
+        for (column, width) in [
+            (self.observations, observation),
+            (self.actions, ACTION),
+            (self.next_observations, observation),
+            (self.terminated, 1),
+        ] {
+            let len = column.len();
+            assert_eq!(
+                len,
+                rows * width,
+                "every column of a minibatch has one row for each transition"
+            );
+        }
+        rows
+    }
+}
+
 /// A minibatch on the learner's device; see [`Columns`] for the columns.
 #[derive(Debug)]
-pub struct Batch {
+pub(super) struct Batch {
     pub(super) observations: Tensor,
     pub(super) actions: Tensor,
     pub(super) rewards: Tensor,
@@ -33,31 +58,21 @@ impl Batch {
     ///
     /// # Panics
     /// When the columns have different numbers of rows, or none.
-    pub fn new(columns: Columns<'_>, device: Device) -> Self {
-        let rows = columns.rewards.len();
-        assert!(rows > 0, "a minibatch has at least one transition");
-        let column = |values: &[f32], width: usize| {
-            assert_eq!(
-                values.len(),
-                rows * width,
-                "every column of a minibatch has one row for each transition"
-            );
-            Tensor::from_slice(values)
-                .view([rows as i64, width as i64])
-                .to_device(device)
-        };
-        let observation = columns.observations.len() / rows;
+    pub(super) fn new(columns: Columns<'_>, observation: usize, device: Device) -> Self {
+        let rows = columns.check(observation) as i64;
+        let column = |values: &[f32], shape: &[i64]| Tensor::from_slice(values).view(shape).to_device(device);
+        let observation = observation as i64;
         Self {
-            observations: column(columns.observations, observation),
-            actions: column(columns.actions, ACTION),
-            rewards: column(columns.rewards, 1).view([-1]),
-            next_observations: column(columns.next_observations, observation),
-            terminated: column(columns.terminated, 1).view([-1]),
+            observations: column(columns.observations, &[rows, observation]),
+            actions: column(columns.actions, &[rows, ACTION as i64]),
+            rewards: column(columns.rewards, &[rows]),
+            next_observations: column(columns.next_observations, &[rows, observation]),
+            terminated: column(columns.terminated, &[rows]),
         }
     }
 
     /// Transitions in the batch.
-    pub fn rows(&self) -> i64 {
+    pub(super) fn rows(&self) -> i64 {
         self.rewards.size()[0]
     }
 }

@@ -39,13 +39,20 @@ fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
         }
         trainer.take_in(flown).unwrap();
     }
-    trainer.train_vae(Epoch(epoch), |_| Ok::<_, UpdateError>(())).unwrap();
+    let (mut timer, before) = (LapTimer::start(), (trainer.vae_updates(), trainer.updates()));
     trainer
-        .train_policy(Epoch(epoch), |_| Ok::<_, UpdateError>(()))
+        .train_vae(Epoch(epoch), &mut timer, |_| Ok::<_, UpdateError>(()))
         .unwrap();
+    trainer
+        .train_policy(Epoch(epoch), &mut timer, |_| Ok::<_, UpdateError>(()))
+        .unwrap();
+    let done = (trainer.vae_updates() - before.0, trainer.updates() - before.1);
+    let booked = |stage| timer.times().of(stage).count;
+    assert_eq!((booked(Stage::SampleImages), booked(Stage::Sample)), done);
+    assert_eq!((booked(Stage::VaeStep), booked(Stage::SacUpdate)), done);
 }
 
-fn state(trainer: &Trainer, epochs: u64) -> CheckpointState {
+fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
     CheckpointState {
         progress: Progress {
             flights: epochs * FLIGHTS,
@@ -62,7 +69,7 @@ fn state(trainer: &Trainer, epochs: u64) -> CheckpointState {
 }
 
 /// Stored to disk, and taken over by a trainer that knows nothing.
-fn resumed(trainer: &Trainer, epochs: u64) -> Trainer {
+fn resumed(trainer: &mut Trainer, epochs: u64) -> Trainer {
     let directory = tempfile::tempdir().unwrap();
     let store = CheckpointStore::new(directory.path(), &config());
     store.save(&state(trainer, epochs), &[]).unwrap();
@@ -84,10 +91,10 @@ fn train(lag: u64, resumed_after: &[u64]) -> CheckpointState {
         keep.push(trainer.keep());
         learn(&mut trainer, epoch, keep[epoch as usize]);
         if resumed_after.contains(&(epoch + 1)) {
-            trainer = resumed(&trainer, epoch + 1);
+            trainer = resumed(&mut trainer, epoch + 1);
         }
     }
-    state(&trainer, 6)
+    state(&mut trainer, 6)
 }
 
 #[test]
@@ -108,8 +115,8 @@ fn a_resumed_trainer_goes_on_bit_for_bit_whenever_it_is_resumed() {
 fn a_state_that_lacks_a_tensor_or_miscounts_is_refused_by_name() {
     let mut trainer = Trainer::new(&config()).unwrap();
     learn(&mut trainer, 0, Keep::Depth);
-    let refusal = |damage: fn(&mut CheckpointState)| {
-        let mut state = state(&trainer, 1);
+    let mut refusal = |damage: fn(&mut CheckpointState)| {
+        let mut state = state(&mut trainer, 1);
         damage(&mut state);
         let mut other = Trainer::new(&config()).unwrap();
         let restored = other.restore(&state.progress, &state.tensors, state.replay);

@@ -238,7 +238,7 @@ fn read_text(path: &Path) -> io::Result<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Device, TargetEntropy};
+    use crate::config::{Device, Engine, TargetEntropy};
 
     fn load(text: &str, overrides: &[&str]) -> Result<Config, String> {
         let directory = tempfile::tempdir().unwrap();
@@ -263,6 +263,14 @@ mod tests {
         let read: Config = toml::from_str(&config.to_toml()).unwrap();
         assert_eq!(read, config);
         assert_eq!(read.digest(), config.digest());
+    }
+
+    #[test]
+    fn every_device_has_its_engine_unless_another_is_asked_for() {
+        let engine = |overrides: &[&str]| load("", overrides).unwrap().run.engine();
+        assert_eq!(engine(&[]), Engine::Native);
+        assert_eq!(engine(&["run.device=cuda:1"]), Engine::Libtorch);
+        assert_eq!(engine(&["run.engine=libtorch"]), Engine::Libtorch);
     }
 
     #[test]
@@ -358,6 +366,12 @@ mod tests {
                 vec!["learning.warmup_steps = 200000", "replay.capacity"],
             ),
             ("[run]\ndevice = \"gpu\"", vec![], vec!["gpu", "cuda:N"]),
+            ("[run]\nengine = \"jax\"", vec![], vec!["jax", "native", "libtorch"]),
+            (
+                "[run]\nengine = \"native\"",
+                vec!["run.device=cuda:1"],
+                vec!["run.engine = native", "run.device = cuda:1", "leave run.engine out"],
+            ),
             ("[sac]\ndiscount = nan", vec![], vec!["sac.discount = NaN"]),
             (
                 "",

@@ -21,7 +21,7 @@ pub use evaluation::EvaluationSection;
 pub use file::{ConfigError, culprit};
 pub use learning::{LearningSection, Observation};
 pub use replay::{ReplaySection, SuccessRule};
-pub use run::{CheckpointSection, Device, RunSection};
+pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};
 pub use transport::TransportSection;
 pub use vae::VaeSection;

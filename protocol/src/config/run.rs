@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require};
 
-/// `[run]`: seed, length, device.
+/// `[run]`: seed, length, device, engine.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunSection {
@@ -17,6 +17,10 @@ pub struct RunSection {
     pub flights: u64,
     /// Where the learner computes: `cpu` or `cuda:N`. Default `cpu`.
     pub device: Device,
+    /// What computes the learner's networks: `native` or `libtorch`. Part of the result: the two add in different orders. Default: `native` on the
+    /// processor, `libtorch` on a CUDA device, where there is no other.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub engine: Option<Engine>,
     /// Threads of the learner's tensor operations. Part of the result: another count sums in another order. Default 2.
     pub learner_threads: usize,
 }
@@ -27,12 +31,21 @@ impl Default for RunSection {
             seed: 1,
             flights: 2000,
             device: Device::Cpu,
+            engine: None,
             learner_threads: 2,
         }
     }
 }
 
 impl RunSection {
+    /// The engine that is used: the one asked for, or the device's own.
+    pub fn engine(&self) -> Engine {
+        self.engine.unwrap_or(match self.device {
+            Device::Cpu => Engine::Native,
+            Device::Cuda(_) => Engine::Libtorch,
+        })
+    }
+
     pub(super) fn validate(&self) -> Result<(), Invalid> {
         require(
             self.flights >= 1,
@@ -45,6 +58,15 @@ impl RunSection {
             "run.flights",
             self.flights,
             "is not below 2^62: flight numbers would run out",
+        )?;
+        require(
+            self.engine != Some(Engine::Native) || self.device == Device::Cpu,
+            "run.engine",
+            Engine::Native,
+            format!(
+                "cannot compute on run.device = {}: leave run.engine out, or set it to \"libtorch\", or run.device to \"cpu\"",
+                self.device
+            ),
         )?;
         require(
             (1..=256).contains(&self.learner_threads),
@@ -100,6 +122,25 @@ impl TryFrom<String> for Device {
 impl From<Device> for String {
     fn from(device: Device) -> Self {
         device.to_string()
+    }
+}
+
+/// What computes the learner's networks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Engine {
+    /// Kernels of our own, on the processor: the same bits on every one, for any number of threads.
+    Native,
+    /// libtorch with its automatic gradients: the reference, and the way to a CUDA device.
+    Libtorch,
+}
+
+impl fmt::Display for Engine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Native => "native",
+            Self::Libtorch => "libtorch",
+        })
     }
 }
 

@@ -7,14 +7,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, LazyLock};
 
-use skein_learner::checkpoint::{
-    CheckpointState, CheckpointStore, EpochOrder, NamedTensor, Progress, TensorValues, checkpoint_directory,
-};
+use skein_learner::checkpoint::{CheckpointState, CheckpointStore, EpochOrder, Progress, checkpoint_directory};
 use skein_learner::disk::Disk;
 use skein_learner::flights::assembly::Keep;
 use skein_learner::metrics::{EventFile, EventWriter, FlightRow, FlightsCsv};
 use skein_learner::replay::Replay;
-use skein_learner::state::{NamedTensors, Stateful};
+use skein_learner::state::{NamedTensor, Part, Stateful, TensorValues};
 use skein_protocol::config::Config;
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::Snapshot;
@@ -95,6 +93,8 @@ fn state() -> CheckpointState {
         },
         tensors: vec![
             tensor("single", &[3, 2], TensorValues::F32(vec![0.5; 6])),
+            tensor("flat", &[6], TensorValues::F32(vec![0.5; 6])),
+            tensor("count", &[1], TensorValues::I64(vec![3])),
             tensor("double", &[2], TensorValues::F64(vec![0.25; 2])),
             tensor("whole", &[], TensorValues::I64(vec![3])),
         ],
@@ -223,26 +223,44 @@ fn go_on(state: CheckpointState) {
     windows.walls_passed.push(1.0);
     assert!(windows.walls_passed.mean().is_some());
     assert!(windows.walls_passed.is_full() || !is_full);
-    let tensors: NamedTensors = state
-        .tensors
-        .iter()
-        .filter_map(|tensor| Some((tensor.name.clone(), tensor.to_tensor().ok()?)))
-        .collect();
-    let mut own = Own(Tensor::from_slice(&[0.0_f32; 6]).reshape([3, 2]));
-    if own.load_named(&tensors).is_ok() {
-        assert_eq!(own.0.size(), [3, 2]);
+    for part in Own::ALL {
+        let mut own = Own {
+            part,
+            tensor: Tensor::from_slice(&[0.0_f32; 6]).reshape([3, 2]),
+            numbers: vec![0.0; 6],
+            count: 0,
+        };
+        if own.load_named(&state.tensors).is_ok() {
+            let stored = state.tensors.iter().find(|tensor| tensor.name == part);
+            let shape = stored.map(|stored| &stored.shape);
+            assert_eq!(own.named_tensors().first().map(|own| &own.shape), shape);
+        }
     }
     if let Ok(mut replay) = Replay::restore(&config(), state.replay) {
         let _ = replay.insert(flight());
     }
 }
 
-/// A network of one tensor.
-struct Own(Tensor);
+/// A state of one part, of each sort that there is.
+struct Own {
+    part: &'static str,
+    tensor: Tensor,
+    numbers: Vec<f32>,
+    count: u64,
+}
+
+impl Own {
+    const ALL: [&'static str; 3] = ["single", "flat", "count"];
+}
 
 impl Stateful for Own {
-    fn named_tensors(&self) -> NamedTensors {
-        vec![("single".to_owned(), self.0.shallow_clone())]
+    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        let part = match self.part {
+            "single" => Part::Tensor(self.tensor.shallow_clone()),
+            "flat" => Part::Numbers(&mut self.numbers),
+            _ => Part::Count(&mut self.count),
+        };
+        vec![(self.part.to_owned(), part)]
     }
 }
 

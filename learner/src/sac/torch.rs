@@ -1,21 +1,23 @@
-//! One SAC update, in reading order.
+//! One SAC update with libtorch's automatic gradients, in reading order: the reference, and the way to a CUDA device.
 
 use skein_protocol::ACTION;
 use skein_protocol::config::{Observation, SacSection};
 use skein_protocol::seeds::{Purpose, derive};
 use tch::{Device, Tensor, no_grad_guard};
 
-use super::Batch;
+use super::batch::Batch;
 use super::losses::{critic_loss, policy_loss, soft_targets, temperature_loss};
+use super::{Columns, SacMetrics};
 use crate::error::{UpdateError, finite};
 use crate::networks::{Critic, Layout, Parameters, Policy};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
-use crate::state::{NamedTensors, Stateful};
+use crate::state::{Part, Stateful};
 
 /// Policy, critic, target critic and temperature, each with its optimizer.
 #[derive(Debug)]
-pub struct Sac {
+pub struct TorchSac {
+    observation: usize,
     policy: Policy,
     policy_parameters: Parameters,
     policy_optimizer: Adam,
@@ -32,35 +34,21 @@ pub struct Sac {
     target_entropy: f64,
 }
 
-/// What one SAC update reports.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SacMetrics {
-    /// Half the squared distance of the two Q estimates from their targets: rises when the policy meets something new, should not grow for long.
-    pub critic_loss: f32,
-    /// What the policy minimises, α log π - Q: falls as the value of its actions rises.
-    pub policy_loss: f32,
-    /// α before this update: the price of certainty, in units of reward for each nat of entropy.
-    pub temperature: f32,
-    /// Estimate of the policy's entropy in nats, -log π of drawn actions: held near the target entropy by the temperature.
-    pub entropy: f32,
-    /// The smaller Q estimate of the replayed actions: the return the critic expects, entropy bonus included.
-    pub mean_value: f32,
-}
-
-impl Sac {
+impl TorchSac {
     /// Untrained networks whose parameters depend on the run's seed alone.
     pub fn new(section: &SacSection, observation: Observation, run_seed: u64, device: Device) -> Self {
-        let (observation, width) = (observation.len() as i64, section.hidden_width as i64);
+        let (inputs, width) = (observation.len() as i64, section.hidden_width as i64);
         let mut layout = Layout::default();
-        let policy = Policy::describe(&mut layout, observation, width);
+        let policy = Policy::describe(&mut layout, inputs, width);
         let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::SacParameters, 0), device);
         let mut layout = Layout::default();
-        let critic = Critic::describe(&mut layout, observation, width);
+        let critic = Critic::describe(&mut layout, inputs, width);
         let critic_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::SacParameters, 1), device);
         let log_temperature = Tensor::from_slice(&[section.initial_temperature.ln() as f32])
             .to_device(device)
             .set_requires_grad(true);
         Self {
+            observation: observation.len(),
             policy,
             policy_optimizer: Adam::new(policy_parameters.flat(), section.policy_learning_rate),
             policy_parameters,
@@ -83,8 +71,12 @@ impl Sac {
     /// # Errors
     /// [`UpdateError::NonFinite`] names what was not finite and the update's number; nothing was changed then.
     ///
+    /// # Panics
+    /// When the columns have different numbers of rows, or none.
+    ///
     /// Source: arXiv:1812.05905, algorithm 1.
-    pub fn update(&mut self, batch: &Batch, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {
+    pub fn update(&mut self, columns: Columns<'_>, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {
+        let batch = Batch::new(columns, self.observation, self.log_temperature.device());
         let action_shape = [batch.rows(), ACTION as i64];
         let mut normal = || noise.normal(&action_shape, self.log_temperature.device());
         let temperature = self.log_temperature.detach().exp();
@@ -100,7 +92,7 @@ impl Sac {
                 .smaller(&self.target_parameters, &batch.next_observations, &next.actions);
             let Batch {
                 rewards, terminated, ..
-            } = batch;
+            } = &batch;
             soft_targets(
                 rewards,
                 terminated,
@@ -166,27 +158,27 @@ impl Sac {
     }
 
     /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
-    pub fn mode(&self, observations: &Tensor) -> Tensor {
+    pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
         let _guard = no_grad_guard();
-        self.policy.mode(&self.policy_parameters, observations)
+        let observations = Tensor::from_slice(observations).view([-1, self.observation as i64]);
+        let device = self.log_temperature.device();
+        let actions = self
+            .policy
+            .mode(&self.policy_parameters, &observations.to_device(device));
+        Vec::try_from(actions.to_device(Device::Cpu).reshape([-1])).expect("actions are f32")
     }
 
-    /// Names and shapes of what [`Sac::publish`] copies.
+    /// Names and shapes of what [`TorchSac::publish`] copies.
     pub fn policy_layout(&self) -> &Layout {
         self.policy_parameters.layout()
-    }
-
-    /// Length of the policy's parameters.
-    pub fn published_len(&self) -> usize {
-        self.policy_layout().len()
     }
 
     /// Copies the policy's part of a snapshot, in the snapshot layout's order.
     ///
     /// # Panics
-    /// When `into` is not [`Sac::published_len`] long.
+    /// When `into` is not as long as the layout.
     pub fn publish(&self, into: &mut [f32]) {
-        self.policy_parameters.copy_range(0..self.published_len(), into);
+        self.policy_parameters.copy_range(0..self.policy_layout().len(), into);
     }
 
     /// Updates done so far.
@@ -195,26 +187,19 @@ impl Sac {
     }
 }
 
-impl Stateful for Sac {
-    fn named_tensors(&self) -> NamedTensors {
-        let mut tensors = vec![
-            (
-                "sac.policy.parameters".to_owned(),
-                self.policy_parameters.flat().shallow_clone(),
-            ),
-            (
-                "sac.critic.parameters".to_owned(),
-                self.critic_parameters.flat().shallow_clone(),
-            ),
-            (
-                "sac.target.parameters".to_owned(),
-                self.target_parameters.flat().shallow_clone(),
-            ),
-            ("sac.log_temperature".to_owned(), self.log_temperature.detach()),
+impl Stateful for TorchSac {
+    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        let own = [
+            ("sac.policy.parameters", self.policy_parameters.flat().shallow_clone()),
+            ("sac.critic.parameters", self.critic_parameters.flat().shallow_clone()),
+            ("sac.target.parameters", self.target_parameters.flat().shallow_clone()),
+            ("sac.log_temperature", self.log_temperature.detach()),
         ];
-        tensors.extend(self.policy_optimizer.named_tensors("sac.policy.adam"));
-        tensors.extend(self.critic_optimizer.named_tensors("sac.critic.adam"));
-        tensors.extend(self.temperature_optimizer.named_tensors("sac.temperature.adam"));
-        tensors
+        let own = own.map(|(name, tensor)| (name.to_owned(), Part::Tensor(tensor)));
+        let mut parts = Vec::from(own);
+        parts.extend(self.policy_optimizer.parts("sac.policy.adam"));
+        parts.extend(self.critic_optimizer.parts("sac.critic.adam"));
+        parts.extend(self.temperature_optimizer.parts("sac.temperature.adam"));
+        parts
     }
 }

@@ -1,0 +1,125 @@
+//! Actions drawn from the policy, their log-probability, and the way back through both.
+//!
+//! The same functions as those of [`crate::networks::Policy`], element by element, and their derivatives.
+
+use std::f32::consts::LN_2;
+
+use skein_kernels::{Isa, exp};
+use skein_protocol::{ACTION, LOG_STD};
+
+/// Numbers of the policy's output in a row: means, and logarithms of standard deviations.
+const OUTPUTS: usize = 2 * ACTION;
+/// ½ ln 2π.
+const HALF_LN_TAU: f32 = 0.918_938_5;
+
+/// Actions drawn for rows of observations. All but `log_prob` are `[rows, 2]`.
+#[derive(Debug, Default)]
+pub(super) struct Sample {
+    /// Standard normal noise: to be filled before anything is drawn.
+    pub(super) noise: Vec<f32>,
+    mean: Vec<f32>,
+    /// As the network gave it, unbounded.
+    log_std: Vec<f32>,
+    /// std · noise.
+    deviation: Vec<f32>,
+    /// Inside (-1, 1).
+    pub(super) actions: Vec<f32>,
+    /// Derivative of tanh.
+    slope: Vec<f32>,
+    element_log_prob: Vec<f32>,
+    /// log π(action | observation) in nats, `[rows]`.
+    pub(super) log_prob: Vec<f32>,
+}
+
+impl Sample {
+    /// Places for so many rows.
+    pub(super) fn places(rows: usize) -> Self {
+        let element = || vec![0.0; rows * ACTION];
+        Self {
+            noise: element(),
+            mean: element(),
+            log_std: element(),
+            deviation: element(),
+            actions: element(),
+            slope: element(),
+            element_log_prob: element(),
+            log_prob: vec![0.0; rows],
+        }
+    }
+
+    /// a = tanh(x), x = mean + std · noise, and log π(a) (arXiv:1812.05905, eq. 26). `output`: the policy network's, `[rows, 4]`.
+    pub(super) fn draw(&mut self, isa: Isa, output: &[f32]) {
+        let rows = output.chunks_exact(OUTPUTS);
+        let own = self
+            .mean
+            .chunks_exact_mut(ACTION)
+            .zip(self.log_std.chunks_exact_mut(ACTION));
+        for (row, (mean, log_std)) in rows.zip(own) {
+            mean.copy_from_slice(&row[..ACTION]);
+            log_std.copy_from_slice(&row[ACTION..]);
+        }
+        let Self {
+            noise,
+            mean,
+            log_std,
+            deviation,
+            actions,
+            slope,
+            element_log_prob,
+            ..
+        } = self;
+        let given = noise.iter().zip(mean).zip(log_std);
+        let made = deviation.iter_mut().zip(actions).zip(slope).zip(element_log_prob);
+        isa.vectorised(|| {
+            for (((noise, mean), log_std), (((deviation, action), slope), log_prob)) in given.zip(made) {
+                let log_std = log_std.clamp(LOG_STD.0, LOG_STD.1);
+                *deviation = exp(log_std) * noise;
+                let x = *mean + *deviation;
+                // With e = exp(-2|x|): tanh|x| = (1 - e) / (1 + e), its derivative 4 e / (1 + e)²: exact where tanh saturates.
+                let e = exp(-2.0 * x.abs());
+                *action = ((1.0 - e) / (1.0 + e)).copysign(x);
+                *slope = 4.0 * e / ((1.0 + e) * (1.0 + e));
+                // log(1 - tanh²x) = 2 (ln 2 - x - softplus(-2x)) = 2 (ln 2 - |x| - ln(1 + e)).
+                let correction = 2.0 * (LN_2 - x.abs() - ln_1p(e));
+                *log_prob = -0.5 * noise * noise - log_std - HALF_LN_TAU - correction;
+            }
+        });
+        let elements = self.element_log_prob.chunks_exact(ACTION);
+        for (log_prob, elements) in self.log_prob.iter_mut().zip(elements) {
+            *log_prob = elements.iter().sum();
+        }
+    }
+
+    /// What flows back to the policy network's output from the rows behind the first `skipped`, `[rows, 4]`, when `log_prob_gradient` flows back to each log π
+    /// and `action_gradient`, `[rows, 2]`, to the actions.
+    ///
+    /// ∂log π/∂x = 2 tanh x; ∂a/∂x = 1 - tanh²x; ∂x/∂mean = 1, ∂x/∂log_std = std · noise; ∂log π/∂log_std = -1 besides. Nothing flows through a bound of log_std.
+    pub(super) fn backward(&self, skipped: usize, log_prob_gradient: f32, action_gradient: &[f32], into: &mut [f32]) {
+        for (row, into) in into.chunks_exact_mut(OUTPUTS).enumerate() {
+            for dimension in 0..ACTION {
+                let at = (skipped + row) * ACTION + dimension;
+                let by_action = action_gradient[row * ACTION + dimension];
+                let by_x = log_prob_gradient * 2.0 * self.actions[at] + by_action * self.slope[at];
+                into[dimension] = by_x;
+                let free = (LOG_STD.0..=LOG_STD.1).contains(&self.log_std[at]);
+                into[ACTION + dimension] = if free {
+                    by_x * self.deviation[at] - log_prob_gradient
+                } else {
+                    0.0
+                };
+            }
+        }
+    }
+}
+
+/// ln(1 + e) for e in [0, 1], within 1e-7: 2 artanh s with s = e / (2 + e) ≤ ⅓, by its series up to s¹⁵ (remainder below 1e-9).
+#[inline(always)]
+fn ln_1p(e: f32) -> f32 {
+    let s = e / (2.0 + e);
+    let square = s * s;
+    let mut sum = 1.0 / 15.0;
+    for factor in [1.0 / 13.0, 1.0 / 11.0, 1.0 / 9.0, 1.0 / 7.0, 1.0 / 5.0, 1.0 / 3.0, 1.0] {
+        sum = square.mul_add(sum, factor);
+    }
+    2.0 * s * sum
+}
