@@ -45,7 +45,7 @@ mkdir -p "$results"
 export CRITERION_HOME=$results/criterion
 
 # Criterion's own settings: long enough for a median that holds still, short enough for the whole table.
-timing=(--warm-up-time 0.5 --measurement-time 3 --sample-size 30 --nresamples 10000)
+timing=(--warm-up-time 0.5 --measurement-time 3 --sample-size 60 --nresamples 10000)
 [[ -z $quick ]] || timing=(--warm-up-time 0.05 --measurement-time 0.1 --sample-size 10 --nresamples 1000)
 
 # The last core that this shell may use: the first often serves the system's interrupts.

@@ -12,19 +12,19 @@ use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 
 /// As in `local.toml`.
-pub const OBSERVATION: Observation = Observation::LatentVelocity;
+pub(crate) const OBSERVATION: Observation = Observation::LatentVelocity;
 
 /// A run whose only learner is this process.
-pub struct Learner {
-    pub identity: RunIdentity,
-    pub config: Config,
-    pub ports: LearnerPorts,
+pub(crate) struct Learner {
+    pub(crate) identity: RunIdentity,
+    pub(crate) config: Config,
+    pub(crate) ports: LearnerPorts,
     _seat: LearnerSeat,
-    pub directory: tempfile::TempDir,
+    pub(crate) directory: tempfile::TempDir,
 }
 
 impl Learner {
-    pub fn open() -> Self {
+    pub(crate) fn open() -> Self {
         let directory = tempfile::tempdir().expect("there is room for a configuration");
         let run = RunDirectory::new(directory.path());
         let mut config = Config::default();
@@ -46,7 +46,7 @@ impl Learner {
     }
 
     /// Of random parameters, uniform in about PyTorch's default range: numbers of ordinary size run through all layers.
-    pub fn snapshot(&self) -> Snapshot {
+    pub(crate) fn snapshot(&self) -> Snapshot {
         let layout = SnapshotLayout::of(&self.config);
         let mut rng = Pcg64Mcg::seed_from_u64(1);
         let mut values = vec![0.0; layout.values()];
@@ -62,7 +62,7 @@ impl Learner {
 }
 
 /// A training flight with that snapshot.
-pub fn ticket(run: RunId, flight: u64, level: u8) -> Ticket {
+pub(crate) fn ticket(run: RunId, flight: u64, level: u8) -> Ticket {
     Ticket {
         run,
         flight: FlightId(flight),

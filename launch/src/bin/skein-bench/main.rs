@@ -126,7 +126,7 @@ fn tell(directory: &Path, only: &[String], judging: Judging, pictures: Option<&P
         (Judging::Nothing, _) => println!("Run to see that the benchmarks work: these times mean nothing."),
         (Judging::Times, None) => {}
         (Judging::Times, Some((name, times))) => println!(
-            "Times are those of the fastest of 30 samples; the median was up to {times:.2} times that, at {name}."
+            "Times are those of the fastest of 60 samples; the median was up to {times:.2} times that, at {name}."
         ),
     }
 
