@@ -24,12 +24,16 @@ build() {
     }
 }
 
+# Where cargo builds. Asked, not assumed: CARGO_TARGET_DIR or the user's own cargo configuration may put it elsewhere.
+target_directory() {
+    (cd "$repository" && cargo metadata --locked --no-deps --format-version 1) |
+        sed -n 's/.*"target_directory":"\([^"]*\)".*/\1/p'
+}
+
 # Replaces the script by one of the built programs.
 run_built() {
     local program=$1 target
     shift
-    # Asked, not assumed: CARGO_TARGET_DIR or the user's own cargo configuration may put it elsewhere.
-    target=$(cd "$repository" && cargo metadata --locked --no-deps --format-version 1 |
-        sed -n 's/.*"target_directory":"\([^"]*\)".*/\1/p')
+    target=$(target_directory)
     exec "$target/release/$program" "$@"
 }

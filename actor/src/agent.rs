@@ -3,6 +3,7 @@
 use rand::{Rng, RngExt};
 use skein_protocol::ACTION;
 use skein_protocol::config::Observation;
+use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Exploration;
 use skein_protocol::transition::TransitionRecord;
 use skein_simulator::simulator::Simulator;
@@ -28,14 +29,22 @@ impl Agent {
         }
     }
 
-    /// Looks through the drone's camera: the image is rendered into `record`, wherever that lies, and encoded from there.
-    pub fn observe(&mut self, simulator: &mut Simulator, network: &Network, record: &mut TransitionRecord) {
+    /// Looks through the drone's camera: the image is rendered into `record`, wherever that lies, and encoded from there. `lap` is called after each.
+    pub fn observe(
+        &mut self,
+        simulator: &mut Simulator,
+        network: &Network,
+        record: &mut TransitionRecord,
+        mut lap: impl FnMut(Stage),
+    ) {
         simulator.render(&mut record.depth);
+        lap(Stage::Camera);
         record.latent = network.encode(&record.depth, &mut self.scratch);
         let state = simulator.state();
         record.position_m = state.position_m.coords.into();
         record.orientation = state.world_from_body.coords.into();
         record.velocity_mps = state.velocity_mps.into();
+        lap(Stage::Encoder);
     }
 
     /// Chooses an action on the observation in `record`, each command in [-1, 1]. `noise` is drawn from unless the policy's mode is asked for.

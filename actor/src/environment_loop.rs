@@ -12,6 +12,7 @@ use skein_protocol::ACTION;
 use skein_protocol::evaluation::FlightScore;
 use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::seeds::{Purpose, derive};
+use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
 use skein_simulator::course::{Course, NoSuchLevel};
@@ -72,7 +73,9 @@ impl Pilot {
             Ok(simulator) => simulator,
             Err(fault) => return Err(give_up(fault, record, link)),
         };
-        self.agent.observe(simulator, network, &mut record);
+        link.lap(Stage::TakeOff);
+        self.agent
+            .observe(simulator, network, &mut record, |stage| link.lap(stage));
 
         let mut previous_action = [0.0; ACTION];
         let mut flight_return = 0.0;
@@ -83,14 +86,17 @@ impl Pilot {
             let action = self
                 .agent
                 .act(ticket.exploration, network, &record, &previous_action, &mut noise);
+            link.lap(Stage::Policy);
             let report = match simulator.step(action) {
                 Ok(report) => report,
                 Err(error) => return Err(give_up(error.into(), record, link)),
             };
+            link.lap(Stage::Physics);
 
             // The reward looks at what the action led to, so the next image comes before this record is complete.
             let mut next = begin(link, step)?;
-            self.agent.observe(simulator, network, &mut next);
+            self.agent
+                .observe(simulator, network, &mut next, |stage| link.lap(stage));
             let reward = RewardTerms::of(&self.reward, &report, &next.depth);
             complete(&mut record, action, &report, &reward);
             link.send(record).map_err(FlightError::Link)?;
@@ -138,6 +144,9 @@ pub trait RecordLink {
     /// # Errors
     /// When that cannot be known.
     fn directive(&mut self) -> Result<Directive, Self::Error>;
+
+    /// Told at the end of each stage of a step, for whoever wants to know where the time goes; what it does itself, a link books itself.
+    fn lap(&mut self, _stage: Stage) {}
 }
 
 /// Whether to fly on.

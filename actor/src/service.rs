@@ -165,7 +165,7 @@ fn serve_life(pilot: &mut Pilot, line: &mut LearnerLine<'_>) -> Result<Parting, 
         }
         match line.take_ticket() {
             Some((ticket, network)) => fly(pilot, &ticket, &network, line)?,
-            None => line.wait(),
+            None => line.wait()?,
         }
     };
     info!(?parting, flights = line.flights_flown, "leaving");
@@ -194,5 +194,6 @@ fn fly(pilot: &mut Pilot, ticket: &Ticket, network: &Network, line: &mut Learner
         // The ticket's deadline makes good for it.
         Err(FlightError::Link(error)) => warn!(%error, "flight lost"),
     }
-    line.wake_learner()
+    // Here, so that the times of a flight that is taken in are known too.
+    line.report(ActorState::Serving)
 }

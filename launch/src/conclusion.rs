@@ -1,4 +1,4 @@
-//! What the user is told at the end of a run: the evaluation, and where everything lies.
+//! What the user is told at the end of a run: the evaluation, where the time went, and where everything lies.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -6,11 +6,12 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::run::RunDirectory;
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::stages::Times;
+use skein_protocol::summary::{Ending, Summary, Trained};
 
 use crate::display::Clock;
 
-/// The evaluation table, the run in one sentence, and the paths of everything it left, for standard output. What a run did not come to write is left out.
+/// The evaluation table, the run in one sentence, the table of where the time went, and the paths of everything it left, for standard output. What a run did not come to write is left out.
 pub fn conclusion(run: &RunDirectory) -> String {
     let mut text = String::new();
     if let Some(report) = read::<EvaluationReport>(&run.evaluation_json()) {
@@ -23,7 +24,13 @@ pub fn conclusion(run: &RunDirectory) -> String {
         );
     }
     if let Some(summary) = Summary::of(run) {
+        if let Some(trained) = &summary.trained {
+            push(&mut text, &trained_sentence(trained));
+        }
         push(&mut text, &sentence(&summary));
+        if summary.stages != Times::default() {
+            push(&mut text, &format!("{}\n", summary.stages));
+        }
     }
     push(&mut text, &format!("{}:", run.root().display()));
     for (path, meaning) in artefacts(run) {
@@ -39,6 +46,17 @@ fn push(text: &mut String, line: &str) {
 
 fn read<T: DeserializeOwned>(path: &Path) -> Option<T> {
     serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+}
+
+fn trained_sentence(trained: &Trained) -> String {
+    format!(
+        "Trained after {}: R {:.3} in evaluation flights after {} flights, {} steps, {} updates.",
+        Clock(trained.wall_secs),
+        trained.rate,
+        trained.flights,
+        trained.steps,
+        trained.updates
+    )
 }
 
 fn sentence(summary: &Summary) -> String {
@@ -64,8 +82,8 @@ fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
     [
         (run.config(), "the resolved configuration"),
         (run.flights_csv(), "one row per training flight"),
-        (run.evaluation_json(), "the table above"),
-        (run.summary_json(), "counts, times, policy_sha256"),
+        (run.evaluation_json(), "the evaluation above"),
+        (run.summary_json(), "counts, times above, policy_sha256"),
         (plot("return.png"), "return over the training flights"),
         (plot("walls_passed.png"), "walls passed over the training flights"),
         (
@@ -88,9 +106,11 @@ fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
 mod tests {
     use std::collections::BTreeMap;
     use std::fs;
+    use std::time::Duration;
 
     use skein_protocol::evaluation::CourseEvaluation;
     use skein_protocol::ids::{PolicyVersion, RunId};
+    use skein_protocol::stages::Stage;
 
     use super::*;
 
@@ -103,6 +123,8 @@ mod tests {
             policy_sha256: "00".to_owned(),
             courses: vec![CourseEvaluation::of("training", 5, &[])],
         };
+        let mut stages = Times::default();
+        stages.add(Stage::Encoder, 2000, Duration::from_millis(1500));
         let summary = Summary {
             skein_version: "0".to_owned(),
             run: RunId(1),
@@ -112,6 +134,13 @@ mod tests {
             final_version: PolicyVersion(50),
             best_version: None,
             best_confirmed_walls_passed: None,
+            trained: Some(Trained {
+                rate: 0.93,
+                flights: 90,
+                steps: 1800,
+                updates: 270,
+                wall_secs: 61.0,
+            }),
             flights: 100,
             steps: 2000,
             updates: 300,
@@ -123,7 +152,7 @@ mod tests {
             refused_by_reason: Default::default(),
             resumes: 0,
             wall_secs: 75.0,
-            phase_secs: BTreeMap::new(),
+            stages,
             thread_cpu_secs: BTreeMap::new(),
         };
         fs::write(run.evaluation_json(), serde_json::to_string(&report).unwrap()).unwrap();
@@ -132,7 +161,9 @@ mod tests {
         for part in [
             "version 42",
             "training",
+            "Trained after 1:01: R 0.930 in evaluation flights after 90 flights, 1800 steps",
             "Completed after 1:15: 100 flights, 2000 steps",
+            "│ actors, together    ┆ encoder ┆  2000 ┆ 1.50 s ┆ 750.00 µs ┆ 100.0 % │",
             "summary.json",
         ] {
             assert!(text.contains(part), "`{part}` is missing in\n{text}");

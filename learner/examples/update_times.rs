@@ -1,6 +1,6 @@
-//! Prints how long a VAE step and a SAC update take on this machine, the latter on both engines and as a share of what the processor can do at most.
+//! Prints how long a VAE step and a SAC update take on this machine, on both engines, and how near that is to what its cores can do.
 //!
-//! `cargo run --release -p skein-learner --example update_times -- [THREADS] [WHAT]`, where WHAT is a part of the names of what is to be timed.
+//! `cargo run --release -p skein-learner --example update_times -- [THREADS] [sac|vae]`
 
 use std::time::Instant;
 
@@ -8,7 +8,7 @@ use skein_kernels::{Isa, Team, peak_flops};
 use skein_learner::device::use_threads;
 use skein_learner::noise::Noise;
 use skein_learner::sac::{Columns, Sac};
-use skein_learner::vae::{Vae, images_from_bytes};
+use skein_learner::vae::{LAYERS, NativeVae, TorchVae, images_from_bytes};
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{Engine, Observation, SacSection, VaeSection};
 use tch::Device;
@@ -17,13 +17,24 @@ fn main() {
     let threads = std::env::args()
         .nth(1)
         .map_or(1, |argument| argument.parse().expect("THREADS is a number"));
+    let which = std::env::args().nth(2);
+    let wanted = |what: &str| which.as_deref().is_none_or(|which| which == what);
     use_threads(threads);
-    let mut team = Team::new(threads);
-    let mut noise = Noise::new(1);
     let isa = Isa::best();
-    let peak = peak_flops(isa);
-    println!("{isa}: at most {:.1} GFLOP/s a core; {threads} threads", peak / 1e9);
+    let peak = peak_flops(isa) * threads as f64;
+    println!("{isa}, peak of {threads} threads: {:.1} GFLOP/s", peak / 1e9);
+    if wanted("sac") {
+        sac(threads, peak);
+    }
+    if wanted("vae") {
+        for batch in [32, 16] {
+            vae(batch, threads, peak);
+        }
+    }
+}
 
+fn sac(threads: usize, peak: f64) {
+    let mut noise = Noise::new(1);
     let section = SacSection::default();
     let observation = Observation::LatentVelocity;
     let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(1.0)).collect() };
@@ -37,37 +48,82 @@ fn main() {
         next_observations,
         terminated: &vec![0.0; rows],
     };
+    let mut team = Team::new(threads);
     for engine in [Engine::Libtorch, Engine::Native] {
         let mut sac = Sac::new(&section, observation, 1, engine, Device::Cpu);
         let mut sac_noise = Noise::new(2);
-        let secs = report(&format!("SAC update, {engine}"), rows, 250, || {
+        let millis = report(&format!("SAC update, {engine}"), rows, 250, || {
             sac.update(&mut team, columns, &mut sac_noise)
                 .expect("random rewards are finite");
         });
-        let Some(secs) = secs else { continue };
         let operations = update_operations(rows, observation.len(), section.hidden_width);
         println!(
             "  {:.1} MFLOP, {:.1} GFLOP/s: {:.1} % of {threads} cores",
             operations / 1e6,
-            operations / secs / 1e9,
-            100.0 * operations / secs / peak / threads as f64
+            operations / millis / 1e6,
+            100.0 * operations / (millis * 1e-3 * peak)
         );
     }
+}
 
+fn vae(batch: usize, threads: usize, peak: f64) {
+    const STEPS: usize = 10;
+    let mut noise = Noise::new(1);
     let section = VaeSection::default();
-    let bytes: Vec<u8> = draw(section.batch_size * IMAGE_PIXELS)
-        .iter()
-        .map(|unit| (127.0 * unit + 128.0) as u8)
+    let bytes: Vec<u8> = (0..batch * IMAGE_PIXELS)
+        .map(|_| (127.0 * noise.uniform(1.0) + 128.0) as u8)
         .collect();
-    let mut vae = Vae::new(&section, 1, Device::Cpu);
+    let (mut native, mut torch) = (
+        NativeVae::new(&section, 1, threads),
+        TorchVae::new(&section, 1, Device::Cpu),
+    );
+    let mut spent = None;
     let mut vae_noise = Noise::new(3);
-    report("VAE step", section.batch_size, 10, || {
-        vae.update(&images_from_bytes(&bytes), &mut vae_noise)
+    let native_millis = report("VAE step, native", batch, STEPS, || {
+        if spent.is_none() {
+            let _ = native.take_spent();
+        }
+        native.update(&bytes, &mut vae_noise).expect("images are finite");
+        spent = Some(native.take_spent());
+    });
+    let torch_millis = report("VAE step, libtorch", batch, STEPS / 2, || {
+        torch
+            .update(&images_from_bytes(&bytes), &mut vae_noise)
             .expect("images are finite");
     });
+    let operations = native.operations();
+    let share_of_peak = |millis: f64| {
+        let all: f64 = operations.as_flattened().iter().sum();
+        100.0 * all * batch as f64 / (millis * 1e-3 * peak)
+    };
+    println!(
+        "  native {:.1} % of peak, libtorch {:.1} %; {:.2} times as fast",
+        share_of_peak(native_millis),
+        share_of_peak(torch_millis),
+        torch_millis / native_millis
+    );
+    let spent = spent.expect("steps were done");
+    let scale = 1.0 / threads as f64;
+    println!("  of the last step, ms by layer (% of peak): forward, backward, gradient");
+    for ((name, secs), operations) in LAYERS.iter().zip(spent.layers).zip(operations) {
+        let cells = secs.iter().zip(operations).map(|(secs, operations)| {
+            let share = 100.0 * operations * batch as f64 / (secs * peak * scale);
+            format!("{:8.2} ({share:4.1})", secs * 1e3 * scale)
+        });
+        println!("    {name:<15}{}", cells.collect::<String>());
+    }
+    println!(
+        "    Adam and packing {:.2}, rest {:.2}, total {:.2}",
+        spent.adam_and_packing * 1e3 * scale,
+        spent.rest * 1e3 * scale,
+        spent.total() * 1e3 * scale
+    );
+    report("VAE encode, native", batch, 20, || {
+        let _ = native.encode(&bytes);
+    });
     let images = images_from_bytes(&bytes);
-    report("VAE encode", section.batch_size, 20, || {
-        let _ = vae.encode(&images);
+    report("VAE encode, libtorch", batch, 20, || {
+        let _ = torch.encode(&images);
     });
 }
 
@@ -86,19 +142,16 @@ fn update_operations(rows: usize, observation: usize, width: usize) -> f64 {
     (2 * rows * (forward + gradients + back)) as f64
 }
 
-/// Runs `work` a few times to warm up, then `repetitions` times; prints and returns the median, in seconds, which a busy machine disturbs least. `None` when
-/// it was not asked for.
-fn report(what: &str, batch: usize, repetitions: usize, mut work: impl FnMut()) -> Option<f64> {
-    if std::env::args().nth(2).is_some_and(|asked| !what.contains(&asked)) {
-        return None;
-    }
-    let mut millis: Vec<f64> = (0..repetitions + repetitions / 5)
+/// Runs `work` a few times to warm up, then `repetitions` times; prints and returns the median, which a busy machine disturbs least.
+fn report(what: &str, batch: usize, repetitions: usize, mut work: impl FnMut()) -> f64 {
+    let warm_up = repetitions / 5 + 1;
+    let mut millis: Vec<f64> = (0..repetitions + warm_up)
         .map(|_| {
             let start = Instant::now();
             work();
             start.elapsed().as_secs_f64() * 1e3
         })
-        .skip(repetitions / 5)
+        .skip(warm_up)
         .collect();
     millis.sort_by(f64::total_cmp);
     println!(
@@ -106,5 +159,5 @@ fn report(what: &str, batch: usize, repetitions: usize, mut work: impl FnMut()) 
         millis[repetitions / 2],
         millis[0]
     );
-    Some(millis[repetitions / 2] / 1e3)
+    millis[repetitions / 2]
 }

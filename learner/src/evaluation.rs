@@ -133,7 +133,7 @@ fn write_path(
 /// [`EvaluationError`] names the file.
 pub fn write_reconstructions(
     directory: &RunDirectory,
-    trainer: &Trainer,
+    trainer: &mut Trainer,
     flights: &[CommittedFlight],
 ) -> Result<(), EvaluationError> {
     let depth = flights

@@ -22,7 +22,7 @@ pub mod report;
 pub mod sac;
 pub mod spent;
 pub mod state;
-mod threads;
+pub mod threads;
 pub mod trainer;
 pub mod training;
 pub mod vae;

@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, Result};
 use clap::Parser;
 use skein_learner::training::{self, TrainingError};
+use skein_protocol::allocation::keep_freed_memory;
 use skein_protocol::failure::{EXIT_START_AGAIN, with_causes};
 use skein_protocol::logging::{LogFormat, log_to_file};
 use skein_protocol::run::{LearnerSeat, RunDirectory};
@@ -26,6 +27,7 @@ struct Arguments {
 }
 
 fn main() -> ExitCode {
+    keep_freed_memory();
     match run(&Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

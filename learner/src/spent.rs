@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
+use skein_protocol::stages::Times;
 
 use crate::flights::reception::Shared;
 
@@ -12,8 +13,8 @@ use crate::flights::reception::Shared;
 pub struct Spent {
     /// Seconds from the learner's start to its end.
     pub wall_secs: f64,
-    /// Seconds of the training thread by what it did.
-    pub phase_secs: BTreeMap<String, f64>,
+    /// Time of the learner's threads and of the actors, by stage.
+    pub stages: Times,
     /// Tickets issued again, by reason.
     pub tickets_reissued: BTreeMap<String, u64>,
     /// Records refused, by reason.
@@ -21,17 +22,12 @@ pub struct Spent {
 }
 
 impl Spent {
-    /// Adds the time since `started` to `phase`.
-    pub fn add(&mut self, phase: &'static str, started: Instant) {
-        *self.phase_secs.entry(phase.to_owned()).or_default() += started.elapsed().as_secs_f64();
-    }
-
-    /// With what the present life, begun at `started`, has come to. Its phases are in already.
-    pub fn with_this_life(&self, started: Instant, shared: &Shared) -> Self {
+    /// With what the present life, begun at `started`, has come to: `training` is its training thread's time, that of all others is in `shared`.
+    pub fn with_this_life(&self, started: Instant, training: &Times, shared: &Shared) -> Self {
         let faults = shared.faults();
         Self {
             wall_secs: self.wall_secs + started.elapsed().as_secs_f64(),
-            phase_secs: self.phase_secs.clone(),
+            stages: self.stages.plus(training).plus(&shared.times()),
             tickets_reissued: sum(&self.tickets_reissued, faults.reissued_by_reason()),
             records_refused: sum(&self.records_refused, faults.refused_by_reason()),
         }

@@ -7,7 +7,7 @@ use rustix::param::clock_ticks_per_second;
 
 /// Seconds of processor time that each thread of this process has taken so far, by its name; threads of one name together, those that have ended not at
 /// all. Empty where the system does not tell.
-pub(crate) fn cpu_secs() -> BTreeMap<String, f64> {
+pub fn cpu_secs() -> BTreeMap<String, f64> {
     let mut secs = BTreeMap::new();
     for thread in fs::read_dir("/proc/self/task").into_iter().flatten().flatten() {
         let line = fs::read_to_string(thread.path().join("stat")).unwrap_or_default();

@@ -10,9 +10,8 @@ use skein_protocol::config::{Config, Engine};
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::Exploration;
-use skein_protocol::{IMAGE_PIXELS, LATENT};
-use tch::{Device, Kind};
 
 use crate::checkpoint::Progress;
 use crate::device::{self, DeviceError};
@@ -23,7 +22,7 @@ use crate::noise::Noise;
 use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
 use crate::sac::{Columns, Sac, SacMetrics};
 use crate::state::{self, NamedTensor, Stateful};
-use crate::vae::{Vae, VaeMetrics, images_from_bytes};
+use crate::vae::{Vae, VaeMetrics};
 
 /// Images encoded at once when stored codes are made anew.
 const ENCODE_CHUNK: usize = 64;
@@ -79,7 +78,7 @@ impl Trainer {
                 Engine::Native => threads,
                 Engine::Libtorch => 1,
             }),
-            vae: Vae::new(&config.vae, config.run.seed, device),
+            vae: Vae::new(&config.vae, &config.run, device),
             sac: Sac::new(
                 &config.sac,
                 config.learning.observation,
@@ -169,7 +168,7 @@ impl Trainer {
         if self.vae_is_frozen()
             && let Some(depth) = flight.depth.take()
         {
-            for (observation, latent) in flight.observations.iter_mut().zip(self.encode(&depth)) {
+            for (observation, latent) in flight.observations.iter_mut().zip(self.vae.encode(&depth)) {
                 observation.latent = latent;
             }
         }
@@ -177,13 +176,15 @@ impl Trainer {
         self.replay.insert(flight)
     }
 
-    /// Trains the VAE as far as the steps flown ask for, and freezes it when its time is over. `after_each` may do something between steps, and give up.
+    /// Trains the VAE as far as the steps flown ask for, and freezes it when its time is over. `after_each` may do something between steps, and give up;
+    /// `timer` is told what the time went into.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
     pub fn train_vae<E: From<UpdateError>>(
         &mut self,
         epoch: Epoch,
+        timer: &mut LapTimer,
         mut after_each: impl FnMut(&VaeMetrics) -> Result<(), E>,
     ) -> Result<Option<VaeMetrics>, E> {
         if self.vae_is_frozen() {
@@ -198,12 +199,15 @@ impl Trainer {
         while self.vae.updates() < due {
             self.replay
                 .sample_images(&mut rng, self.config.vae.batch_size, &mut images);
-            let metrics = self.vae.update(&images_from_bytes(&images), &mut noise)?;
+            timer.lap(Stage::SampleImages, 1);
+            let metrics = self.vae.update(&images, &mut noise)?;
+            timer.lap(Stage::VaeStep, 1);
             after_each(&metrics)?;
             last = Some(metrics);
         }
         if self.steps >= self.config.vae.train_steps as u64 {
             self.freeze_vae();
+            timer.lap(Stage::Recode, 1);
         }
         Ok(last)
     }
@@ -212,18 +216,19 @@ impl Trainer {
         tracing::info!(steps = self.steps, vae_updates = self.vae.updates(), "VAE frozen");
         let Self { vae, replay, .. } = self;
         let frozen: Result<(), std::convert::Infallible> =
-            replay.freeze_latents(ENCODE_CHUNK, |images| Ok(encode(vae, images)));
+            replay.freeze_latents(ENCODE_CHUNK, |images| Ok(vae.encode(images)));
         let Ok(()) = frozen;
     }
 
     /// Does the SAC updates that the steps flown since the warm-up ask for; returns the means of their metrics. `after_each` may do something
-    /// between updates, and give up.
+    /// between updates, and give up; `timer` is told what the time went into.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
     pub fn train_policy<E: From<UpdateError>>(
         &mut self,
         epoch: Epoch,
+        timer: &mut LapTimer,
         mut after_each: impl FnMut(&SacMetrics) -> Result<(), E>,
     ) -> Result<Option<SacMetrics>, E> {
         let learning = &self.config.learning;
@@ -235,7 +240,9 @@ impl Trainer {
         let mut means = Means::default();
         while self.sac.updates() < due {
             self.replay.sample(&mut rng, self.config.sac.batch_size, &mut minibatch);
+            timer.lap(Stage::Sample, 1);
             let metrics = self.sac.update(&mut self.team, columns(&minibatch), &mut noise)?;
+            timer.lap(Stage::SacUpdate, 1);
             means.add(&metrics);
             after_each(&metrics)?;
         }
@@ -255,20 +262,9 @@ impl Trainer {
     }
 
     /// `images` as the VAE sees them: `[n, 72, 128]` u8, both ways.
-    pub fn reconstruct(&self, images: &[u8]) -> Vec<u8> {
-        let depth = self.vae.reconstruct(&images_from_bytes(images));
-        let grey = (depth * 255.0)
-            .round()
-            .clamp(0.0, 255.0)
-            .to_kind(Kind::Uint8)
-            .to_device(Device::Cpu);
-        let mut bytes = vec![0; images.len()];
-        grey.copy_data(&mut bytes, images.len());
-        bytes
-    }
-
-    fn encode(&self, images: &[u8]) -> Vec<[f32; LATENT]> {
-        encode(&self.vae, images)
+    pub fn reconstruct(&mut self, images: &[u8]) -> Vec<u8> {
+        let depth = self.vae.reconstruct(images).into_iter();
+        depth.map(|depth| (depth * 255.0).round_ties_even() as u8).collect()
     }
 
     /// Copies of all tensors that updates change.
@@ -277,16 +273,6 @@ impl Trainer {
         all.extend(self.sac.named_tensors());
         all
     }
-}
-
-fn encode(vae: &Vae, images: &[u8]) -> Vec<[f32; LATENT]> {
-    let codes = vae
-        .encode(&images_from_bytes(images))
-        .to_device(Device::Cpu)
-        .contiguous();
-    let mut values = vec![[0.0_f32; LATENT]; images.len() / IMAGE_PIXELS];
-    codes.copy_data(values.as_flattened_mut(), images.len() / IMAGE_PIXELS * LATENT);
-    values
 }
 
 fn columns(minibatch: &Minibatch) -> Columns<'_> {

@@ -20,6 +20,7 @@ use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::Phase;
 use skein_protocol::run::{Life, RunDirectory, RunIdentity};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{Ending, Summary};
 
 use crate::checkpoint::{CheckpointWriter, EpochOrder, Progress};
@@ -51,6 +52,8 @@ struct Training<'a> {
     checkpoints: CheckpointWriter,
     started: Instant,
     epoch_started: Instant,
+    /// What this thread's time goes into: what it does between two laps is in the later one.
+    timer: LapTimer,
     /// What is counted of the run. What trainer and metrics count themselves is filled in for a checkpoint.
     progress: Progress,
     /// The newest checkpoint's.
@@ -128,12 +131,12 @@ impl Training<'_> {
 
     /// Publishes the parameters as they are now.
     fn publish(&mut self) -> Result<(), TrainingError> {
-        let started = Instant::now();
+        self.timer.lap(Stage::OtherTraining, 0);
         let snapshot = self.trainer.snapshot(self.progress.version());
         self.reception.publish(snapshot.clone())?;
         self.snapshots.insert(snapshot.version, snapshot);
         self.forget_snapshots();
-        self.progress.spent.add("publish", started);
+        self.timer.lap(Stage::Publish, 1);
         Ok(())
     }
 
@@ -178,7 +181,7 @@ impl Training<'_> {
 
     /// Waits for all flights of the epoch that was ordered first. Until they are there, it counts as in the air.
     fn collect(&mut self) -> Result<Vec<CommittedFlight>, TrainingError> {
-        let started = Instant::now();
+        self.timer.lap(Stage::OtherTraining, 0);
         self.reporter.update(|progress| progress.phase = Phase::Flying);
         if let Some(InTheAir { batch, flights, .. }) = self.in_the_air.front_mut() {
             while let Some(flight) = batch.next(self.stop)? {
@@ -189,7 +192,7 @@ impl Training<'_> {
                 flights.push(flight);
             }
         }
-        self.progress.spent.add("wait for flights", started);
+        self.timer.lap(Stage::TrainingIdle, 1);
         pass(FaultPoint::LearnerEpochCollected);
         Ok(self
             .in_the_air
@@ -200,10 +203,10 @@ impl Training<'_> {
 
     /// Takes the epoch's flights into metrics and replay buffer, in flight order.
     fn take_in(&mut self, flights: Vec<CommittedFlight>) -> Result<(), TrainingError> {
-        let started = Instant::now();
+        let count = flights.len() as u64;
         let steps: usize = flights.iter().map(CommittedFlight::steps).sum();
         let steps_per_sec = steps as f64 / self.epoch_started.elapsed().as_secs_f64();
-        self.epoch_started = started;
+        self.epoch_started = Instant::now();
         for flight in flights {
             self.metrics.flight(&flight)?;
             self.trainer.take_in(flight)?;
@@ -224,7 +227,7 @@ impl Training<'_> {
         self.metrics.scalars(self.last_flight(), &sizes)?;
         self.metrics
             .scalars(self.last_flight(), &self.reception.shared().faults().scalars())?;
-        self.progress.spent.add("take flights in", started);
+        self.timer.lap(Stage::TakeIn, count);
         Ok(())
     }
 
@@ -234,9 +237,8 @@ impl Training<'_> {
     }
 
     fn train_vae(&mut self, epoch: Epoch) -> Result<(), TrainingError> {
-        let started = Instant::now();
         let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
-        let trained = self.trainer.train_vae(epoch, |metrics| {
+        let trained = self.trainer.train_vae(epoch, &mut self.timer, |metrics| {
             reporter.update(|progress| {
                 progress.vae_updates += 1;
                 progress.vae_loss = Some(metrics.loss.into());
@@ -244,7 +246,6 @@ impl Training<'_> {
             pass(FaultPoint::LearnerMidUpdates);
             watch.after_update()
         })?;
-        self.progress.spent.add("VAE steps", started);
         let Some(metrics) = trained else {
             return Ok(());
         };
@@ -257,10 +258,11 @@ impl Training<'_> {
     }
 
     fn train_policy(&mut self, epoch: Epoch) -> Result<(), TrainingError> {
+        self.timer.lap(Stage::OtherTraining, 0);
         let started = Instant::now();
         let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
         let updates_before = self.trainer.updates();
-        let trained = self.trainer.train_policy(epoch, |metrics| {
+        let trained = self.trainer.train_policy(epoch, &mut self.timer, |metrics| {
             reporter.update(|progress| {
                 progress.updates += 1;
                 progress.temperature = Some(metrics.temperature.into());
@@ -271,7 +273,6 @@ impl Training<'_> {
         pass(FaultPoint::LearnerUpdated);
         let done = self.trainer.updates() - updates_before;
         let updates_per_sec = done as f64 / started.elapsed().as_secs_f64();
-        self.progress.spent.add("SAC updates", started);
         let Some(SacMetrics {
             critic_loss,
             policy_loss,

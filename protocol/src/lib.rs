@@ -2,9 +2,11 @@
 //!
 //! Everything that two processes must agree on is defined here, and nothing else: who flies what ([`ticket`]), what a flown step looks like on the
 //! wire ([`transition`]), what a policy snapshot contains ([`snapshot`]), the iceoryx2 services that carry them ([`services`]), the configuration of a
-//! run ([`config`]) and the files it leaves ([`run`], [`evaluation`], [`summary`]). It knows neither libtorch nor the physics engine, so that every
+//! run ([`config`]) and the files it leaves ([`run`], [`evaluation`], [`summary`]), and what their time is counted by ([`stages`]); and what all of our programs do alike
+//! ([`allocation`], [`logging`]). It knows neither libtorch nor the physics engine, so that every
 //! process can afford to depend on it.
 
+pub mod allocation;
 pub mod claims;
 pub mod config;
 pub mod durable;
@@ -18,6 +20,7 @@ pub mod run;
 pub mod seeds;
 pub mod services;
 pub mod snapshot;
+pub mod stages;
 pub mod status;
 pub mod summary;
 pub mod ticket;
@@ -25,7 +28,7 @@ pub mod transition;
 
 /// Version of everything in this crate that crosses a process boundary; part of every service's attributes, so that a process of another version is
 /// refused when it opens a service.
-pub const PROTOCOL_VERSION: u32 = 3;
+pub const PROTOCOL_VERSION: u32 = 4;
 
 /// Width of the depth image in pixels (paper, section 3.3).
 pub const IMAGE_WIDTH: usize = 128;

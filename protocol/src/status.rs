@@ -4,11 +4,12 @@ use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::ids::{ActorId, Incarnation, PolicyVersion, RunId};
+use crate::stages::{ACTOR_STAGES, Tally, Times};
 
-/// Sign of life of an actor, sent at its start, at every heartbeat and at its end.
+/// Sign of life of an actor, sent at its start, after every flight, at every heartbeat and at its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
-#[type_name("skein.StatusRecord.v1")]
+#[type_name("skein.StatusRecord.v2")]
 pub struct StatusRecord {
     run: u64,
     incarnation: u64,
@@ -18,10 +19,12 @@ pub struct StatusRecord {
     pid: u32,
     state: u32,
     reserved: u32,
+    /// By stage, in the order of [`crate::stages::Stage::ALL`].
+    times: [Tally; ACTOR_STAGES],
 }
 
-// Four 8-byte and four 4-byte fields: no padding.
-const _: () = assert!(size_of::<StatusRecord>() == 4 * 8 + 4 * 4);
+// Four 8-byte and four 4-byte fields, then tallies of two 8-byte fields: no padding.
+const _: () = assert!(size_of::<StatusRecord>() == 4 * 8 + 4 * 4 + ACTOR_STAGES * 16);
 
 /// An actor's state, as read from a [`StatusRecord`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,6 +41,8 @@ pub struct ActorStatus {
     pub newest_policy: Option<PolicyVersion>,
     /// Flights it has flown in this life.
     pub flights_flown: u64,
+    /// What its time in this life has gone into, until its last lap.
+    pub times: Times,
 }
 
 /// What an actor is about.
@@ -66,16 +71,18 @@ impl StatusRecord {
                 ActorState::Leaving => 2,
             },
             reserved: 0,
+            times: status.times.of_actor(),
         }
     }
 
-    /// The status, or `None` when the record is of another run or holds what no actor of this version writes.
+    /// The status, or `None` when the record is of another run or holds what no actor of this version writes: another state, times of years.
     pub fn read(&self, run: RunId) -> Option<ActorStatus> {
         let state = match self.state {
             1 => ActorState::Serving,
             2 => ActorState::Leaving,
             _ => return None,
         };
+        let times = Times::read_actor(&self.times)?;
         (self.run == run.0).then_some(ActorStatus {
             actor: ActorId(self.actor),
             incarnation: Incarnation(self.incarnation),
@@ -83,13 +90,17 @@ impl StatusRecord {
             state,
             newest_policy: (self.newest_policy != NO_POLICY).then_some(PolicyVersion(self.newest_policy)),
             flights_flown: self.flights_flown,
+            times,
         })
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
+    use crate::stages::Stage;
 
     #[test]
     fn a_status_survives_the_wire_of_its_own_run_only() {
@@ -101,11 +112,39 @@ mod tests {
                 state: ActorState::Leaving,
                 newest_policy,
                 flights_flown: 6,
+                times: times(7),
             };
             let record = StatusRecord::new(RunId(9), &status);
             assert_eq!(record.read(RunId(9)), Some(status));
             assert_eq!(record.read(RunId(8)), None);
             assert_eq!(StatusRecord { state: 7, ..record }.read(RunId(9)), None);
         }
+    }
+
+    fn times(nanos: u64) -> Times {
+        let mut times = Times::default();
+        times.add(Stage::TakeSnapshot, 1, Duration::from_nanos(nanos));
+        times.add(Stage::ActorIdle, nanos, Duration::from_nanos(2));
+        times
+    }
+
+    #[test]
+    fn times_that_no_actor_comes_to_are_refused() {
+        let read = |times| {
+            let status = ActorStatus {
+                actor: ActorId(1),
+                incarnation: Incarnation(2),
+                pid: 3,
+                state: ActorState::Serving,
+                newest_policy: None,
+                flights_flown: 6,
+                times,
+            };
+            StatusRecord::new(RunId(9), &status).read(RunId(9))
+        };
+        let years = |years: u64| years * 365 * 24 * 3600 * 1_000_000_000;
+        assert!(read(times(years(9))).is_some());
+        assert_eq!(read(times(years(10))), None);
+        assert_eq!(read(times(u64::MAX)), None);
     }
 }

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::durable;
 use crate::ids::{PolicyVersion, RunId};
 use crate::run::RunDirectory;
+use crate::stages::Times;
 
 /// What a run came to.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -29,6 +30,9 @@ pub struct Summary {
     pub best_version: Option<PolicyVersion>,
     /// Walls passed in the best snapshot's confirmation flights, on average.
     pub best_confirmed_walls_passed: Option<f64>,
+    /// When a candidate for the best snapshot first passed the share `evaluation.trained_rate` of walls, if one did.
+    #[serde(default)]
+    pub trained: Option<Trained>,
     /// Training flights committed.
     pub flights: u64,
     /// Environment steps of training flights.
@@ -54,8 +58,10 @@ pub struct Summary {
     pub resumes: u64,
     /// Seconds from the learner's start to its end, over all its lives; what a death undid is not counted.
     pub wall_secs: f64,
-    /// Seconds of the learner's main thread by what it did, as far as `wall_secs`.
-    pub phase_secs: BTreeMap<String, f64>,
+    /// What the time of actors and learner went into, as far as `wall_secs`. An actor that was killed has told of it until its last heartbeat or the end of
+    /// its last flight, whichever was later.
+    #[serde(default)]
+    pub stages: Times,
     /// Seconds of processor time in the learner's last life by those of its threads that lived until its end; `reception` receives and assembles flights.
     #[serde(default)]
     pub thread_cpu_secs: BTreeMap<String, f64>,
@@ -77,6 +83,21 @@ impl Summary {
     }
 }
 
+/// When a policy first did what it was trained for: what is behind it then.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Trained {
+    /// Share R of walls passed in its evaluation flights, without exploration noise, from the start of level 1.
+    pub rate: f64,
+    /// Training flights committed.
+    pub flights: u64,
+    /// Environment steps of training flights.
+    pub steps: u64,
+    /// SAC updates.
+    pub updates: u64,
+    /// Seconds from the learner's start until its evaluation flights were flown, over all lives; what a death undid is not counted.
+    pub wall_secs: f64,
+}
+
 /// How a run ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -89,7 +110,10 @@ pub enum Ending {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
+    use crate::stages::Stage;
 
     #[test]
     fn a_saved_summary_is_loaded_and_a_damaged_one_is_no_summary() {
@@ -97,6 +121,8 @@ mod tests {
         let run = RunDirectory::new(directory.path());
         let path = run.summary_json();
         assert_eq!(Summary::of(&run), None);
+        let mut stages = Times::default();
+        stages.add(Stage::Publish, 3, Duration::from_millis(500));
         let summary = Summary {
             skein_version: "0.1.0".to_owned(),
             run: RunId(3),
@@ -106,6 +132,13 @@ mod tests {
             final_version: PolicyVersion(4),
             best_version: None,
             best_confirmed_walls_passed: None,
+            trained: Some(Trained {
+                rate: 0.95,
+                flights: 30,
+                steps: 300,
+                updates: 15,
+                wall_secs: 1.25,
+            }),
             flights: 40,
             steps: 400,
             updates: 20,
@@ -117,12 +150,23 @@ mod tests {
             refused_by_reason: BTreeMap::new(),
             resumes: 2,
             wall_secs: 1.5,
-            phase_secs: BTreeMap::from([("publish".to_owned(), 0.5)]),
+            stages,
             thread_cpu_secs: BTreeMap::from([("reception".to_owned(), 0.25)]),
         };
         summary.save(&path).unwrap();
         assert_eq!(Summary::of(&run), Some(summary));
         std::fs::write(&path, "{").unwrap();
         assert_eq!(Summary::of(&run), None);
+    }
+
+    #[test]
+    fn a_summary_from_before_there_were_stages_is_read() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let old = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"ab","final_version":80,"best_version":70,
+            "best_confirmed_walls_passed":4.9,"flights":800,"steps":42837,"updates":20418,"vae_updates":400,"evaluation_flights":400,
+            "tickets_reissued":0,"records_refused":0,"wall_secs":333.3,"phase_secs":{"publish":12.5}}"#;
+        std::fs::write(run.summary_json(), old).unwrap();
+        assert_eq!(Summary::of(&run).unwrap().stages, Times::default());
     }
 }

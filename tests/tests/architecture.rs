@@ -64,10 +64,18 @@ fn every_package_keeps_to_its_side_of_the_fence() {
     for (package, allowed, forbidden) in [
         ("skein-simulator", &[][..], [&torch[..], &["iceoryx2"]].concat()),
         ("skein-protocol", &[], [torch, physics].concat()),
-        ("skein-actor", &["skein-kernels", "skein-protocol", "skein-simulator"], torch.to_vec()),
+        (
+            "skein-actor",
+            &["skein-kernels", "skein-protocol", "skein-simulator"],
+            torch.to_vec(),
+        ),
         ("skein-kernels", &[], [torch, physics].concat()),
         ("skein-learner", &["skein-kernels", "skein-protocol"], physics.to_vec()),
-        ("skein-launch", &["skein-protocol", "skein-simulator"], torch.to_vec()),
+        (
+            "skein-launch",
+            &["skein-kernels", "skein-protocol", "skein-simulator"],
+            torch.to_vec(),
+        ),
     ] {
         for of in [Of::Programs, Of::Tests] {
             let found = dependencies(&metadata, package, of);

@@ -7,7 +7,7 @@ use rand_pcg::Pcg64Mcg;
 use skein_actor::inference::{Network, Scratch};
 use skein_learner::networks::{Layout, Parameters, Policy};
 use skein_learner::sac::Sac;
-use skein_learner::vae::{Vae, images_from_bytes};
+use skein_learner::vae::{TorchVae as Vae, images_from_bytes};
 use skein_protocol::config::{Config, Observation};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};

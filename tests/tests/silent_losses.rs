@@ -18,6 +18,7 @@ use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, Attempt, Epoch, FlightId, Incarnation, PolicyVersion};
 use skein_protocol::run::{LearnerSeat, Presence, RunDirectory, RunIdentity};
 use skein_protocol::services::{ActorPorts, LearnerPorts};
+use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind};
@@ -148,6 +149,7 @@ fn status(actor: ActorId, incarnation: Incarnation) -> ActorStatus {
         state: ActorState::Serving,
         newest_policy: None,
         flights_flown: 0,
+        times: Times::default(),
     }
 }
 

@@ -8,6 +8,7 @@ use std::path::Path;
 
 use skein_protocol::config::Config;
 use skein_protocol::snapshot::Snapshot;
+use skein_protocol::stages::{Stage, Thread};
 use skein_protocol::summary::Ending;
 use skein_tests::{Ended, Recipe};
 
@@ -17,13 +18,14 @@ fn a_completed_run_leaves_what_it_promises() {
     the_configuration_is_resolved(&run);
     the_flights_have_the_promised_columns(&run);
     the_summary_agrees_with_the_flights(&run);
+    the_stages_agree_with_the_counts(&run);
     the_snapshots_are_those_of_the_summary(&run);
     the_evaluation_is_of_the_best_snapshot(&run);
     the_newest_checkpoint_is_of_the_end(&run);
     the_curves_are_in_an_event_file(&run);
     the_plots_show_something(&run);
     every_process_has_its_log(&run);
-    the_conclusion_shows_the_table_and_the_paths(&run);
+    the_conclusion_shows_the_tables_and_the_paths(&run);
 }
 
 fn the_configuration_is_resolved(run: &Ended) {
@@ -89,10 +91,52 @@ fn the_summary_agrees_with_the_flights(run: &Ended) {
     assert!(summary.updates > 0 && summary.vae_updates > 0, "{summary:?}");
     // Three on each of two courses, and at least one that confirmed the best snapshot.
     assert!(summary.evaluation_flights > 6, "{summary:?}");
-    let accounted: f64 = summary.phase_secs.values().sum();
+}
+
+/// Each thread's stages are its whole time, and each was gone through as often as there was something to do.
+fn the_stages_agree_with_the_counts(run: &Ended) {
+    let summary = run.summary();
+    let count = |stage| summary.stages.of(stage).count;
+    let secs = |thread| summary.stages.total_nanos(thread) as f64 / 1e9;
+    let evaluated = fs::read_to_string(run.directory.evaluation_paths_csv()).unwrap();
+    // A header, and a row for each observation of six flights.
+    let evaluation_steps = evaluated.lines().count() as u64 - 1 - 6;
+    let (flights, steps) = (count(Stage::TakeOff), count(Stage::Physics));
+    let flown = summary.flights + summary.evaluation_flights;
+    // The last flight's end may not have been heard of yet.
     assert!(
-        summary.phase_secs.len() >= 5 && accounted > 0.0 && accounted <= summary.wall_secs,
-        "{summary:?}"
+        (flown - 1..=flown).contains(&flights),
+        "{flights} flights of {summary:?}"
+    );
+    // Those that confirmed the best snapshot were flown besides.
+    assert!(steps > summary.steps + evaluation_steps, "{steps} steps of {summary:?}");
+    assert_eq!(count(Stage::Policy), steps);
+    assert_eq!([Stage::Camera, Stage::Encoder].map(count), [steps + flights; 2]);
+    assert!((steps + flights - 1..=steps + flights).contains(&count(Stage::Send)));
+    assert!(count(Stage::Assemble) >= summary.steps + summary.flights);
+    assert_eq!(count(Stage::TakeIn), summary.flights);
+    assert_eq!(count(Stage::Evaluate), summary.evaluation_flights);
+    assert_eq!([Stage::Sample, Stage::SacUpdate].map(count), [summary.updates; 2]);
+    assert_eq!(
+        [Stage::SampleImages, Stage::VaeStep].map(count),
+        [summary.vae_updates; 2]
+    );
+    // One for the parameters it began with.
+    assert_eq!(count(Stage::Publish), summary.final_version.0 + 1);
+    assert_eq!(count(Stage::Recode), 1);
+    let (training, receiving) = (secs(Thread::Training), secs(Thread::Receiving));
+    assert!(
+        (summary.wall_secs - training).abs() < 0.1,
+        "{training} s of {summary:?}"
+    );
+    assert!(
+        receiving > 0.5 * training && receiving <= summary.wall_secs,
+        "{receiving} s of {summary:?}"
+    );
+    let actors = secs(Thread::Actors);
+    assert!(
+        actors > 0.5 * training && actors <= 2.0 * summary.wall_secs,
+        "{actors} s of {summary:?}"
     );
 }
 
@@ -199,9 +243,10 @@ fn every_process_has_its_log(run: &Ended) {
     }
 }
 
-fn the_conclusion_shows_the_table_and_the_paths(run: &Ended) {
+fn the_conclusion_shows_the_tables_and_the_paths(run: &Ended) {
     for part in [
         "non_rectangular",
+        &run.summary().stages.to_string(),
         "flights.csv",
         "plots/walls_passed.png",
         "snapshots/best.safetensors",

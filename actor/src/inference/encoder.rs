@@ -3,45 +3,29 @@
 //! Four 4x4 convolutions of stride 2 without padding, a ReLU after each, and one linear layer:
 //! 1x72x128 → 32x35x63 → 64x16x30 → 128x7x14 → 256x2x6 → 32.
 //!
-//! Images lie channels-last here. A kernel row then covers one contiguous run of memory, so that collecting the pixels under the kernel is four copies, and
-//! a convolution is that plus one matrix product. PyTorch's channels-first weights are rearranged once, when a snapshot arrives.
+//! Images lie channels-last here: a kernel row then covers one contiguous run of memory, and a convolution is one product that reads its windows where they
+//! lie. PyTorch's channels-first weights are rearranged once, when a snapshot arrives.
 
+use skein_kernels::{Finish, Isa, Matrix, Panels, Rows, Start, Windows, product};
 use skein_protocol::snapshot::{ENCODER_CHANNELS as CHANNELS, ENCODER_FEATURES as FEATURES, ENCODER_KERNEL as KERNEL};
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LATENT};
 
-use super::matrix::{add_bias, add_bias_relu, multiply, transposed};
+use super::linear::Linear;
 
 /// Step of every kernel, pixels.
 const STRIDE: usize = 2;
-
-/// An image's height and width before and after each convolution.
-const SIZES: [[usize; 2]; 5] = {
-    let mut sizes = [[IMAGE_HEIGHT, IMAGE_WIDTH]; 5];
-    let mut layer = 0;
-    while layer < 4 {
-        let [height, width] = sizes[layer];
-        sizes[layer + 1] = [(height - KERNEL) / STRIDE + 1, (width - KERNEL) / STRIDE + 1];
-        layer += 1;
-    }
-    sizes
-};
-const _: () = assert!(CHANNELS[4] * SIZES[4][0] * SIZES[4][1] == FEATURES);
 
 /// The encoder's parameters, arranged for [`Encoder::encode`].
 #[derive(Debug)]
 pub struct Encoder {
     convolutions: [Convolution; 4],
-    /// `[FEATURES, LATENT]`, features channels-last.
-    mean_weights: Vec<f32>,
-    mean_bias: Vec<f32>,
+    /// Takes features channels-last.
+    mean: Linear,
 }
 
-/// Working memory of one encoding thread.
-#[derive(Debug)]
+/// Working memory of one encoding thread: layers alternate between the two.
+#[derive(Debug, Default)]
 pub struct EncoderScratch {
-    /// Pixels under the kernel, one row for each output pixel: `[height * width, 4 * 4 * channels]`.
-    patches: Vec<f32>,
-    /// Layers alternate between these two.
     images: [Vec<f32>; 2],
 }
 
@@ -50,126 +34,84 @@ impl Encoder {
     ///
     /// # Panics
     /// When a tensor has not the length its shape asks for.
-    pub fn new<'a>(tensor: impl Fn(&str) -> &'a [f32]) -> Self {
+    pub fn new<'a>(isa: Isa, tensor: impl Fn(&str) -> &'a [f32]) -> Self {
+        let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
         let convolutions = std::array::from_fn(|layer| {
             let name = format!("encoder.conv{}", layer + 1);
-            Convolution::new(
-                layer,
-                tensor(&format!("{name}.weight")),
-                tensor(&format!("{name}.bias")),
-            )
+            let windows = Windows::new(size, CHANNELS[layer], [KERNEL; 2], STRIDE);
+            size = windows.positions();
+            let (weights, bias) = (tensor(&format!("{name}.weight")), tensor(&format!("{name}.bias")));
+            Convolution::new(isa, windows, CHANNELS[layer], weights, bias)
         });
-        let pixels = SIZES[4][0] * SIZES[4][1];
-        let mean_weights: Vec<f32> = tensor("encoder.mean.weight")
+        let pixels = size[0] * size[1];
+        assert_eq!(pixels * CHANNELS[4], FEATURES, "the last image is all features");
+        let weights: Vec<f32> = tensor("encoder.mean.weight")
             .chunks_exact(FEATURES)
             .flat_map(|features| transposed(features, CHANNELS[4], pixels))
             .collect();
         Self {
             convolutions,
-            mean_weights: transposed(&mean_weights, LATENT, FEATURES),
-            mean_bias: tensor("encoder.mean.bias").to_vec(),
+            mean: Linear::new(isa, &weights, tensor("encoder.mean.bias")),
         }
     }
 
     /// Mean of the latent code of a depth image, `[72, 128]`, top row first, 0 nearest and 255 farthest; the network sees it scaled to [0, 1].
     pub fn encode(&self, image: &[u8; IMAGE_PIXELS], scratch: &mut EncoderScratch) -> [f32; LATENT] {
-        let EncoderScratch {
-            patches,
-            images: [input, output],
-        } = scratch;
-        let [first, rest @ ..] = &self.convolutions;
-        first.apply(
-            image.as_slice(),
-            |depth| f32::from(depth) * (1.0 / 255.0),
-            patches,
-            output,
-        );
-        for convolution in rest {
+        let [input, output] = &mut scratch.images;
+        input.clear();
+        input.extend(image.iter().map(|&depth| f32::from(depth) * (1.0 / 255.0)));
+        for convolution in &self.convolutions {
+            convolution.apply(input, output);
             std::mem::swap(input, output);
-            convolution.apply(input.as_slice(), |value| value, patches, output);
         }
         let mut latent = [0.0; LATENT];
-        multiply(&output[..FEATURES], FEATURES, &self.mean_weights, &mut latent, LATENT);
-        add_bias(&mut latent, &self.mean_bias);
+        self.mean.apply(input, Finish::Plain, &mut latent);
         latent
-    }
-}
-
-impl Default for EncoderScratch {
-    fn default() -> Self {
-        let largest = |values: fn(usize) -> usize| (0..4).map(values).max().unwrap_or(0);
-        let image = largest(|layer| SIZES[layer + 1].iter().product::<usize>() * CHANNELS[layer + 1]);
-        let patches = largest(|layer| SIZES[layer + 1].iter().product::<usize>() * KERNEL * KERNEL * CHANNELS[layer]);
-        Self {
-            patches: vec![0.0; patches],
-            images: [vec![0.0; image], vec![0.0; image]],
-        }
     }
 }
 
 /// One convolution with its ReLU.
 #[derive(Debug)]
 struct Convolution {
-    /// `[height, width]`.
-    input_size: [usize; 2],
-    output_size: [usize; 2],
-    input_channels: usize,
-    output_channels: usize,
-    /// `[4, 4, input channels, output channels]`.
-    weights: Vec<f32>,
+    windows: Windows,
+    /// `[4 · 4 · input channels, output channels]`.
+    weights: Panels,
     bias: Vec<f32>,
 }
 
 impl Convolution {
     /// `weights`: `[output channels, input channels, 4, 4]`; `bias`: `[output channels]`.
-    fn new(layer: usize, weights: &[f32], bias: &[f32]) -> Self {
-        let (input_channels, output_channels) = (CHANNELS[layer], CHANNELS[layer + 1]);
-        assert_eq!(bias.len(), output_channels, "a bias for each output channel");
-        // [out, in, 16] → [out, 16, in] → [16, in, out].
+    fn new(isa: Isa, windows: Windows, channels: usize, weights: &[f32], bias: &[f32]) -> Self {
+        assert_eq!(
+            weights.len(),
+            bias.len() * windows.window_len(),
+            "a weight for each number of a window and output channel"
+        );
         let channels_last: Vec<f32> = weights
-            .chunks_exact(input_channels * KERNEL * KERNEL)
-            .flat_map(|kernel| transposed(kernel, input_channels, KERNEL * KERNEL))
+            .chunks_exact(windows.window_len())
+            .flat_map(|kernel| transposed(kernel, channels, KERNEL * KERNEL))
             .collect();
         Self {
-            input_size: SIZES[layer],
-            output_size: SIZES[layer + 1],
-            input_channels,
-            output_channels,
-            weights: transposed(&channels_last, output_channels, KERNEL * KERNEL * input_channels),
+            weights: Panels::of(isa, Matrix::of_rows(&channels_last, windows.window_len()).transposed()),
             bias: bias.to_vec(),
+            windows,
         }
     }
 
-    /// `input`: `[height, width, channels]`; `convert` makes a value of it. Writes the start of `output`.
-    fn apply<T: Copy>(&self, input: &[T], convert: impl Fn(T) -> f32, patches: &mut [f32], output: &mut [f32]) {
-        let pixels = self.output_size[0] * self.output_size[1];
-        let patch = KERNEL * KERNEL * self.input_channels;
-        let (patches, output) = (
-            &mut patches[..pixels * patch],
-            &mut output[..pixels * self.output_channels],
-        );
-        self.collect_patches(input, convert, patches);
-        multiply(patches, patch, &self.weights, output, self.output_channels);
-        add_bias_relu(output, &self.bias);
+    /// `input`: `[height, width, channels]`.
+    fn apply(&self, input: &[f32], output: &mut Vec<f32>) {
+        output.resize(self.windows.count() * self.bias.len(), 0.0);
+        let rows = Rows::Windows(&self.windows, input);
+        product(rows, &self.weights, Start::Bias(&self.bias), Finish::Rectified, output);
     }
+}
 
-    /// Lays the pixels under the kernel side by side, `[4, 4, channels]` for each output pixel.
-    fn collect_patches<T: Copy>(&self, input: &[T], convert: impl Fn(T) -> f32, patches: &mut [f32]) {
-        let run = KERNEL * self.input_channels;
-        let [_, input_width] = self.input_size;
-        for (pixel, patch) in patches.chunks_exact_mut(KERNEL * run).enumerate() {
-            let (top, left) = (
-                pixel / self.output_size[1] * STRIDE,
-                pixel % self.output_size[1] * STRIDE,
-            );
-            for (row, into) in patch.chunks_exact_mut(run).enumerate() {
-                let start = ((top + row) * input_width + left) * self.input_channels;
-                for (to, from) in into.iter_mut().zip(&input[start..start + run]) {
-                    *to = convert(*from);
-                }
-            }
-        }
-    }
+/// `[rows, columns]` row-major to `[columns, rows]`.
+fn transposed(matrix: &[f32], rows: usize, columns: usize) -> Vec<f32> {
+    assert_eq!(matrix.len(), rows * columns, "the matrix has the stated shape");
+    (0..columns)
+        .flat_map(|column| (0..rows).map(move |row| matrix[row * columns + column]))
+        .collect()
 }
 
 #[cfg(test)]
@@ -192,6 +134,13 @@ mod tests {
         let mut image = Box::new([0; IMAGE_PIXELS]);
         image.fill_with(|| rng.random());
         image
+    }
+
+    /// An image's height and width before and after each convolution.
+    const SIZES: [[usize; 2]; 5] = [[72, 128], [35, 63], [16, 30], [7, 14], [2, 6]];
+
+    fn encoder(layout: &SnapshotLayout, values: &[f32], isa: Isa) -> Encoder {
+        Encoder::new(isa, |name| &values[layout.tensor(name).unwrap().range.clone()])
     }
 
     /// The definition, channels first and in f64, index by index.
@@ -231,7 +180,7 @@ mod tests {
         for seed in 0..2 {
             let (layout, values) = parameters(seed);
             let tensor = |name: &str| &values[layout.tensor(name).unwrap().range.clone()];
-            let latent = Encoder::new(tensor).encode(&image(seed), &mut EncoderScratch::default());
+            let latent = encoder(&layout, &values, Isa::best()).encode(&image(seed), &mut EncoderScratch::default());
             let expected = naive(&|name: &str| tensor(name).to_vec(), &image(seed));
             assert!(
                 expected.iter().any(|value| value.abs() > 0.02),
@@ -246,11 +195,20 @@ mod tests {
     #[test]
     fn the_same_image_gives_the_same_bits_whatever_came_before() {
         let (layout, values) = parameters(7);
-        let encoder = Encoder::new(|name| &values[layout.tensor(name).unwrap().range.clone()]);
+        let encoder = encoder(&layout, &values, Isa::best());
         let mut scratch = EncoderScratch::default();
         let first = encoder.encode(&image(1), &mut scratch);
         assert_ne!(first, encoder.encode(&image(2), &mut scratch));
         assert_eq!(first, encoder.encode(&image(1), &mut scratch));
         assert_eq!(first, encoder.encode(&image(1), &mut EncoderScratch::default()));
+    }
+
+    #[test]
+    fn every_instruction_set_gives_the_same_bits() {
+        let (layout, values) = parameters(3);
+        let latent = |isa| encoder(&layout, &values, isa).encode(&image(1), &mut EncoderScratch::default());
+        for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
+            assert_eq!(latent(isa), latent(Isa::Portable), "{isa}");
+        }
     }
 }

@@ -1,13 +1,14 @@
 //! Native inference: depth image to latent code, observation to action, without libtorch.
 //!
 //! An actor looks at one image at a time, where a tensor library spends more time on itself than on the network. So the two networks are written out over
-//! one matrix product; the whole-system tests hold them to the learner's. A [`Network`] is immutable and shared between threads; what a thread writes
+//! the kernels that the learner trains them with; the whole-system tests hold them to the learner's. A [`Network`] is immutable and shared between threads; what a thread writes
 //! to is its own [`Scratch`], allocated once.
 
 mod encoder;
-mod matrix;
+mod linear;
 mod policy;
 
+use skein_kernels::Isa;
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::{IMAGE_PIXELS, LATENT};
@@ -42,10 +43,11 @@ impl Network {
                 .expect("every layout has the encoder's and the policy's tensors");
             &snapshot.values[tensor.range.clone()]
         };
+        let isa = Isa::best();
         Self {
             version: snapshot.version,
-            encoder: Encoder::new(tensor),
-            policy: Policy::new(tensor),
+            encoder: Encoder::new(isa, tensor),
+            policy: Policy::new(isa, tensor),
         }
     }
 

@@ -4,15 +4,16 @@
 
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
+use skein_kernels::{Finish, Isa};
 use skein_protocol::snapshot::POLICY_LAYERS;
 use skein_protocol::{ACTION, LOG_STD};
 
-use super::matrix::{add_bias, add_bias_relu, multiply, transposed};
+use super::linear::Linear;
 
 /// The policy's parameters, arranged for [`Policy::distribution`].
 #[derive(Debug)]
 pub struct Policy {
-    layers: [Layer; POLICY_LAYERS],
+    layers: [Linear; POLICY_LAYERS],
 }
 
 /// Working memory of one thread.
@@ -36,10 +37,10 @@ impl Policy {
     ///
     /// # Panics
     /// When a tensor has not the length its shape asks for.
-    pub fn new<'a>(tensor: impl Fn(&str) -> &'a [f32]) -> Self {
+    pub fn new<'a>(isa: Isa, tensor: impl Fn(&str) -> &'a [f32]) -> Self {
         let layers = std::array::from_fn(|index| {
             let name = format!("policy.layer{}", index + 1);
-            Layer::new(tensor(&format!("{name}.weight")), tensor(&format!("{name}.bias")))
+            Linear::new(isa, tensor(&format!("{name}.weight")), tensor(&format!("{name}.bias")))
         });
         Self { layers }
     }
@@ -54,15 +55,15 @@ impl Policy {
         input.extend_from_slice(observation);
         let [hidden @ .., last] = &self.layers;
         for layer in hidden {
-            layer.apply(input, output);
-            add_bias_relu(output, &layer.bias);
+            output.resize(layer.outputs(), 0.0);
+            layer.apply(input, Finish::Rectified, output);
             std::mem::swap(input, output);
         }
-        last.apply(input, output);
-        add_bias(output, &last.bias);
+        let mut outputs = [0.0; 2 * ACTION];
+        last.apply(input, Finish::Plain, &mut outputs);
         ActionDistribution {
-            mean: std::array::from_fn(|axis| output[axis]),
-            log_std: std::array::from_fn(|axis| output[ACTION + axis].clamp(LOG_STD.0, LOG_STD.1)),
+            mean: std::array::from_fn(|axis| outputs[axis]),
+            log_std: std::array::from_fn(|axis| outputs[ACTION + axis].clamp(LOG_STD.0, LOG_STD.1)),
         }
     }
 }
@@ -79,30 +80,6 @@ impl ActionDistribution {
             let noise: f32 = StandardNormal.sample(rng);
             (self.mean[axis] + self.log_std[axis].exp() * noise).tanh()
         })
-    }
-}
-
-/// A fully connected layer.
-#[derive(Debug)]
-struct Layer {
-    /// `[in, out]`.
-    weights: Vec<f32>,
-    bias: Vec<f32>,
-}
-
-impl Layer {
-    /// `weights`: `[out, in]`; `bias`: `[out]`.
-    fn new(weights: &[f32], bias: &[f32]) -> Self {
-        Self {
-            weights: transposed(weights, bias.len(), weights.len() / bias.len()),
-            bias: bias.to_vec(),
-        }
-    }
-
-    /// The product without the bias.
-    fn apply(&self, input: &[f32], output: &mut Vec<f32>) {
-        output.resize(self.bias.len(), 0.0);
-        multiply(input, input.len(), &self.weights, output, self.bias.len());
     }
 }
 
@@ -130,7 +107,7 @@ mod tests {
     }
 
     fn policy() -> Policy {
-        Policy::new(|name| parameters(name).leak())
+        Policy::new(Isa::best(), |name| parameters(name).leak())
     }
 
     #[test]
@@ -185,7 +162,7 @@ mod tests {
 
     #[test]
     fn an_extreme_spread_is_bounded() {
-        let wild = Policy::new(|name| {
+        let wild = Policy::new(Isa::best(), |name| {
             let mut values = parameters(name);
             if name == "policy.layer4.bias" {
                 values[ACTION..].copy_from_slice(&[1e3, -1e3]);

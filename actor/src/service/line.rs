@@ -10,6 +10,7 @@ use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::run::RunIdentity;
 use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
 use skein_protocol::snapshot::SnapshotLayout;
+use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, Ticket};
 use skein_protocol::transition::RecordKind;
@@ -33,7 +34,11 @@ pub(super) struct LearnerLine<'a> {
     /// What was found out and ends this line.
     parting: Option<Parting>,
     last_sign: Instant,
+    /// When the last heartbeat was given: whoever missed some has been stopped.
     last_said: Instant,
+    timer: LapTimer,
+    /// Whether the learner was told that there is nothing to fly, since there was.
+    has_told_of_waiting: bool,
     pub(super) flights_flown: u64,
 }
 
@@ -60,7 +65,7 @@ impl<'a> LearnerLine<'a> {
             identity: service.identity,
             actor: service.actor,
             incarnation: service.incarnation,
-            weights: Weights::new(SnapshotLayout::of(service.config)),
+            weights: Weights::for_lag(SnapshotLayout::of(service.config), service.config.learning.policy_lag),
             tickets: VecDeque::new(),
             limits: Limits {
                 heartbeat: transport.heartbeat(),
@@ -73,6 +78,8 @@ impl<'a> LearnerLine<'a> {
             parting: None,
             last_sign: service.last_sign,
             last_said: Instant::now(),
+            timer: LapTimer::start(),
+            has_told_of_waiting: false,
             flights_flown: 0,
         }
     }
@@ -98,6 +105,7 @@ impl<'a> LearnerLine<'a> {
     /// Hears everything there is to hear, and gives a sign of life when one is due.
     pub(super) fn listen(&mut self) -> Result<(), ServiceError> {
         self.listen_for_control()?;
+        self.timer.lap(Stage::ActorControl, 1);
         while let Some(received) = self.ports.receive_snapshot()? {
             match received {
                 Ok(snapshot) => {
@@ -106,6 +114,7 @@ impl<'a> LearnerLine<'a> {
                 }
                 Err(error) => warn!(%error, "snapshot refused"),
             }
+            self.timer.lap(Stage::TakeSnapshot, 1);
         }
         let life = self.limits.ticket_life;
         self.tickets.retain(|queued| {
@@ -136,6 +145,7 @@ impl<'a> LearnerLine<'a> {
         } else if unsaid >= self.limits.heartbeat {
             self.look_at_learner();
             self.ports.maintain()?;
+            self.last_said = Instant::now();
             self.report(ActorState::Serving)?;
         }
         Ok(())
@@ -182,11 +192,17 @@ impl<'a> LearnerLine<'a> {
             .position(|queued| self.weights.holds(queued.ticket.policy_version))?;
         let ticket = self.tickets.remove(ready)?.ticket;
         let network = self.weights.network(ticket.policy_version)?;
+        self.has_told_of_waiting = false;
+        self.timer.lap(Stage::TakeSnapshot, 0);
         Some((ticket, network))
     }
 
-    /// Waits for the learner, not longer than until the next sign of life.
-    pub(super) fn wait(&self) {
+    /// Waits for the learner, not longer than until the next sign of life. The learner is told first: it wakes actors only to what one that waits would miss.
+    pub(super) fn wait(&mut self) -> Result<(), ServiceError> {
+        if !self.has_told_of_waiting {
+            self.has_told_of_waiting = true;
+            self.report(ActorState::Serving)?;
+        }
         if let Err(error) = self
             .ports
             .wait(self.limits.heartbeat.saturating_sub(self.last_said.elapsed()))
@@ -195,10 +211,12 @@ impl<'a> LearnerLine<'a> {
             debug!(%error, "cannot wait for the learner");
             std::thread::sleep(Duration::from_millis(10));
         }
+        self.timer.lap(Stage::ActorIdle, 1);
+        Ok(())
     }
 
-    pub(super) fn report(&mut self, state: ActorState) -> Result<(), ServiceError> {
-        self.last_said = Instant::now();
+    /// Tells how this actor stands. It is no heartbeat: one that was missed is still found missing.
+    pub(super) fn report(&self, state: ActorState) -> Result<(), ServiceError> {
         let status = ActorStatus {
             actor: self.actor,
             incarnation: self.incarnation,
@@ -206,12 +224,9 @@ impl<'a> LearnerLine<'a> {
             state,
             newest_policy: self.weights.newest(),
             flights_flown: self.flights_flown,
+            times: *self.timer.times(),
         };
         self.ports.send_status(StatusRecord::new(self.ports.run(), &status))?;
-        self.wake_learner()
-    }
-
-    pub(super) fn wake_learner(&self) -> Result<(), ServiceError> {
         self.ports.wake_learner()
     }
 }
@@ -221,13 +236,16 @@ impl RecordLink for LearnerLine<'_> {
     type Error = ServiceError;
 
     fn loan(&mut self) -> Result<LoanedTransition, ServiceError> {
-        self.ports.loan_transition()
+        let loaned = self.ports.loan_transition();
+        self.timer.lap(Stage::Send, 0);
+        loaned
     }
 
     fn send(&mut self, record: LoanedTransition) -> Result<(), ServiceError> {
         let (step, kind) = (record.step, record.kind);
         pass(FaultPoint::ActorBeforeSend);
         self.ports.send_transition(record)?;
+        self.timer.lap(Stage::Send, 1);
         if kind == RecordKind::Closing.code() {
             pass(FaultPoint::ActorAfterLastRecord);
         } else if step == 2 {
@@ -238,10 +256,15 @@ impl RecordLink for LearnerLine<'_> {
 
     fn directive(&mut self) -> Result<Directive, ServiceError> {
         self.listen_for_control()?;
+        self.timer.lap(Stage::ActorControl, 1);
         Ok(if self.parting().is_some() {
             Directive::Abandon
         } else {
             Directive::Continue
         })
+    }
+
+    fn lap(&mut self, stage: Stage) {
+        self.timer.lap(stage, 1);
     }
 }

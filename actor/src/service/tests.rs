@@ -5,6 +5,7 @@ use skein_protocol::ids::{Attempt, FlightId, PolicyVersion};
 use skein_protocol::run::{LearnerSeat, Presence, RunDirectory};
 use skein_protocol::services::LearnerPorts;
 use skein_protocol::snapshot::SnapshotLayout;
+use skein_protocol::stages::{Stage, Thread};
 use skein_protocol::status::ActorStatus;
 use skein_protocol::ticket::{ControlRecord, CourseChoice, Exploration};
 use skein_protocol::transition::{Outcome, RecordKind};
@@ -133,6 +134,7 @@ impl Drop for Run {
 
 #[test]
 fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
+    let begun = Instant::now();
     let mut run = Run::start(30.0);
     let incarnation = run.joined();
     run.publish(1);
@@ -144,7 +146,9 @@ fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
     };
     run.say(ControlRecord::fly(&other, ACTOR, Incarnation(1)));
     run.say(ControlRecord::fly(&ticket, ACTOR, incarnation));
+    let mut steps = 0;
     for step in 0.. {
+        steps = u64::from(step);
         let record = run.until("a record", || run.learner().receive_transition().unwrap());
         if record.check(&ticket, ACTOR, incarnation, step) == Ok(RecordKind::Closing) {
             assert!(step > 3 && Outcome::from_code(record.outcome).is_some());
@@ -155,6 +159,19 @@ fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
     run.say(ControlRecord::stop(run.identity.run));
     let last = run.until_status("the last word", |status| status.state == ActorState::Leaving);
     assert_eq!((last.flights_flown, last.newest_policy), (1, Some(PolicyVersion(1))));
+    let done = [
+        Stage::TakeSnapshot,
+        Stage::TakeOff,
+        Stage::Physics,
+        Stage::Camera,
+        Stage::Encoder,
+        Stage::Policy,
+        Stage::Send,
+    ]
+    .map(|stage| last.times.of(stage).count);
+    assert_eq!(done, [1, 1, steps, steps + 1, steps + 1, steps, steps + 1]);
+    let total = Duration::from_nanos(last.times.total_nanos(Thread::Actors));
+    assert!(total <= begun.elapsed() && total > Duration::ZERO);
     assert_eq!(run.ending(), Ending::Stopped);
     assert!(run.learner().receive_transition().unwrap().is_none());
 }

@@ -5,6 +5,7 @@
 mod canvas;
 mod curves;
 mod flight_paths;
+pub mod growth;
 mod reconstructions;
 
 use std::io;

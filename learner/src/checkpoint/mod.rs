@@ -26,6 +26,7 @@ mod writer;
 use serde::{Deserialize, Serialize};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::Snapshot;
+use skein_protocol::summary::Trained;
 use skein_protocol::ticket::Exploration;
 
 use crate::flights::assembly::Keep;
@@ -76,6 +77,8 @@ pub struct Progress {
     pub latest_candidate: Option<u64>,
     /// The best snapshot so far.
     pub best: Option<BestSnapshot>,
+    /// When a candidate first did what it was trained for.
+    pub trained: Option<Trained>,
     /// Averages over the latest flights, and where the files of metrics end.
     pub metrics: MetricsState,
     /// Time and losses so far.
@@ -97,6 +100,7 @@ impl Progress {
             evaluation_flights: 0,
             latest_candidate: None,
             best: None,
+            trained: None,
             metrics: MetricsState::new(window_flights),
             spent: Spent::default(),
         }

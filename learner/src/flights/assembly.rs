@@ -3,6 +3,7 @@
 //! A flight is committed once, complete and in order, or not at all; nothing downstream ever sees half of one, or one flown with two policies.
 
 use serde::{Deserialize, Serialize};
+use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::ids::{ActorId, Epoch, Incarnation};
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{Outcome, RecordFault, RecordKind, TransitionRecord};
@@ -118,6 +119,9 @@ impl Assembly {
             RecordKind::Closing => self.check_ending(record)?,
             RecordKind::Step | RecordKind::Failed => self.check_step(record)?,
         }
+        if self.is_empty() {
+            self.make_room();
+        }
         self.flight.observations.push(StepObservation {
             latent: record.latent,
             velocity_mps: record.velocity_mps,
@@ -137,6 +141,14 @@ impl Assembly {
         self.flight.walls_passed = record.walls_passed;
         self.last_step = StepEnd::of(record);
         Ok(Assembled::Step)
+    }
+
+    /// Makes room for the images of the longest flight at once. The system gives memory as it is written to, so what is not needed costs nothing; images that
+    /// grew would be moved again and again, with as much fresh memory each time.
+    fn make_room(&mut self) {
+        if let Some(depth) = &mut self.flight.depth {
+            depth.reserve_exact(self.longest_records * IMAGE_PIXELS);
+        }
     }
 
     /// Whether the flight goes on, and walls are passed as the step says.
@@ -190,6 +202,9 @@ impl Assembly {
         self.flight.outcome = outcome;
         self.flight.walls_passed = record.walls_passed;
         self.flight.course_walls = record.course_walls;
+        if let Some(depth) = &mut self.flight.depth {
+            depth.shrink_to_fit();
+        }
         let (epoch, longest_records) = (self.flight.epoch, self.longest_records);
         let empty = Self::new(
             self.ticket,
@@ -226,7 +241,6 @@ fn refuse_contradictions<const N: usize>(contradictions: [(&'static str, bool); 
 #[cfg(test)]
 mod tests {
     use bytemuck::Zeroable;
-    use skein_protocol::IMAGE_PIXELS;
     use skein_protocol::ids::{Attempt, FlightId, PolicyVersion, RunId};
     use skein_protocol::ticket::{CourseChoice, Exploration};
 

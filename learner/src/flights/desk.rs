@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use skein_protocol::config::TransportSection;
 use skein_protocol::ids::{ActorId, Attempt, Epoch, FlightId, Incarnation, RunId};
+use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus};
 use skein_protocol::ticket::{ControlRecord, Ticket};
 use skein_protocol::transition::{RecordFault, TransitionRecord};
@@ -58,8 +59,12 @@ pub struct Desk {
     actors: BTreeMap<ActorId, Actor>,
     failures: Failures,
     faults: Faults,
+    /// What the time of actors that are gone went into.
+    times_of_the_gone: Times,
     /// What is to be said to actors besides their tickets.
     letters: Vec<ControlRecord>,
+    /// Whether something was said to an actor that may not look by itself.
+    is_wake_due: bool,
 }
 
 #[derive(Debug)]
@@ -70,9 +75,18 @@ struct Actor {
     tickets: VecDeque<Issued>,
     /// Flights it has spoiled since the last one that was committed.
     spoiled: u32,
+    /// What its time had gone into when it was first heard of: an actor that was taken for dead and is not is not counted twice.
+    first_times: Times,
+    times: Times,
+    /// It has spoken since, and nothing shows that it has seen a ticket that it was given after: it may have found nothing to fly and be waiting.
+    may_wait: bool,
 }
 
 impl Actor {
+    fn times_since_it_came(&self) -> Times {
+        self.times.since(&self.first_times)
+    }
+
     fn is_trusted(&self) -> bool {
         self.spoiled < MOST_SPOILED
     }
@@ -83,6 +97,8 @@ struct Issued {
     order: Order,
     since: Instant,
     assembly: Assembly,
+    /// Whether its actor has not spoken since: one that flies it does not wait.
+    is_newest_word: bool,
 }
 
 impl Desk {
@@ -95,7 +111,9 @@ impl Desk {
             actors: BTreeMap::new(),
             failures: Failures::default(),
             faults: Faults::default(),
+            times_of_the_gone: Times::default(),
             letters: Vec::new(),
+            is_wake_due: false,
         }
     }
 
@@ -107,6 +125,12 @@ impl Desk {
     /// What went wrong so far.
     pub fn faults(&self) -> Faults {
         self.faults
+    }
+
+    /// What the time of all actors went into, as far as they have told.
+    pub fn actor_times(&self) -> Times {
+        let living = self.actors.values().map(Actor::times_since_it_came);
+        living.fold(self.times_of_the_gone, |sum, times| sum.plus(&times))
     }
 
     /// Counts a sign of life that makes no sense.
@@ -151,6 +175,9 @@ impl Desk {
         match status.state {
             ActorState::Leaving => {
                 if known == Some(status.incarnation) {
+                    self.actors
+                        .entry(status.actor)
+                        .and_modify(|actor| actor.times = status.times);
                     self.dismiss(status.actor, Reissue::Left);
                 }
             }
@@ -174,9 +201,18 @@ impl Desk {
                         last_sign: now,
                         tickets: VecDeque::new(),
                         spoiled: 0,
+                        first_times: status.times,
+                        times: status.times,
+                        may_wait: true,
                     }
                 });
                 actor.last_sign = now;
+                actor.times = status.times;
+                // It speaks when it finds nothing to fly. What was on its way to it then, it finds when it is woken.
+                actor.may_wait = true;
+                for issued in &mut actor.tickets {
+                    self.is_wake_due |= std::mem::take(&mut issued.is_newest_word);
+                }
             }
         }
     }
@@ -208,6 +244,9 @@ impl Desk {
             self.faults.refuse(Refusal::NoTicket);
             return Ok(None);
         };
+        if actor.tickets[position].is_newest_word {
+            actor.may_wait = false;
+        }
         // Tickets are flown in order: those before this one never reached the actor, or their records never reached us.
         for _ in 0..position {
             self.reissue_first(id, Reissue::Skipped);
@@ -318,6 +357,7 @@ impl Desk {
     /// every flight while there are others. Returns what to send.
     pub fn issue(&mut self, now: Instant) -> Vec<ControlRecord> {
         let mut messages = std::mem::take(&mut self.letters);
+        self.is_wake_due |= !messages.is_empty();
         let credit = self.limits.tickets_per_actor;
         let any_trusted = self.actors.values().any(Actor::is_trusted);
         while !self.waiting.is_empty() {
@@ -334,13 +374,21 @@ impl Desk {
             messages.push(ControlRecord::fly(&order.ticket, id, actor.incarnation));
             let longest = self.limits.max_records_per_flight;
             let assembly = Assembly::new(order.ticket, order.epoch, order.keep, longest, id, actor.incarnation);
+            self.is_wake_due |= actor.may_wait || actor.tickets.is_empty();
             actor.tickets.push_back(Issued {
                 order,
                 since: now,
                 assembly,
+                is_newest_word: true,
             });
         }
         messages
+    }
+
+    /// Whether an actor may wait that was given something since this was last asked. One that flies looks by itself before each step, and to wake all actors
+    /// for every flight costs the more, the more of them there are.
+    pub fn take_wake(&mut self) -> bool {
+        std::mem::take(&mut self.is_wake_due)
     }
 
     /// Forgets an actor; its tickets are issued again.
@@ -348,7 +396,8 @@ impl Desk {
         while self.actors.get(&id).is_some_and(|actor| !actor.tickets.is_empty()) {
             self.reissue_last(id, why);
         }
-        if self.actors.remove(&id).is_some() {
+        if let Some(actor) = self.actors.remove(&id) {
+            self.times_of_the_gone = self.times_of_the_gone.plus(&actor.times_since_it_came());
             tracing::info!(actor = %id, "actor {}", why.name());
         }
     }
@@ -395,3 +444,6 @@ impl Desk {
 #[cfg(test)]
 #[path = "desk_tests.rs"]
 mod tests;
+#[cfg(test)]
+#[path = "waking_tests.rs"]
+mod waking_tests;

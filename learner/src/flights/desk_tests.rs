@@ -5,16 +5,17 @@ use std::collections::BTreeMap;
 use bytemuck::Zeroable;
 use proptest::prelude::*;
 use skein_protocol::ids::PolicyVersion;
+use skein_protocol::stages::Stage;
 use skein_protocol::ticket::{Control, CourseChoice, Exploration};
 use skein_protocol::transition::{Outcome, RecordKind};
 
 use super::super::failures;
 use super::*;
 
-const RUN: RunId = RunId(1);
-const LIFE: Incarnation = Incarnation(100);
+pub(super) const RUN: RunId = RunId(1);
+pub(super) const LIFE: Incarnation = Incarnation(100);
 
-fn limits() -> TransportSection {
+pub(super) fn limits() -> TransportSection {
     TransportSection {
         tickets_per_actor: 2,
         actor_silence_secs: 5.0,
@@ -23,7 +24,7 @@ fn limits() -> TransportSection {
     }
 }
 
-fn order(flight: u64) -> Order {
+pub(super) fn order(flight: u64) -> Order {
     let ticket = Ticket {
         run: RUN,
         flight: FlightId(flight),
@@ -45,20 +46,34 @@ fn order(flight: u64) -> Order {
     }
 }
 
-fn attach(desk: &mut Desk, actor: u32, life: Incarnation, now: Instant) {
-    let status = ActorStatus {
+pub(super) fn attach(desk: &mut Desk, actor: u32, life: Incarnation, now: Instant) {
+    desk.on_status(&status(actor, life), now);
+}
+
+fn status(actor: u32, life: Incarnation) -> ActorStatus {
+    ActorStatus {
         actor: ActorId(actor),
         incarnation: life,
         pid: 1,
         state: ActorState::Serving,
         newest_policy: None,
         flights_flown: 0,
+        times: Times::default(),
+    }
+}
+
+/// A sign of life of an actor that has flown for so many seconds in this life.
+fn flown(desk: &mut Desk, actor: u32, life: Incarnation, state: ActorState, secs: u64, now: Instant) {
+    let mut status = ActorStatus {
+        state,
+        ..status(actor, life)
     };
+    status.times.add(Stage::Physics, secs, Duration::from_secs(secs));
     desk.on_status(&status, now);
 }
 
 /// Tickets handed out to `actor`.
-fn tickets_for(messages: &[ControlRecord], actor: u32, life: Incarnation) -> Vec<Ticket> {
+pub(super) fn tickets_for(messages: &[ControlRecord], actor: u32, life: Incarnation) -> Vec<Ticket> {
     let own = messages.iter().filter(|message| message.is_for(ActorId(actor), life));
     own.filter_map(|message| match message.read(RUN) {
         Ok(Control::Fly(ticket)) => Some(ticket),
@@ -68,7 +83,7 @@ fn tickets_for(messages: &[ControlRecord], actor: u32, life: Incarnation) -> Vec
 }
 
 /// The records of a flight of `2 + flight % 3` steps.
-fn records(ticket: &Ticket, actor: u32, life: Incarnation) -> Vec<TransitionRecord> {
+pub(super) fn records(ticket: &Ticket, actor: u32, life: Incarnation) -> Vec<TransitionRecord> {
     let steps = 2 + (ticket.flight.0 % 3) as u32;
     (0..=steps)
         .map(|step| {
@@ -86,7 +101,7 @@ fn records(ticket: &Ticket, actor: u32, life: Incarnation) -> Vec<TransitionReco
         .collect()
 }
 
-fn feed(desk: &mut Desk, records: &[TransitionRecord], now: Instant) -> Vec<(Place, CommittedFlight)> {
+pub(super) fn feed(desk: &mut Desk, records: &[TransitionRecord], now: Instant) -> Vec<(Place, CommittedFlight)> {
     records
         .iter()
         .filter_map(|record| desk.on_record(record, now).unwrap())
@@ -94,7 +109,7 @@ fn feed(desk: &mut Desk, records: &[TransitionRecord], now: Instant) -> Vec<(Pla
 }
 
 /// A desk with one actor that holds tickets 0 and 1 of three orders.
-fn desk(now: Instant) -> (Desk, Vec<Ticket>) {
+pub(super) fn desk(now: Instant) -> (Desk, Vec<Ticket>) {
     let mut desk = Desk::new(RUN, &limits());
     (0..3).for_each(|flight| desk.order(order(flight)));
     attach(&mut desk, 0, LIFE, now);
@@ -420,4 +435,35 @@ proptest! {
         prop_assert_eq!(committed.len() as u64, ORDERS);
         prop_assert_eq!(desk.open_orders(), 0);
     }
+}
+
+#[test]
+fn the_times_of_all_lives_of_all_actors_are_summed_up_and_none_twice() {
+    let now = Instant::now();
+    let mut desk = Desk::new(RUN, &limits());
+    let flies = |desk: &mut Desk, actor, life, secs| flown(desk, actor, life, ActorState::Serving, secs, now);
+    let physics = |desk: &Desk| desk.actor_times().of(Stage::Physics);
+    let next_life = Incarnation(LIFE.0 + 1);
+    attach(&mut desk, 0, LIFE, now);
+    attach(&mut desk, 1, LIFE, now);
+    flies(&mut desk, 0, LIFE, 3);
+    flies(&mut desk, 0, LIFE, 5);
+    flies(&mut desk, 1, LIFE, 20);
+    assert_eq!(physics(&desk).count, 25);
+    // The next life counts from nothing; an older one's late word is not believed.
+    attach(&mut desk, 0, next_life, now);
+    flies(&mut desk, 0, next_life, 100);
+    flies(&mut desk, 0, LIFE, 7000);
+    assert_eq!(physics(&desk).count, 125);
+    // What it says as it leaves is in.
+    flown(&mut desk, 0, next_life, ActorState::Leaving, 101, now);
+    assert_eq!(physics(&desk).count, 126);
+    // Taken for dead, and heard again in the same life.
+    let later = now + 2 * Duration::from_secs_f64(limits().actor_silence_secs);
+    desk.on_time(later);
+    assert_eq!((desk.actors().count(), physics(&desk).count), (0, 126));
+    flown(&mut desk, 1, LIFE, ActorState::Serving, 30, later);
+    flown(&mut desk, 1, LIFE, ActorState::Serving, 31, later);
+    assert_eq!(physics(&desk).count, 127);
+    assert_eq!(physics(&desk).nanos, 127_000_000_000);
 }

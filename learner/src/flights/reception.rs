@@ -15,6 +15,7 @@ use skein_protocol::ids::Epoch;
 use skein_protocol::run::{Life, RunIdentity};
 use skein_protocol::services::{LearnerPorts, LearnerWaker};
 use skein_protocol::snapshot::Snapshot;
+use skein_protocol::stages::Times;
 use skein_protocol::ticket::Ticket;
 
 use super::assembly::Keep;
@@ -47,6 +48,7 @@ pub struct Shared {
     /// Actors that live, in ascending order.
     live_actors: RwLock<Vec<u32>>,
     faults: RwLock<Faults>,
+    times: RwLock<Times>,
     situation: RwLock<Option<(Instant, Situation)>>,
     /// Why the receiving thread ended before it was told to.
     failure: RwLock<Option<ReceptionError>>,
@@ -197,6 +199,11 @@ impl Shared {
         *self.faults.read().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// What the time of the receiving thread and of all actors since the learner's start went into, as of the last word of any of them.
+    pub fn times(&self) -> Times {
+        *self.times.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Where the flights are, as of the receiving thread's last heartbeat, and how long ago that was; `None` before the first.
     pub fn situation(&self) -> Option<(Duration, Situation)> {
         let situation = self.situation.read().unwrap_or_else(PoisonError::into_inner);
@@ -224,6 +231,10 @@ impl Shared {
             *live = desk.actors().map(|actor| actor.0).collect();
         }
         *self.faults.write().unwrap_or_else(PoisonError::into_inner) = desk.faults();
+    }
+
+    pub(super) fn update_times(&self, times: Times) {
+        *self.times.write().unwrap_or_else(PoisonError::into_inner) = times;
     }
 
     pub(super) fn update_situation(&self, situation: Situation, now: Instant) {

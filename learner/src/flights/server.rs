@@ -15,6 +15,7 @@ use skein_protocol::ids::RunId;
 use skein_protocol::run::RunIdentity;
 use skein_protocol::services::{LearnerPorts, ServiceError};
 use skein_protocol::snapshot::Snapshot;
+use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::ControlRecord;
 
 use super::desk::{Desk, HopelessFlight, Order, Place};
@@ -36,9 +37,12 @@ pub(super) struct Server {
     ports: LearnerPorts,
     /// What is still to be sent, in this order.
     outbox: VecDeque<Outgoing>,
+    /// Whether an actor that may wait has not been woken to what was sent.
+    is_wake_due: bool,
     heartbeat: Duration,
     last_heartbeat: Option<Instant>,
     trouble: Trouble,
+    timer: LapTimer,
 }
 
 /// Flights of one batch that wait for an earlier one.
@@ -82,9 +86,11 @@ impl Server {
             deliveries: BTreeMap::new(),
             ports,
             outbox: VecDeque::new(),
+            is_wake_due: false,
             heartbeat: config.transport.heartbeat(),
             last_heartbeat: None,
             trouble: Trouble::default(),
+            timer: LapTimer::start(),
         }
     }
 
@@ -103,13 +109,16 @@ impl Server {
                 Wish::Vanish => return Ok(()),
             }
             let now = Instant::now();
-            self.take_status(now);
+            self.take_status(now, shared);
+            self.timer.lap(Stage::HandOut, 0);
             let next = self.take_records(now)?;
             self.desk.on_time(now);
             self.hand_out(now);
             self.give_sign_of_life(now, shared);
             self.send_out();
+            self.wake_actors();
             shared.update(&self.desk);
+            self.timer.lap(Stage::HandOut, 1);
             if let Some(error) = self.trouble.lasting(now) {
                 return Err(ReceptionError::Transport(error));
             }
@@ -154,31 +163,55 @@ impl Server {
         }
     }
 
-    fn take_status(&mut self, now: Instant) {
+    fn take_status(&mut self, now: Instant, shared: &Shared) {
+        let (mut heard, mut anyone_empty_handed) = (false, false);
         while let Some(record) = self.trouble.unless(self.ports.receive_status()).flatten() {
+            heard = true;
             match record.read(self.run) {
-                Some(status) => self.desk.on_status(&status, now),
+                Some(status) => {
+                    anyone_empty_handed |= status.newest_policy.is_none();
+                    self.desk.on_status(&status, now);
+                }
                 None => {
                     tracing::debug!(?record, "status record refused");
                     self.desk.refuse_status();
                 }
             }
         }
+        if heard {
+            self.tell_times(shared);
+        }
+        if anyone_empty_handed {
+            // Not only at the next heartbeat: an actor that has come cannot fly before it has a snapshot.
+            self.trouble.unless(self.ports.connect());
+            self.is_wake_due = true;
+        }
+    }
+
+    fn tell_times(&self, shared: &Shared) {
+        shared.update_times(self.desk.actor_times().plus(self.timer.times()));
     }
 
     /// Takes records in.
     fn take_records(&mut self, now: Instant) -> Result<Next, HopelessFlight> {
+        let mut unbooked = 0;
+        let mut next = Next::AtOnce;
         for _ in 0..RECORDS_AT_ONCE {
             let Some(record) = self.trouble.unless(self.ports.receive_transition()).flatten() else {
-                return Ok(Next::Wait);
+                next = Next::Wait;
+                break;
             };
+            unbooked += 1;
             if let Some((place, flight)) = self.desk.on_record(&record, now)? {
                 self.deliver(place, flight);
+                self.timer.lap(Stage::Assemble, std::mem::take(&mut unbooked));
                 self.hand_out(now);
                 self.send_out();
+                self.timer.lap(Stage::HandOut, 0);
             }
         }
-        Ok(Next::AtOnce)
+        self.timer.lap(Stage::Assemble, unbooked);
+        Ok(next)
     }
 
     /// Passes on what is next in its batch, and keeps what is early.
@@ -205,7 +238,6 @@ impl Server {
 
     /// Sends what is to be sent, as far as that works.
     fn send_out(&mut self) {
-        let before = self.outbox.len();
         while let Some(outgoing) = self.outbox.front() {
             let sent = match outgoing {
                 Outgoing::Snapshot(snapshot) => self.ports.publish(snapshot),
@@ -214,10 +246,17 @@ impl Server {
             if self.trouble.unless(sent).is_none() {
                 break;
             }
+            self.is_wake_due |= matches!(outgoing, Outgoing::Snapshot(_));
             self.outbox.pop_front();
         }
-        if self.outbox.len() < before {
-            self.trouble.unless(self.ports.wake_actors());
+    }
+
+    /// Wakes the actors to what was sent in this round, if one of them may wait.
+    fn wake_actors(&mut self) {
+        self.is_wake_due |= self.desk.take_wake();
+        // What could not be sent yet is nothing to wake anybody for.
+        if self.is_wake_due && self.outbox.is_empty() {
+            self.is_wake_due = self.trouble.unless(self.ports.wake_actors()).is_none();
         }
     }
 
@@ -228,6 +267,7 @@ impl Server {
         }
         self.last_heartbeat = Some(now);
         shared.update_situation(self.desk.situation(now), now);
+        self.tell_times(shared);
         self.trouble.unless(self.ports.maintain());
         let heartbeat = ControlRecord::heartbeat(self.run);
         self.trouble.unless(self.ports.send_control(heartbeat));
@@ -242,6 +282,7 @@ impl Server {
         if self.trouble.unless(self.ports.wait(patience)).is_none() {
             sleep(RETRY_INTERVAL);
         }
+        self.timer.lap(Stage::ReceivingIdle, 1);
     }
 
     fn say_stop(&mut self) {

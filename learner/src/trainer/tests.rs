@@ -39,10 +39,17 @@ fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
         }
         trainer.take_in(flown).unwrap();
     }
-    trainer.train_vae(Epoch(epoch), |_| Ok::<_, UpdateError>(())).unwrap();
+    let (mut timer, before) = (LapTimer::start(), (trainer.vae_updates(), trainer.updates()));
     trainer
-        .train_policy(Epoch(epoch), |_| Ok::<_, UpdateError>(()))
+        .train_vae(Epoch(epoch), &mut timer, |_| Ok::<_, UpdateError>(()))
         .unwrap();
+    trainer
+        .train_policy(Epoch(epoch), &mut timer, |_| Ok::<_, UpdateError>(()))
+        .unwrap();
+    let done = (trainer.vae_updates() - before.0, trainer.updates() - before.1);
+    let booked = |stage| timer.times().of(stage).count;
+    assert_eq!((booked(Stage::SampleImages), booked(Stage::Sample)), done);
+    assert_eq!((booked(Stage::VaeStep), booked(Stage::SacUpdate)), done);
 }
 
 fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {

@@ -1,11 +1,12 @@
 //! Evaluation flights in a run: those that confirm a candidate for the best snapshot, and those that show in the end what it can do.
 
 use std::ops::Range;
-use std::time::Instant;
 
 use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::Phase;
+use skein_protocol::stages::Stage;
+use skein_protocol::summary::Trained;
 
 use super::{Training, TrainingError};
 use crate::best::{is_better, is_candidate};
@@ -27,6 +28,7 @@ impl Training<'_> {
         let version = self.progress.version();
         let flown = self.evaluate(version, 0..1, self.config.evaluation.confirm_flights, Keep::Latents)?;
         pass(FaultPoint::LearnerCandidateFlown);
+        self.note_trained(&flown);
         let passed: f64 = flown.iter().map(|flight| f64::from(flight.walls_passed)).sum();
         let candidate = BestSnapshot {
             policy_version: version.0,
@@ -57,6 +59,30 @@ impl Training<'_> {
         Ok(())
     }
 
+    /// Writes down what it took, the first time that `flown` show a policy that does what it was trained for.
+    fn note_trained(&mut self, flown: &[CommittedFlight]) {
+        let sum = |of: fn(&CommittedFlight) -> u8| flown.iter().map(|flight| f64::from(of(flight))).sum::<f64>();
+        let rate = sum(|flight| flight.walls_passed) / sum(|flight| flight.course_walls);
+        if self.progress.trained.is_some() || rate < self.config.evaluation.trained_rate {
+            return;
+        }
+        let trained = Trained {
+            rate,
+            flights: self.progress.flights,
+            steps: self.trainer.steps(),
+            updates: self.trainer.updates(),
+            wall_secs: self.progress.spent.wall_secs + self.started.elapsed().as_secs_f64(),
+        };
+        tracing::info!(
+            rate,
+            flights = trained.flights,
+            steps = trained.steps,
+            secs = trained.wall_secs,
+            "trained"
+        );
+        self.progress.trained = Some(trained);
+    }
+
     fn is_candidate(&self) -> bool {
         let progress = &self.progress;
         let last = progress.flights == self.config.run.flights && progress.latest_candidate != Some(progress.flights);
@@ -77,7 +103,7 @@ impl Training<'_> {
         flights: u64,
         keep: Keep,
     ) -> Result<Vec<CommittedFlight>, TrainingError> {
-        let started = Instant::now();
+        self.timer.lap(Stage::OtherTraining, 0);
         let (run, number) = (self.identity.run, self.progress.evaluations);
         let tickets = curriculum::evaluation(self.config, run, number, version, courses, flights);
         let total = tickets.len() as u64;
@@ -93,7 +119,7 @@ impl Training<'_> {
         }
         self.progress.evaluations += 1;
         self.progress.evaluation_flights += total;
-        self.progress.spent.add("evaluation", started);
+        self.timer.lap(Stage::Evaluate, total);
         Ok(flown)
     }
 
@@ -117,7 +143,7 @@ impl Training<'_> {
         pass(FaultPoint::LearnerEvaluated);
         Ok(self.disk.with_room(self.directory.root(), || {
             evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;
-            evaluation::write_reconstructions(self.directory, &self.trainer, &pictured)
+            evaluation::write_reconstructions(self.directory, &mut self.trainer, &pictured)
         })?)
     }
 }

@@ -13,6 +13,7 @@ use skein_protocol::ids::PolicyVersion;
 use skein_protocol::progress::{self, Phase};
 use skein_protocol::run::{Life, RunDirectory, RunIdentity};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{Ending, Summary};
 
 use super::{StopWatch, Training, TrainingError};
@@ -34,7 +35,7 @@ impl<'a> Training<'a> {
         config: &'a Config,
         stop: &'a Arc<AtomicBool>,
     ) -> Result<Self, TrainingError> {
-        let started = Instant::now();
+        let (started, timer) = (Instant::now(), LapTimer::start());
         let disk = Disk::new(stop.clone());
         let mut trainer = Trainer::new(config)?;
         let store = CheckpointStore::new(&directory.checkpoints(), config);
@@ -86,6 +87,7 @@ impl<'a> Training<'a> {
             disk,
             started,
             epoch_started: started,
+            timer,
             progress: saved.clone(),
             saved,
             resumes,
@@ -176,9 +178,10 @@ impl<'a> Training<'a> {
         if (now.epochs, now.latest_candidate) == (saved.epochs, saved.latest_candidate) {
             return Ok(());
         }
-        let started = Instant::now();
+        self.timer.lap(Stage::OtherTraining, 0);
         self.metrics.flush()?;
         self.save_snapshot(self.progress.version(), &self.directory.latest_snapshot())?;
+        self.timer.lap(Stage::Checkpoint, 0);
         let progress = self.counted();
         let state = CheckpointState {
             progress: progress.clone(),
@@ -188,7 +191,7 @@ impl<'a> Training<'a> {
         };
         self.checkpoints.save(state, self.metrics.files())?;
         self.saved = progress;
-        self.progress.spent.add("checkpoint", started);
+        self.timer.lap(Stage::Checkpoint, 1);
         Ok(())
     }
 
@@ -205,7 +208,7 @@ impl<'a> Training<'a> {
             spent: self
                 .progress
                 .spent
-                .with_this_life(self.started, &self.reception.shared()),
+                .with_this_life(self.started, self.timer.times(), &self.reception.shared()),
             ..self.progress.clone()
         }
     }
@@ -215,6 +218,7 @@ impl<'a> Training<'a> {
         self.reporter.update(|progress| progress.phase = Phase::Finishing);
         self.metrics.flush()?;
         self.checkpoint()?;
+        self.timer.lap(Stage::OtherTraining, 0);
         Ok(self.counted())
     }
 
@@ -362,6 +366,7 @@ fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &P
         final_version: progress.version(),
         best_version: best.map(|best| PolicyVersion(best.policy_version)),
         best_confirmed_walls_passed: best.map(|best| best.confirmed_walls_passed),
+        trained: progress.trained,
         flights: progress.flights,
         steps: progress.environment_steps,
         updates: progress.sac_updates,
@@ -373,7 +378,7 @@ fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &P
         refused_by_reason: progress.spent.records_refused.clone(),
         resumes,
         wall_secs: progress.spent.wall_secs,
-        phase_secs: progress.spent.phase_secs.clone(),
+        stages: progress.spent.stages,
         thread_cpu_secs: BTreeMap::new(),
     }
 }

@@ -1,172 +1,274 @@
-//! The whole step: exactness, determinism, and that it learns.
+//! The native engine against libtorch's automatic gradients, and against itself on other instructions and threads.
 
-use skein_protocol::snapshot::SnapshotLayout;
+use skein_kernels::Isa;
+use tch::{Kind, no_grad_guard};
 
 use super::*;
 
 /// Depth images of one wall each with a square opening at some place: near, far, and nothing in between.
-fn synthetic_images(count: usize, seed: u64) -> Tensor {
+pub(super) fn synthetic_bytes(count: usize, seed: u64) -> Vec<u8> {
+    const WIDTH: usize = skein_protocol::IMAGE_WIDTH;
     let mut noise = Noise::new(seed);
     let mut bytes = vec![60; count * IMAGE_PIXELS];
     for image in bytes.chunks_exact_mut(IMAGE_PIXELS) {
         let (top, left) = (26.0 + noise.uniform(20.0), 54.0 + noise.uniform(40.0));
         for row in top as usize..top as usize + 20 {
-            image[row * IMAGE_WIDTH..][left as usize..left as usize + 20].fill(220);
+            image[row * WIDTH..][left as usize..left as usize + 20].fill(220);
         }
     }
-    images_from_bytes(&bytes)
+    bytes
 }
 
-fn vae(seed: u64) -> Vae {
+fn native(seed: u64) -> NativeVae {
+    NativeVae::new(&VaeSection::default(), seed, 2)
+}
+
+fn torch(seed: u64) -> TorchVae {
     crate::device::use_threads(1);
-    Vae::new(&VaeSection::default(), seed, Device::Cpu)
+    TorchVae::new(&VaeSection::default(), seed, Device::Cpu)
 }
 
-fn bits(tensor: &Tensor) -> Vec<f32> {
+fn bits(values: &[f32]) -> Vec<u32> {
+    values.iter().map(|value| value.to_bits()).collect()
+}
+
+fn flat(tensor: &Tensor) -> Vec<f32> {
     Vec::try_from(tensor.reshape([-1])).unwrap()
 }
 
-#[test]
-fn squared_error_is_summed_over_pixels_and_averaged_over_images() {
-    let seen = Tensor::from_slice(&[0.0_f32, 1.0, 0.5, 0.5]).view([2, 1, 1, 2]);
-    let reconstructed = Tensor::from_slice(&[0.5_f32, 0.5, 0.5, 1.0]).view([2, 1, 1, 2]);
-    // ((0.25 + 0.25) + (0 + 0.25)) / 2
-    assert_eq!(squared_error(&reconstructed, &seen).double_value(&[]), 0.375);
+/// Distance of two vectors, as a share of the second one's length.
+fn relative_distance(found: &[f32], expected: &[f32]) -> f64 {
+    let length = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>().sqrt();
+    let difference = found.iter().zip(expected);
+    let difference = length(&mut difference.map(|(a, b)| f64::from(*a) - f64::from(*b)));
+    difference / length(&mut expected.iter().map(|value| f64::from(*value)))
+}
+
+fn state(vae: &mut NativeVae) -> Vec<crate::state::NamedTensor> {
+    vae.named_tensors()
 }
 
 #[test]
-fn divergence_matches_hand_calculation() {
-    let mean = Tensor::from_slice(&[1.0_f32, 0.0, 0.0, 0.0]).view([2, 2]);
-    let log_variance = Tensor::from_slice(&[0.0_f32, 2.0_f32.ln(), 0.0, 0.0]).view([2, 2]);
-    // ½ (1 + (2 - ln 2 - 1)) for the first code, 0 for the second, which is the prior.
-    let expected = 0.5 * (1.0 + 1.0 - std::f64::consts::LN_2) / 2.0;
-    let found = divergence(&mean, &log_variance).double_value(&[]);
-    assert!((found - expected).abs() < 1e-6, "{found} is not {expected}");
-}
+fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_precision() {
+    for (seed, count) in [(1, 1), (2, 3), (3, 16)] {
+        let images = synthetic_bytes(count, seed);
+        let mut noise = vec![0.0; count * LATENT];
+        Noise::new(seed).fill_normal(&mut noise);
+        let (found, gradient) = native(seed).loss_and_gradient(&images, &noise);
 
-#[test]
-fn the_published_part_is_the_snapshots_encoder() {
-    let vae = vae(1);
-    let layout = SnapshotLayout::new(LATENT, 8);
-    assert_eq!(layout.encoder(), 0..vae.published_len());
-    let mut start = 0;
-    for (ours, snapshots) in vae.parameters.layout().tensors().iter().zip(layout.tensors()) {
-        if start == vae.published_len() {
-            break;
+        let reference = torch(seed).in_double();
+        let (expected, expected_gradient) = reference.loss_and_gradient(&images_from_bytes(&images), &noise);
+        for (found, expected) in found.iter().zip(expected) {
+            let error = (f64::from(*found) - expected).abs() / expected;
+            assert!(error < 1e-6, "{found} is not {expected}: off by {error}");
         }
-        let shape: Vec<usize> = ours.shape.iter().map(|&size| size as usize).collect();
-        assert_eq!((&ours.name, &shape), (&snapshots.name, &snapshots.shape));
-        assert_eq!(start..start + ours.len(), snapshots.range);
-        start += ours.len();
-    }
-    assert_eq!(start, vae.published_len());
-    let mut published = vec![0.0; vae.published_len()];
-    vae.publish(&mut published);
-    assert_eq!(published, bits(vae.parameters.flat())[..start]);
-}
-
-#[test]
-fn the_decoder_gives_images_of_the_cameras_size() {
-    let vae = vae(1);
-    assert_eq!(vae.reconstruct(&synthetic_images(2, 1)).size(), [2, 72, 128]);
-    assert_eq!(vae.encode(&images_from_bytes(&[])).size(), [0, 32]);
-}
-
-#[test]
-fn images_are_encoded_alike_in_one_chunk_and_in_several() {
-    let (vae, images) = (vae(1), synthetic_images(CHUNK as usize + 3, 1));
-    let together = vae.encode(&images);
-    assert_eq!(together.size(), [CHUNK + 3, 32]);
-    let apart = vae.encode(&images.narrow(0, CHUNK, 3));
-    assert!(together.narrow(0, CHUNK, 3).allclose(&apart, 1e-4, 1e-5, false));
-}
-
-#[test]
-fn gradient_matches_finite_differences() {
-    let mut vae = vae(1);
-    vae.parameters = vae.parameters.to_double();
-    let pixels = pixels(&synthetic_images(1, 1)).to_kind(Kind::Double);
-    let code_noise = Noise::new(2).normal(&[1, 32], Device::Cpu);
-    let loss = |vae: &Vae| vae.objective(&pixels, &code_noise).loss;
-    let gradient = vae.parameters.gradient(&loss(&vae));
-
-    // Along its own gradient, the loss of each tensor rises by the gradient's length: a tensor out of place in the flat vector would show.
-    let _guard = no_grad_guard();
-    let mut start = 0;
-    for tensor in vae.parameters.layout().clone().tensors() {
-        let len = tensor.len() as i64;
-        let direction = gradient.narrow(0, start, len);
-        let slope = direction.norm().double_value(&[]);
-        let mut loss_after_moving = |distance: f64| {
-            let _ = vae
-                .parameters
-                .flat_mut()
-                .narrow(0, start, len)
-                .g_add_(&(&direction * (distance / slope)));
-            loss(&vae).double_value(&[])
-        };
-        let (ahead, behind) = (loss_after_moving(1e-5), loss_after_moving(-2e-5));
-        loss_after_moving(1e-5);
-        let measured = (ahead - behind) / 2e-5;
-        assert!(
-            (measured - slope).abs() < 1e-3 * slope,
-            "{}: {measured} is not {slope}",
-            tensor.name
-        );
-        start += len;
+        let mut start = 0;
+        for tensor in reference.layout().tensors() {
+            let range = start..start + tensor.len();
+            let error = relative_distance(&gradient[range.clone()], &expected_gradient[range]);
+            assert!(error < 3e-6, "{} of {count} images is off by {error}", tensor.name);
+            start += tensor.len();
+        }
+        assert_eq!(start, gradient.len());
     }
 }
 
 #[test]
-fn a_vae_learns_to_reproduce_images_it_was_not_trained_on() {
-    let mut vae = vae(3);
-    let (seen, unseen) = (synthetic_images(64, 1), synthetic_images(16, 2));
-    let code_noise = Noise::new(5).normal(&[16, 32], Device::Cpu);
-    let error = |vae: &Vae| {
-        let _guard = no_grad_guard();
-        vae.objective(&pixels(&unseen), &code_noise).error.double_value(&[]) / IMAGE_PIXELS as f64
+fn both_engines_begin_with_the_same_numbers() {
+    for seed in 1..4 {
+        let (native, torch) = (native(seed), torch(seed));
+        assert_eq!(native.published_len(), torch.published_len());
+        let [mut ours, mut theirs] = [0; 2].map(|_| vec![f32::NAN; native.published_len()]);
+        native.publish(&mut ours);
+        torch.publish(&mut theirs);
+        assert_eq!(bits(&ours), bits(&theirs));
+    }
+}
+
+#[test]
+fn both_engines_encode_and_reconstruct_alike() {
+    let images = synthetic_bytes(35, 4);
+    let (mut native, torch) = (native(5), torch(5));
+    let codes = native.encode(&images);
+    let expected = flat(&torch.encode(&images_from_bytes(&images)));
+    assert!(relative_distance(codes.as_flattened(), &expected) < 1e-6);
+    let seen = native.reconstruct(&images);
+    let expected = flat(&torch.reconstruct(&images_from_bytes(&images)));
+    assert_eq!(seen.len(), expected.len());
+    for (seen, expected) in seen.iter().zip(&expected) {
+        assert!((seen - expected).abs() < 1e-6, "{seen} is not {expected}");
+    }
+    assert!(native.encode(&[]).is_empty() && native.reconstruct(&[]).is_empty());
+}
+
+#[test]
+fn twenty_steps_of_both_engines_lead_to_the_same_place() {
+    let images = synthetic_bytes(16, 6);
+    let (mut native, mut torch) = (native(7), torch(7));
+    let [mut ours, mut theirs] = [0; 2].map(|_| Noise::new(8));
+    for step in 0..20 {
+        let batch = &images[step % 2 * 8 * IMAGE_PIXELS..][..8 * IMAGE_PIXELS];
+        let found = native.update(batch, &mut ours).unwrap();
+        let expected = torch.update(&images_from_bytes(batch), &mut theirs).unwrap();
+        let error = (found.loss - expected.loss).abs() / expected.loss;
+        assert!(error < 1e-3, "step {step}: {found:?} is not {expected:?}");
+    }
+    let seen = native.reconstruct(&images);
+    let expected = flat(&torch.reconstruct(&images_from_bytes(&images)));
+    let distance = relative_distance(&seen, &expected);
+    assert!(distance < 1e-3, "reconstructions differ by {distance}");
+}
+
+#[test]
+fn neither_threads_nor_instructions_change_a_bit() {
+    let images = synthetic_bytes(2, 9);
+    let run = |isa: Isa, threads: usize| {
+        let mut vae = NativeVae::with_isa(&VaeSection::default(), 1, threads, isa);
+        let metrics = [1, 2].map(|seed| vae.update(&images, &mut Noise::new(seed)).unwrap());
+        (
+            metrics,
+            vae.encode(&images),
+            bits(&vae.reconstruct(&images)),
+            state(&mut vae),
+        )
     };
-    let untrained = error(&vae);
+    let expected = run(Isa::best(), 1);
+    for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
+        // The slowest once: 3 threads, of which one has no image.
+        for threads in (1..4).filter(|threads| isa != Isa::Portable || *threads == 3) {
+            assert!(run(isa, threads) == expected, "{isa}, {threads} threads");
+        }
+    }
+}
+
+#[test]
+fn an_image_is_encoded_and_seen_the_same_in_any_company() {
+    let (mut vae, images) = (native(1), synthetic_bytes(35, 1));
+    let (codes, seen) = (vae.encode(&images), vae.reconstruct(&images));
+    for index in [0, 33] {
+        let alone = &images[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
+        assert_eq!(vae.encode(alone), [codes[index]]);
+        assert_eq!(vae.reconstruct(alone), seen[index * IMAGE_PIXELS..][..IMAGE_PIXELS]);
+    }
+}
+
+#[test]
+fn a_restored_native_vae_continues_bit_for_bit() {
+    let images = synthetic_bytes(4, 1);
+    let mut vae = native(1);
+    vae.update(&images, &mut Noise::new(1)).unwrap();
+    let stored = state(&mut vae);
+    let expected = vae.update(&images, &mut Noise::new(2)).unwrap();
+
+    let mut resumed = native(9);
+    // What it has packed must not outlive what it is restored to.
+    let _ = resumed.encode(&images);
+    resumed.load_named(&stored).unwrap();
+    assert_eq!(resumed.updates(), 1);
+    assert_eq!(resumed.update(&images, &mut Noise::new(2)).unwrap(), expected);
+    assert!(state(&mut resumed) == state(&mut vae));
+    assert_eq!(resumed.encode(&images), vae.encode(&images));
+}
+
+#[test]
+fn the_state_of_one_engine_is_refused_by_the_other() {
+    let mut torch = torch(1);
+    assert!(torch.load_named(&state(&mut native(1))).is_err());
+    assert!(native(1).load_named(&torch.named_tensors()).is_err());
+}
+
+#[test]
+fn a_native_vae_learns_to_reproduce_images_it_was_not_trained_on() {
+    let (seen, unseen) = (synthetic_bytes(64, 1), synthetic_bytes(16, 2));
+    let mut vae = native(3);
+    let error = |vae: &mut NativeVae| {
+        let reconstructed = vae.reconstruct(&unseen);
+        let errors = reconstructed
+            .iter()
+            .zip(&unseen)
+            .map(|(found, depth)| found - f32::from(*depth) / 255.0);
+        errors.map(|error| error * error).sum::<f32>() / unseen.len() as f32
+    };
+    let untrained = error(&mut vae);
     let mut noise = Noise::new(4);
     for step in 0..24 {
-        let metrics = vae.update(&seen.narrow(0, step % 8 * 8, 8), &mut noise).unwrap();
+        let batch = &seen[step % 8 * 8 * IMAGE_PIXELS..][..8 * IMAGE_PIXELS];
+        let metrics = vae.update(batch, &mut noise).unwrap();
         let parts = metrics.pixel_error * IMAGE_PIXELS as f32 + metrics.divergence;
-        assert!((metrics.loss - parts).abs() < 0.01 * metrics.loss, "{metrics:?}");
+        assert!((metrics.loss - parts).abs() < 1e-4 * metrics.loss, "{metrics:?}");
     }
+    let trained = error(&mut vae);
     assert!(
-        error(&vae) < 0.4 * untrained,
-        "{} after training, {untrained} before",
-        error(&vae)
+        trained < 0.4 * untrained,
+        "{trained} after training, {untrained} before"
     );
     assert_eq!(vae.updates(), 24);
 }
 
 #[test]
-fn a_restored_vae_continues_bit_for_bit() {
-    let images = synthetic_images(8, 1);
-    let mut vae = vae(1);
-    vae.update(&images, &mut Noise::new(1)).unwrap();
-    let stored = vae.named_tensors();
-    let expected = vae.update(&images, &mut Noise::new(2)).unwrap();
+fn what_is_not_finite_changes_nothing() {
+    let images = synthetic_bytes(2, 1);
+    let infinite = VaeSection {
+        kl_weight: f64::INFINITY,
+        ..VaeSection::default()
+    };
+    let mut vae = NativeVae::new(&infinite, 1, 2);
+    let before = state(&mut vae);
+    let refused = vae.update(&images, &mut Noise::new(1)).unwrap_err();
+    let tensor = "vae loss";
+    assert_eq!(refused, UpdateError::NonFinite { tensor, update: 1 });
+    assert!(state(&mut vae) == before);
 
-    let mut resumed = self::vae(9);
-    resumed.load_named(&stored).unwrap();
-    assert_eq!(resumed.update(&images, &mut Noise::new(2)).unwrap(), expected);
-    assert_eq!(bits(resumed.parameters.flat()), bits(vae.parameters.flat()));
+    // Parameters that are not numbers, each of another layer; and one that only gradients meet, for the loss is far from overflowing.
+    let broken = |name: &str, value: f32| {
+        let mut vae = native(1);
+        vae.spoil(name, value);
+        let before = state(&mut vae);
+        let refused = vae.update(&images, &mut Noise::new(1)).unwrap_err();
+        // Not a number is not equal to itself.
+        let bits_of = |state: Vec<crate::state::NamedTensor>| format!("{state:?}");
+        assert_eq!(bits_of(state(&mut vae)), bits_of(before), "{name}");
+        refused
+    };
+    for name in ["encoder.conv1.bias", "decoder.conv1.weight", "decoder.conv4.bias"] {
+        let UpdateError::NonFinite { update, .. } = broken(name, f32::NAN);
+        assert_eq!(update, 1, "{name}");
+    }
 }
 
 #[test]
-fn a_non_finite_loss_changes_nothing() {
-    let mut vae = vae(1);
-    vae.kl_weight = f64::INFINITY;
-    let before = vae.parameters.flat().copy();
-    let error = vae.update(&synthetic_images(2, 1), &mut Noise::new(1)).unwrap_err();
-    assert_eq!(
-        error,
-        UpdateError::NonFinite {
-            tensor: "vae loss",
-            update: 1
-        }
-    );
-    assert_eq!((vae.parameters.flat(), vae.updates()), (&before, 0));
+fn a_configuration_gets_its_engine() {
+    let mut run = RunSection::default();
+    let section = VaeSection::default();
+    assert!(matches!(Vae::new(&section, &run, Device::Cpu), Vae::Native(_)));
+    run.engine = Some(Engine::Libtorch);
+    assert!(matches!(Vae::new(&section, &run, Device::Cpu), Vae::Libtorch(_)));
+}
+
+#[test]
+fn engines_agree_behind_their_common_face() {
+    let images = synthetic_bytes(3, 2);
+    let of = |engine| {
+        let run = RunSection {
+            engine: Some(engine),
+            ..RunSection::default()
+        };
+        let mut vae = Vae::new(&VaeSection::default(), &run, Device::Cpu);
+        let metrics = vae.update(&images, &mut Noise::new(1)).unwrap();
+        let mut published = vec![0.0; vae.published_len()];
+        vae.publish(&mut published);
+        (
+            metrics,
+            vae.encode(&images),
+            vae.reconstruct(&images),
+            published,
+            vae.updates(),
+        )
+    };
+    let (native, torch) = (of(Engine::Native), of(Engine::Libtorch));
+    assert!((native.0.loss - torch.0.loss).abs() < 1e-5 * torch.0.loss);
+    assert!(relative_distance(native.1.as_flattened(), torch.1.as_flattened()) < 1e-2);
+    assert!(relative_distance(&native.2, &torch.2) < 1e-3);
+    assert!(relative_distance(&native.3, &torch.3) < 1e-3);
+    assert_eq!((native.4, torch.4), (1, 1));
 }

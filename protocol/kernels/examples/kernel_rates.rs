@@ -79,7 +79,7 @@ fn main() {
         let img = vec![0.5; w.image_len()];
         let b = vec![0.25; w.window_len() * out];
         let panels = Panels::of(isa, Matrix::of_rows(&b, w.window_len()).transposed());
-        let mut c = vec![0.0; w.count() * out];
+        let mut c = vec![0.5; w.count() * out];
         let flops = (2 * w.count() * w.window_len() * out) as f64;
         report(
             &format!("convolution {size:?}x{ch} {kernel:?} to {out}"),
@@ -105,6 +105,13 @@ fn main() {
         );
         let cols = vec![0.5; w.count() * w.window_len()];
         let mut into = vec![0.0; w.image_len()];
-        report("  add back", flops, best(|| w.add_back(&cols, &mut into)));
+        report("  add back", flops, best(|| w.add_back(isa, &cols, &mut into)));
+        let panels = Panels::of(isa, Matrix::of_rows(&b, w.window_len()));
+        let mut scratch = Vec::new();
+        report(
+            "  spread",
+            flops,
+            best(|| spread(&c, &panels, &w, &mut scratch, &mut into)),
+        );
     }
 }

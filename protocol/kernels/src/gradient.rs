@@ -1,5 +1,8 @@
 //! The gradient of a layer's weights: what came in, times what flows back, summed over everything the weights were used for.
 
+use std::cell::RefCell;
+use std::ops::Range;
+
 use crate::isa::{Isa, Scalar8, Simd};
 use crate::panels::{Aligned, Matrix, Panel, panels};
 use crate::team::{Shared, Team};
@@ -8,6 +11,8 @@ use crate::windows::Windows;
 
 /// Terms done before all elements are put back: both operands' parts then stay in the caches.
 const TERMS_AT_ONCE: usize = 256;
+/// Numbers between two tiles of the left operand: without them, all tiles would begin in the same few sets of the cache.
+const PADDING: usize = 16;
 
 /// The right operand, a row for each term.
 #[derive(Debug, Clone, Copy)]
@@ -18,7 +23,37 @@ pub enum Terms<'a> {
     Windows(&'a Windows, &'a [f32]),
 }
 
-impl Terms<'_> {
+impl<'a> Terms<'a> {
+    fn data(&self) -> &'a [f32] {
+        match self {
+            Self::Matrix(data, _) | Self::Windows(_, data) => data,
+        }
+    }
+
+    /// Where the rows of these terms begin.
+    fn starts(&self, terms: Range<usize>, into: &mut Vec<usize>) {
+        into.clear();
+        match self {
+            Self::Matrix(_, columns) => into.extend(terms.map(|term| term * columns)),
+            Self::Windows(windows, _) => into.extend(terms.map(|term| {
+                let (image, window) = (term / windows.count(), term % windows.count());
+                image * windows.image_len() + windows.starts()[window]
+            })),
+        }
+    }
+
+    /// The runs of memory that hold a panel's columns of a row.
+    fn pieces(&self, panel: Panel) -> Vec<Run> {
+        let columns = panel.first..panel.first + panel.columns;
+        match self {
+            Self::Matrix(..) => vec![Run {
+                offset: columns.start,
+                len: columns.len(),
+            }],
+            Self::Windows(windows, _) => windows.pieces(columns),
+        }
+    }
+
     fn columns(&self) -> usize {
         match self {
             Self::Matrix(_, columns) => *columns,
@@ -80,30 +115,35 @@ struct Job<'a> {
     isa: Isa,
     left: Matrix<'a>,
     right: Terms<'a>,
-    columns: std::ops::Range<usize>,
+    columns: Range<usize>,
     output: Output,
 }
 
+/// Memory of one thread, kept from product to product.
+#[derive(Default)]
+struct Scratch {
+    left: Aligned,
+    right: Aligned,
+    /// Where each term's row of the right operand begins.
+    starts: Vec<usize>,
+}
+
 thread_local! {
-    /// Packed operands, kept from product to product.
-    static PACKED: std::cell::RefCell<[Aligned; 2]> = std::cell::RefCell::default();
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
 impl Job<'_> {
     fn run(&self) {
-        PACKED.with_borrow_mut(|[left, right]| {
-            let terms = self.left.rows();
-            if terms == 0 {
-                return self.blank();
-            }
+        let terms = self.left.rows();
+        if terms == 0 {
+            return self.blank();
+        }
+        SCRATCH.with_borrow_mut(|scratch| {
             for first in (0..terms).step_by(TERMS_AT_ONCE) {
-                let terms = (terms - first).min(TERMS_AT_ONCE);
-                let tall = self.isa.tile_rows();
-                let left = left.of_len(self.left.columns().div_ceil(tall) * tall * terms);
-                let right = right.of_len(self.isa.panel_width() * terms);
+                let terms = first..(first + TERMS_AT_ONCE).min(terms);
                 let begin = if first == 0 { Begin::Zero } else { Begin::Output };
-                // SAFETY: the instructions were asked for; both buffers have room for all that is packed; this member alone writes its columns.
-                unsafe { do_block(self, first..first + terms, left, right, begin) };
+                // SAFETY: `gradient` has asked for the instructions and looked at all lengths; this member alone writes its columns.
+                unsafe { do_block(self, terms, scratch, begin) };
             }
         });
     }
@@ -120,55 +160,53 @@ impl Job<'_> {
 }
 
 /// # Safety
-/// The instructions of `job` are there; the buffers have room; nobody else touches the job's columns of the output.
-unsafe fn do_block(job: &Job<'_>, terms: std::ops::Range<usize>, left: &mut [f32], right: &mut [f32], begin: Begin) {
+/// The instructions of `job` are there; the terms are; nobody else touches the job's columns of the output.
+unsafe fn do_block(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
     // SAFETY: as the caller says.
     unsafe {
         match job.isa {
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx512 => avx512(job, terms, left, right, begin),
+            Isa::Avx512 => avx512(job, terms, scratch, begin),
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx2 => avx2(job, terms, left, right, begin),
-            _ => block::<Scalar8>(job, terms, left, right, begin),
+            Isa::Avx2 => avx2(job, terms, scratch, begin),
+            _ => block::<Scalar8>(job, terms, scratch, begin),
         }
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq")]
-unsafe fn avx512(job: &Job<'_>, terms: std::ops::Range<usize>, left: &mut [f32], right: &mut [f32], begin: Begin) {
+unsafe fn avx512(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
     // SAFETY: as the caller says.
-    unsafe { block::<crate::isa::x86::Avx512>(job, terms, left, right, begin) }
+    unsafe { block::<crate::isa::x86::Avx512>(job, terms, scratch, begin) }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-unsafe fn avx2(job: &Job<'_>, terms: std::ops::Range<usize>, left: &mut [f32], right: &mut [f32], begin: Begin) {
+unsafe fn avx2(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
     // SAFETY: as the caller says.
-    unsafe { block::<crate::isa::x86::Avx2>(job, terms, left, right, begin) }
+    unsafe { block::<crate::isa::x86::Avx2>(job, terms, scratch, begin) }
 }
 
 #[inline(always)]
-unsafe fn block<S: Simd>(
-    job: &Job<'_>,
-    terms: std::ops::Range<usize>,
-    left: &mut [f32],
-    right: &mut [f32],
-    begin: Begin,
-) {
-    let count = terms.len();
-    pack_left::<S>(job.left, terms.clone(), left);
+unsafe fn block<S: Simd>(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
+    let (count, rows) = (terms.len(), job.left.columns());
+    let apart = count * S::ROWS + PADDING;
+    let left = scratch.left.of_len(rows.div_ceil(S::ROWS) * apart);
+    pack_left::<S>(job.left, terms.clone(), apart, left);
+    job.right.starts(terms, &mut scratch.starts);
+    let right = scratch.right.of_len(2 * S::LANES * count);
     for panel in panels(job.isa, job.columns.len()) {
         let panel = Panel {
             first: job.columns.start + panel.first,
             ..panel
         };
-        pack_right(job.right, terms.clone(), panel, &mut right[..count * panel.width]);
-        for row in (0..job.left.columns()).step_by(S::ROWS) {
-            let rows = (job.left.columns() - row).min(S::ROWS);
+        // SAFETY: as the caller says; there is room for a whole panel.
+        unsafe { pack_right::<S>(job.right, &scratch.starts, panel, right) };
+        for row in (0..rows).step_by(S::ROWS) {
             let tile = Tile {
                 left: Packed {
-                    data: left[row * count..].as_ptr(),
+                    data: left[row / S::ROWS * apart..].as_ptr(),
                     stride: S::ROWS,
                 },
                 runs: [Run { offset: 0, len: count }],
@@ -178,7 +216,7 @@ unsafe fn block<S: Simd>(
                 output: job.output.down(row * job.output.stride + panel.first),
             };
             // SAFETY: as the caller says.
-            unsafe { of_height!(S, rows, tile_of(tile)) };
+            unsafe { of_height!(S, (rows - row).min(S::ROWS), tile_of(tile)) };
         }
     }
 }
@@ -208,58 +246,67 @@ unsafe fn tile_of<S: Simd, const M: usize>(tile: Tile) {
     }
 }
 
-/// Lays out the left operand's columns as rows of tiles, term by term. Behind the last column lies whatever was there.
+/// Lays out the left operand's columns as tiles that begin `apart` numbers from each other, term by term. Behind the last column lies whatever was there.
 #[inline(always)]
-fn pack_left<S: Simd>(left: Matrix<'_>, terms: std::ops::Range<usize>, into: &mut [f32]) {
-    let count = terms.len();
+fn pack_left<S: Simd>(left: Matrix<'_>, terms: Range<usize>, apart: usize, into: &mut [f32]) {
+    let (count, columns) = (terms.len(), left.columns());
+    let whole = columns / S::ROWS;
+    assert!(apart >= count * S::ROWS && into.len() >= columns.div_ceil(S::ROWS) * apart);
     for (index, term) in terms.enumerate() {
         let row = left.row(term);
-        let mut whole = row.chunks_exact(S::ROWS);
-        let mut at = index * S::ROWS;
-        for part in &mut whole {
-            into[at..at + S::ROWS].copy_from_slice(part);
-            at += count * S::ROWS;
+        for tile in 0..whole {
+            let (from, to) = (tile * S::ROWS, tile * apart + index * S::ROWS);
+            // SAFETY: the row has `columns` numbers, `into` room for `count` terms of as many tiles as they fill, as asserted.
+            unsafe {
+                into.as_mut_ptr()
+                    .add(to)
+                    .copy_from_nonoverlapping(row.as_ptr().add(from), S::ROWS)
+            };
         }
-        let rest = whole.remainder();
+        let rest = &row[whole * S::ROWS..];
         if !rest.is_empty() {
-            into[at..at + rest.len()].copy_from_slice(rest);
+            into[whole * apart + index * S::ROWS..][..rest.len()].copy_from_slice(rest);
         }
     }
 }
 
 /// Lays out the panel's columns of the right operand, term by term.
+///
+/// # Safety
+/// The terms that begin at `starts` have the panel's columns; `into` has room for as many rows of the panel's width.
 #[inline(always)]
-fn pack_right(right: Terms<'_>, terms: std::ops::Range<usize>, panel: Panel, into: &mut [f32]) {
-    let rows = terms.zip(into.chunks_exact_mut(panel.width));
-    match right {
-        Terms::Matrix(data, columns) => {
-            for (term, row) in rows {
-                let from = &data[term * columns + panel.first..][..panel.columns];
-                fill_row(row, from);
+unsafe fn pack_right<S: Simd>(right: Terms<'_>, starts: &[usize], panel: Panel, into: &mut [f32]) {
+    let data = right.data().as_ptr();
+    let mut row = into.as_mut_ptr();
+    let pieces = right.pieces(panel);
+    // SAFETY: as the caller says.
+    unsafe {
+        match &pieces[..] {
+            [piece] if piece.len == 2 * S::LANES => {
+                for start in starts {
+                    let from = data.add(start + piece.offset);
+                    S::store(row, S::load(from));
+                    S::store(row.add(S::LANES), S::load(from.add(S::LANES)));
+                    row = row.add(2 * S::LANES);
+                }
             }
-        }
-        Terms::Windows(windows, images) => {
-            let offsets = windows.offsets(panel.first..panel.first + panel.columns);
-            let side_by_side = offsets.is_sorted_by(|a, b| a + 1 == *b);
-            for (term, row) in rows {
-                let (image, window) = (term / windows.count(), term % windows.count());
-                let start = image * windows.image_len() + windows.starts()[window];
-                if side_by_side {
-                    fill_row(row, &images[start + offsets[0]..][..panel.columns]);
-                } else {
-                    for (into, offset) in row.iter_mut().zip(&offsets) {
-                        *into = images[start + offset];
+            pieces => {
+                for start in starts {
+                    let mut to = row;
+                    for piece in pieces {
+                        let from = data.add(start + piece.offset);
+                        for number in 0..piece.len {
+                            *to.add(number) = *from.add(number);
+                        }
+                        to = to.add(piece.len);
                     }
-                    row[panel.columns..].fill(0.0);
+                    row = row.add(panel.width);
+                    while to < row {
+                        *to = 0.0;
+                        to = to.add(1);
+                    }
                 }
             }
         }
     }
-}
-
-#[inline(always)]
-fn fill_row(row: &mut [f32], from: &[f32]) {
-    let (there, missing) = row.split_at_mut(from.len());
-    there.copy_from_slice(from);
-    missing.fill(0.0);
 }

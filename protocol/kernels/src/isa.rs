@@ -56,19 +56,6 @@ impl Isa {
             Self::Avx512 => 32,
         }
     }
-
-    /// Rows of a tile: as many as leave registers for a panel's row and one broadcast.
-    pub(crate) fn tile_rows(self) -> usize {
-        match self {
-            Self::Portable => Scalar8::ROWS,
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx2 => x86::Avx2::ROWS,
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx512 => x86::Avx512::ROWS,
-            #[cfg(not(target_arch = "x86_64"))]
-            _ => Scalar8::ROWS,
-        }
-    }
 }
 
 impl fmt::Display for Isa {
@@ -240,6 +227,45 @@ pub(crate) mod x86 {
         unsafe fn gated(vector: __m512, by: __m512) -> __m512 {
             // SAFETY: as for `splat`.
             unsafe { _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(by, _mm512_setzero_ps()), vector) }
+        }
+    }
+
+    /// Writes `terms` numbers of eight columns side by side into rows that lie `stride` apart; `terms` is a multiple of eight.
+    ///
+    /// # Safety
+    /// AVX2 is there; so are the numbers and, from `into` on, eight numbers in each row.
+    #[target_feature(enable = "avx2")]
+    pub(crate) unsafe fn interleave(columns: [*const f32; 8], terms: usize, into: *mut f32, stride: usize) {
+        for first in (0..terms).step_by(8) {
+            // SAFETY: as the caller says.
+            let rows = columns.map(|column| unsafe { _mm256_loadu_ps(column.add(first)) });
+            // Pairs of numbers, then of pairs, then of halves change places.
+            let pairs: [__m256; 8] = std::array::from_fn(|row| {
+                let (a, b) = (rows[row & !1], rows[row | 1]);
+                if row & 1 == 0 {
+                    _mm256_unpacklo_ps(a, b)
+                } else {
+                    _mm256_unpackhi_ps(a, b)
+                }
+            });
+            let quads: [__m256; 8] = std::array::from_fn(|row| {
+                let (a, b) = (pairs[row & 4 | (row >> 1 & 1)], pairs[row & 4 | 2 | (row >> 1 & 1)]);
+                if row & 1 == 0 {
+                    _mm256_shuffle_ps::<0x44>(a, b)
+                } else {
+                    _mm256_shuffle_ps::<0xee>(a, b)
+                }
+            });
+            for term in 0..8 {
+                let (a, b) = (quads[term & 3], quads[4 | term & 3]);
+                let row = if term & 4 == 0 {
+                    _mm256_permute2f128_ps::<0x20>(a, b)
+                } else {
+                    _mm256_permute2f128_ps::<0x31>(a, b)
+                };
+                // SAFETY: as the caller says.
+                unsafe { _mm256_storeu_ps(into.add((first + term) * stride), row) };
+            }
         }
     }
 }

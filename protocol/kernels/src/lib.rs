@@ -26,7 +26,7 @@ pub use panels::{Matrix, Panels};
 pub use peak::peak_flops;
 pub use product::{Finish, Rows, Start, product};
 pub use team::Team;
-pub use windows::Windows;
+pub use windows::{Windows, spread};
 
 #[cfg(test)]
 mod tests;

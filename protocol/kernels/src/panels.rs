@@ -3,6 +3,8 @@
 //! Columns are gathered in panels as wide as a tile, and each panel is laid out term by term. Left where it lies, a matrix whose rows are a power of two apart
 //! would fall into a few sets of the cache.
 
+use std::ops::Range;
+
 use crate::isa::Isa;
 
 /// A matrix seen in either direction: element (row, column) lies at `row · row_stride + column · column_stride`.
@@ -134,7 +136,7 @@ impl Panels {
         let data = self.data.of_len(padded(isa, matrix.columns) * terms);
         for panel in panels(isa, matrix.columns) {
             let into = &mut data[panel.first * terms..][..panel.width * terms];
-            pack_panel(matrix, panel, into);
+            pack_panel(isa, matrix, panel, into);
         }
     }
 
@@ -159,14 +161,32 @@ impl Panels {
         self.isa
     }
 
-    pub(crate) fn panels(&self) -> impl Iterator<Item = Panel> + use<> {
-        panels(self.isa, self.columns)
+    /// The panels, as many full ones at a time as asked for while there are.
+    pub(crate) fn groups(&self, size: usize) -> impl Iterator<Item = Panel> + use<> {
+        let group = size * self.isa.panel_width();
+        let grouped = self.columns / group * group;
+        let groups = (0..grouped).step_by(group).map(move |first| Panel {
+            first,
+            columns: group,
+            width: group,
+        });
+        let rest = panels(self.isa, self.columns - grouped);
+        groups.chain(rest.map(move |panel| Panel {
+            first: grouped + panel.first,
+            ..panel
+        }))
+    }
+
+    /// Whether these columns are those of whole, full panels.
+    pub(crate) fn are_whole(&self, columns: &Range<usize>) -> bool {
+        let width = self.isa.panel_width();
+        columns.start.is_multiple_of(width) && columns.end.is_multiple_of(width)
     }
 
     /// Where `panel` begins at `term`.
     pub(crate) fn at(&self, panel: Panel, term: usize) -> *const f32 {
         debug_assert!(term < self.terms.max(1));
-        // Inside the allocation: `pack` has laid out all terms of all panels.
+        // Inside the allocation: `pack` has laid out all terms of all panels. Of several panels at once all terms are taken.
         self.data
             .as_ptr()
             .wrapping_add(panel.first * self.terms + term * panel.width)
@@ -192,7 +212,7 @@ fn padded(isa: Isa, columns: usize) -> usize {
     panels(isa, columns).last().map_or(0, |last| last.first + last.width)
 }
 
-fn pack_panel(matrix: Matrix<'_>, panel: Panel, into: &mut [f32]) {
+fn pack_panel(isa: Isa, matrix: Matrix<'_>, panel: Panel, into: &mut [f32]) {
     let Matrix {
         data,
         row_stride,
@@ -207,18 +227,55 @@ fn pack_panel(matrix: Matrix<'_>, panel: Panel, into: &mut [f32]) {
         }
         return;
     }
-    if panel.columns < panel.width {
-        into.fill(0.0);
-    }
-    // Along the columns, which lie side by side when the matrix is seen transposed; a few terms at a time, so that what is written stays near.
-    const TERMS: usize = 16;
-    for (block, into) in into.chunks_mut(TERMS * panel.width).enumerate() {
-        let terms = into.len() / panel.width;
-        for column in 0..panel.columns {
-            let start = (panel.first + column) * column_stride + block * TERMS * row_stride;
-            for term in 0..terms {
-                into[term * panel.width + column] = data[start + term * row_stride];
+    // Along the columns, which lie side by side when the matrix is seen transposed; eight at a time, so that lines are written whole.
+    for first in (0..panel.width).step_by(EIGHT) {
+        let columns = panel.columns.saturating_sub(first).min(EIGHT);
+        let column = |index: usize| &data[(panel.first + first + index) * column_stride..];
+        if columns == EIGHT && row_stride == 1 {
+            let columns: [&[f32]; EIGHT] = std::array::from_fn(|index| &column(index)[..matrix.rows]);
+            interleave(isa, columns, into, first, panel.width);
+            continue;
+        }
+        for (term, row) in into.chunks_exact_mut(panel.width).enumerate() {
+            let row = &mut row[first..first + EIGHT];
+            for (index, number) in row.iter_mut().enumerate() {
+                *number = if index < columns {
+                    column(index)[term * row_stride]
+                } else {
+                    0.0
+                };
             }
+        }
+    }
+}
+
+/// Columns that are interleaved at a time; a panel's width is a multiple of it.
+const EIGHT: usize = 8;
+
+/// Writes the numbers of eight columns, all of one length, side by side into the rows of `into`, from its column `first` on.
+fn interleave(isa: Isa, columns: [&[f32]; EIGHT], into: &mut [f32], first: usize, width: usize) {
+    let terms = columns[0].len();
+    assert!(
+        columns.iter().all(|column| column.len() == terms),
+        "columns of one length"
+    );
+    assert!(
+        into.len() == terms * width && first + EIGHT <= width,
+        "a row for each term"
+    );
+    let mut done = 0;
+    #[cfg(target_arch = "x86_64")]
+    if isa >= Isa::Avx2 && isa.is_available() {
+        done = terms / EIGHT * EIGHT;
+        // SAFETY: the instructions are there, as just asked; so are `terms` numbers of each column and as many rows, as asserted above.
+        unsafe {
+            crate::isa::x86::interleave(columns.map(<[f32]>::as_ptr), done, into[first..].as_mut_ptr(), width);
+        }
+    }
+    let _ = isa;
+    for term in done..terms {
+        for (index, column) in columns.iter().enumerate() {
+            into[term * width + first + index] = column[term];
         }
     }
 }

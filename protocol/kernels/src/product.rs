@@ -1,14 +1,17 @@
 //! Rows times packed panels: every forward pass, and what flows back to a layer's input.
 
+use std::ops::Range;
+
 use crate::isa::{Isa, Scalar8, Simd};
 use crate::panels::{Panel, Panels};
-use crate::tile::{Begin, End, InPlace, Output, Run, of_height, panel_tile};
+use crate::tile::{Begin, End, InPlace, MOST_ROWS, Output, ROW_PANELS, Run, of_height, panel_tile, row_of_panels};
 use crate::windows::Windows;
 
-/// Terms done before the next panel's turn: a panel's part then stays in the first cache beside the rows it meets.
+/// Terms of a panel that all rows meet before the next ones' turn: they stay in the first cache meanwhile.
 const TERMS_AT_ONCE: usize = 256;
-/// Rows done before the next ones' turn: their terms stay in the second cache while all panels meet them.
+/// Rows that meet all panels before the next ones' turn, and numbers of a matrix's rows: they stay in the second cache meanwhile.
 const ROWS_AT_ONCE: usize = 192;
+const NUMBERS_AT_ONCE: usize = 80 << 10;
 
 /// The left operand: rows of numbers, read where they lie.
 #[derive(Debug, Clone, Copy)]
@@ -46,8 +49,20 @@ pub enum Finish<'a> {
 /// # Panics
 /// When lengths do not belong together.
 pub fn product(rows: Rows<'_>, panels: &Panels, start: Start<'_>, finish: Finish<'_>, output: &mut [f32]) {
-    let columns = panels.columns();
-    let count = check(rows, panels, start, finish, output.len());
+    product_part(rows, panels, 0..panels.columns(), start, finish, output);
+}
+
+/// [`product`] for some columns only, from the first of a panel to the last of one: `output` and a gate hold these alone, a bias is that of all.
+pub(crate) fn product_part(
+    rows: Rows<'_>,
+    panels: &Panels,
+    part: Range<usize>,
+    start: Start<'_>,
+    finish: Finish<'_>,
+    output: &mut [f32],
+) {
+    let columns = part.len();
+    let count = check(rows, panels, &part, start, finish, output.len());
     let single;
     let (data, starts, runs) = match rows {
         Rows::Matrix(data) => {
@@ -59,19 +74,33 @@ pub fn product(rows: Rows<'_>, panels: &Panels, start: Start<'_>, finish: Finish
         }
         Rows::Windows(windows, image) => (image, Starts::Listed(windows.starts()), windows.runs()),
     };
-    let blocks = blocks(runs);
-    for first in (0..count).step_by(ROWS_AT_ONCE) {
-        let rows = (count - first).min(ROWS_AT_ONCE);
-        for (index, block) in blocks.iter().enumerate() {
-            for panel in panels.panels() {
-                let corner = first * columns + panel.first;
+    // A single row meets a number only once, and needs as many sums under way as there are registers.
+    let (terms_at_once, panels_at_once) = if count == 1 && columns == panels.columns() {
+        (usize::MAX, ROW_PANELS)
+    } else {
+        (TERMS_AT_ONCE, 1)
+    };
+    let blocks = blocks(runs, terms_at_once);
+    let last_block = blocks.len() - 1;
+    let rows_at_once = match rows {
+        Rows::Matrix(_) => (NUMBERS_AT_ONCE / panels.terms()).clamp(MOST_ROWS, ROWS_AT_ONCE),
+        Rows::Windows(..) => ROWS_AT_ONCE,
+    };
+    for first in (0..count).step_by(rows_at_once) {
+        for panel in panels
+            .groups(panels_at_once)
+            .filter(|panel| part.contains(&panel.first))
+        {
+            let corner = first * columns + panel.first - part.start;
+            for (index, block) in blocks.iter().enumerate() {
                 let work = Work {
                     left: data.as_ptr(),
                     starts,
                     first,
-                    rows,
+                    rows: (count - first).min(rows_at_once),
                     runs: &block.runs,
                     right: panels.at(panel, block.first_term),
+                    terms: panels.terms(),
                     panel,
                     begin: match start {
                         _ if index > 0 => Begin::Output,
@@ -79,7 +108,7 @@ pub fn product(rows: Rows<'_>, panels: &Panels, start: Start<'_>, finish: Finish
                         Start::Bias(bias) => Begin::Bias(bias[panel.first..].as_ptr()),
                     },
                     end: match finish {
-                        _ if index + 1 < blocks.len() => End::Plain,
+                        _ if index < last_block => End::Plain,
                         Finish::Plain => End::Plain,
                         Finish::Rectified => End::Rectified,
                         Finish::Gated(by) => End::Gated(by[corner..].as_ptr()),
@@ -98,8 +127,19 @@ pub fn product(rows: Rows<'_>, panels: &Panels, start: Start<'_>, finish: Finish
 }
 
 /// Looks at all lengths; returns the number of rows.
-fn check(rows: Rows<'_>, panels: &Panels, start: Start<'_>, finish: Finish<'_>, output: usize) -> usize {
-    let (terms, columns) = (panels.terms(), panels.columns());
+fn check(
+    rows: Rows<'_>,
+    panels: &Panels,
+    part: &Range<usize>,
+    start: Start<'_>,
+    finish: Finish<'_>,
+    output: usize,
+) -> usize {
+    let (terms, columns) = (panels.terms(), part.len());
+    assert!(
+        part.end <= panels.columns() && (*part == (0..panels.columns()) || panels.are_whole(part)),
+        "columns {part:?} are not those of whole panels"
+    );
     assert!(panels.isa().is_available(), "{} is not to be had here", panels.isa());
     assert!(terms > 0 && columns > 0, "an empty product");
     let count = match rows {
@@ -123,7 +163,7 @@ fn check(rows: Rows<'_>, panels: &Panels, start: Start<'_>, finish: Finish<'_>, 
         "a place for each of {count} x {columns} elements"
     );
     if let Start::Bias(bias) = start {
-        assert_eq!(bias.len(), columns, "a bias for each column");
+        assert_eq!(bias.len(), panels.columns(), "a bias for each column");
     }
     if let Finish::Gated(by) = finish {
         assert_eq!(by.len(), output, "a gate for each element");
@@ -137,15 +177,15 @@ struct Block {
     runs: Vec<Run>,
 }
 
-/// Cuts the terms into blocks of at most [`TERMS_AT_ONCE`].
-fn blocks(runs: &[Run]) -> Vec<Block> {
+/// Cuts the terms into blocks of at most so many.
+fn blocks(runs: &[Run], most: usize) -> Vec<Block> {
     let mut blocks: Vec<Block> = Vec::new();
     let (mut first_term, mut room) = (0, 0);
     for run in runs {
         let mut run = *run;
         while run.len > 0 {
             if room == 0 {
-                room = TERMS_AT_ONCE;
+                room = most;
                 let runs = Vec::new();
                 blocks.push(Block { first_term, runs });
             }
@@ -173,7 +213,7 @@ enum Starts<'a> {
     Listed(&'a [usize]),
 }
 
-/// Some rows, some terms, one panel.
+/// Some rows, some terms, one panel or several.
 struct Work<'a> {
     left: *const f32,
     starts: Starts<'a>,
@@ -181,6 +221,9 @@ struct Work<'a> {
     rows: usize,
     runs: &'a [Run],
     right: *const f32,
+    /// All terms of the product: so far apart are the columns of one panel and the next.
+    terms: usize,
+    /// One panel, or as many full ones side by side as a single row meets at once.
     panel: Panel,
     begin: Begin,
     end: End,
@@ -231,6 +274,11 @@ unsafe fn avx2(work: &Work<'_>) {
 
 #[inline(always)]
 unsafe fn all_tiles<S: Simd>(work: &Work<'_>) {
+    if work.panel.width == ROW_PANELS * 2 * S::LANES {
+        let panels = std::array::from_fn(|panel| work.right.wrapping_add(panel * work.terms * 2 * S::LANES));
+        // SAFETY: as the caller says: the panels lie one behind the other.
+        return unsafe { row_of_panels::<S>(work.row(0), work.runs, panels, work.begin, work.end, work.output) };
+    }
     let mut row = 0;
     while row < work.rows {
         let rows = (work.rows - row).min(S::ROWS);

@@ -110,6 +110,28 @@ proptest! {
             let flowing = Matrix::of_rows(&flowing, outputs);
             gradient(&mut Team::new(1), isa, flowing, Terms::Windows(&windows, &input), &mut found);
             prop_assert_eq!(&found, &expected_gradient, "{}", isa);
+
+            // What is spread is what is added back of the product, up to the order of sums; and the same with all instructions.
+            let columns = defined(
+                &output.chunks(outputs).map(<[f32]>::to_vec).collect::<Vec<_>>(),
+                |term, number| weights[term * len + number],
+                len,
+                |_| 0.0,
+            );
+            let panels = [Isa::Portable, isa].map(|isa| Panels::of(isa, Matrix::of_rows(&weights, len)));
+            for (rows, columns) in output.chunks(windows.count() * outputs).zip(columns.chunks(windows.count() * len)) {
+                let mut added = vec![0.5; windows.image_len()];
+                windows.add_back(isa, columns, &mut added);
+                let [portable, found] = panels.each_ref().map(|panels| {
+                    let mut image = vec![0.5; windows.image_len()];
+                    spread(rows, panels, &windows, &mut Vec::new(), &mut image);
+                    image
+                });
+                prop_assert_eq!(&found, &portable, "{}", isa);
+                for (found, added) in found.iter().zip(&added) {
+                    prop_assert!((found - added).abs() <= 1e-4 * (1.0 + added.abs()), "{} is not {}", found, added);
+                }
+            }
         }
     }
 }

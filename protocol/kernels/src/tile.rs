@@ -100,8 +100,11 @@ impl End {
     }
 }
 
+/// Full panels that a single row meets at once: eight sums under way hide that each term of one waits for the one before.
+pub(crate) const ROW_PANELS: usize = 4;
+
 /// The tallest tile of any instruction set, and its columns.
-const MOST_ROWS: usize = 12;
+pub(crate) const MOST_ROWS: usize = 12;
 const MOST_COLUMNS: usize = 32;
 
 /// Calls a function that is generic over instruction set and height with the height that is only known now. No tile is made that the instruction set has no
@@ -248,6 +251,57 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile, const M: usize, const N: usize>(
                     End::Gated(by) => S::gated(*sum, S::load(by.add(at))),
                 };
                 S::store(output.data.add(at), value);
+            }
+        }
+    }
+}
+
+/// One row under [`ROW_PANELS`] full panels, `output` as wide as all of them.
+///
+/// # Safety
+/// As for [`tile`].
+#[inline(always)]
+pub(crate) unsafe fn row_of_panels<S: Simd>(
+    left: *const f32,
+    runs: &[Run],
+    panels: [*const f32; ROW_PANELS],
+    begin: Begin,
+    end: End,
+    output: Output,
+) {
+    // SAFETY: all pointers are offset within what the caller vouches for.
+    unsafe {
+        let mut sums = [[S::splat(0.0); 2]; ROW_PANELS];
+        let at = |panel: usize, part: usize| (2 * panel + part) * S::LANES;
+        for (panel, sums) in sums.iter_mut().enumerate() {
+            for (part, sum) in sums.iter_mut().enumerate() {
+                match begin {
+                    Begin::Zero => {}
+                    Begin::Output => *sum = S::load(output.data.add(at(panel, part))),
+                    Begin::Bias(bias) => *sum = S::load(bias.add(at(panel, part))),
+                }
+            }
+        }
+        let mut passed = 0;
+        for run in runs {
+            for k in 0..run.len {
+                let term = S::splat(*left.add(run.offset + k));
+                for (panel, sums) in panels.iter().zip(&mut sums) {
+                    for (part, sum) in sums.iter_mut().enumerate() {
+                        *sum = S::fused(term, S::load(panel.add(passed + part * S::LANES)), *sum);
+                    }
+                }
+                passed += 2 * S::LANES;
+            }
+        }
+        for (panel, sums) in sums.iter().enumerate() {
+            for (part, sum) in sums.iter().enumerate() {
+                let value = match end {
+                    End::Plain => *sum,
+                    End::Rectified => S::rectified(*sum),
+                    End::Gated(by) => S::gated(*sum, S::load(by.add(at(panel, part)))),
+                };
+                S::store(output.data.add(at(panel, part)), value);
             }
         }
     }

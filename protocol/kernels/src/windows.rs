@@ -5,6 +5,9 @@
 
 use std::ops::Range;
 
+use crate::isa::Isa;
+use crate::panels::Panels;
+use crate::product::{Finish, Rows, Start, product_part};
 use crate::tile::Run;
 
 /// All positions of a kernel on an image `[height, width, channels]`, row by row, without padding.
@@ -78,34 +81,88 @@ impl Windows {
         &self.runs
     }
 
-    /// Where these numbers of a window lie, from where it begins.
-    pub(crate) fn offsets(&self, numbers: Range<usize>) -> Vec<usize> {
+    /// The runs of memory that hold these numbers of a window, from where it begins.
+    pub(crate) fn pieces(&self, numbers: Range<usize>) -> Vec<Run> {
         let row_len = self.runs[0].len;
-        numbers
-            .map(|number| self.runs[number / row_len].offset + number % row_len)
-            .collect()
+        let mut pieces = Vec::new();
+        let mut number = numbers.start;
+        while number < numbers.end {
+            let (row, inside) = (number / row_len, number % row_len);
+            let len = (row_len - inside).min(numbers.end - number);
+            let offset = self.runs[row].offset + inside;
+            pieces.push(Run { offset, len });
+            number += len;
+        }
+        pieces
     }
 
-    /// Adds each window's numbers, `[windows, window_len]`, to where they belong in `image`, in order. The adjoint of looking through the windows.
+    /// Adds each window's numbers, `[windows, window_len]`, to where they belong in `image`. The adjoint of looking through the windows.
     ///
     /// # Panics
     /// When a length is off.
-    pub fn add_back(&self, numbers: &[f32], image: &mut [f32]) {
+    pub fn add_back(&self, isa: Isa, numbers: &[f32], image: &mut [f32]) {
+        self.add_back_part(isa, 0..self.count(), 0..self.runs.len(), numbers, image);
+    }
+
+    /// Adds some rows of some windows back, kernel row by kernel row. `numbers`: `[windows, kernel rows, numbers of a row]`.
+    fn add_back_part(
+        &self,
+        isa: Isa,
+        windows: Range<usize>,
+        kernel_rows: Range<usize>,
+        numbers: &[f32],
+        image: &mut [f32],
+    ) {
+        let (starts, runs) = (&self.starts[windows], &self.runs[kernel_rows]);
+        let (run_len, len) = (self.runs[0].len, self.runs[0].len * runs.len());
         assert_eq!(image.len(), self.image_len, "the image the windows are of");
-        assert_eq!(
-            numbers.len(),
-            self.count() * self.window_len,
-            "all numbers of each window"
-        );
-        for (&start, mut numbers) in self.starts.iter().zip(numbers.chunks_exact(self.window_len)) {
-            for run in &self.runs {
-                let (from, rest) = numbers.split_at(run.len);
-                let into = &mut image[start + run.offset..][..run.len];
-                for (into, from) in into.iter_mut().zip(from) {
-                    *into += from;
+        assert_eq!(numbers.len(), starts.len() * len, "all numbers of each window");
+        isa.vectorised(|| {
+            for (row, run) in runs.iter().enumerate() {
+                for (&start, numbers) in starts.iter().zip(numbers.chunks_exact(len)) {
+                    let from = &numbers[row * run_len..][..run_len];
+                    let into = &mut image[start + run.offset..][..run_len];
+                    for (into, from) in into.iter_mut().zip(from) {
+                        *into += from;
+                    }
                 }
-                numbers = rest;
             }
+        });
+    }
+}
+
+/// Rows that a product is not done for fewer of, if there are: every panel that is fetched meets them all.
+const ROWS_AT_ONCE: usize = 24;
+
+/// Adds `rows · panels`, a window's numbers for each row, to where they belong in `image`: a transposed convolution forward, and what flows back through a
+/// convolution. `scratch` is used again from call to call.
+///
+/// Some rows of windows and one row of the kernel at a time, so that what is made is added back from the first cache. An element of the image is the sum of what
+/// it held, and then of its windows, by rows of windows in groups, by rows of the kernel, and from left to right.
+///
+/// # Panics
+/// When lengths do not belong together.
+pub fn spread(rows: &[f32], panels: &Panels, windows: &Windows, scratch: &mut Vec<f32>, image: &mut [f32]) {
+    let (terms, kernel_rows, run_len) = (panels.terms(), windows.runs.len(), windows.runs[0].len);
+    assert_eq!(
+        panels.columns(),
+        windows.window_len,
+        "a column for each number of a window"
+    );
+    assert_eq!(rows.len(), windows.count() * terms, "a row for each window");
+    let across = windows.positions[1];
+    let at_once = across * ROWS_AT_ONCE.div_ceil(across);
+    // By a rule that no instruction set changes: 32 columns are whole panels of all.
+    let kernel_rows_at_once = if run_len.is_multiple_of(32) { 1 } else { kernel_rows };
+    for first in (0..windows.count()).step_by(at_once) {
+        let some = first..(first + at_once).min(windows.count());
+        let left = Rows::Matrix(&rows[some.start * terms..some.end * terms]);
+        for row in (0..kernel_rows).step_by(kernel_rows_at_once) {
+            let runs = row..row + kernel_rows_at_once;
+            let columns = runs.start * run_len..runs.end * run_len;
+            scratch.resize(some.len() * columns.len(), 0.0);
+            product_part(left, panels, columns, Start::Zero, Finish::Plain, scratch);
+            windows.add_back_part(panels.isa(), some.clone(), runs, scratch, image);
         }
     }
 }
@@ -127,7 +184,7 @@ mod tests {
         // 3 x 4 pixels, one channel, windows of 2 x 2 moved by 2: two of them, in the upper two rows.
         let windows = Windows::new([3, 4], 1, [2, 2], 2);
         let mut image = [0.5; 12];
-        windows.add_back(&[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0], &mut image);
+        windows.add_back(Isa::best(), &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0], &mut image);
         assert_eq!(image, [1.5, 2.5, 5.5, 6.5, 3.5, 4.5, 7.5, 8.5, 0.5, 0.5, 0.5, 0.5]);
     }
 

@@ -18,6 +18,9 @@ pub struct EvaluationSection {
     pub every_flights: u64,
     /// How far below that of the best snapshot so far a candidate's average may lie, in walls: the average of so few flights is noisy. Default 0.3.
     pub candidate_margin: f64,
+    /// Share R of walls passed in a candidate's evaluation flights from which on the policy counts as trained. Only told, as time and flights that it took
+    /// (paper: R > 0.9); nothing that is learned depends on it. Default 0.9.
+    pub trained_rate: f64,
 }
 
 impl Default for EvaluationSection {
@@ -28,6 +31,7 @@ impl Default for EvaluationSection {
             window_flights: 50,
             every_flights: 50,
             candidate_margin: 0.3,
+            trained_rate: 0.9,
         }
     }
 }
@@ -47,6 +51,12 @@ impl EvaluationSection {
             "evaluation.candidate_margin",
             self.candidate_margin,
             "is negative or not finite",
+        )?;
+        require(
+            (0.0..=1.0).contains(&self.trained_rate),
+            "evaluation.trained_rate",
+            self.trained_rate,
+            "is outside [0, 1]: it is a share of walls passed",
         )
     }
 }

@@ -197,6 +197,15 @@ impl LearnerPorts {
     /// [`ServiceError`] when a peer's memory cannot be mapped, or actors can no longer find this learner.
     pub fn maintain(&self) -> Result<(), ServiceError> {
         self.check_findable()?;
+        self.connect()?;
+        self.dead.reclaim(&self.node)
+    }
+
+    /// Connects to actors that have come, and hands late joiners the newest snapshots.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when a peer's memory cannot be mapped.
+    pub fn connect(&self) -> Result<(), ServiceError> {
         self.transitions
             .update_connections()
             .map_err(failed("transitions", "connecting"))?;
@@ -208,8 +217,7 @@ impl LearnerPorts {
             .map_err(failed("weights", "connecting"))?;
         self.control
             .update_connections()
-            .map_err(failed("control", "connecting"))?;
-        self.dead.reclaim(&self.node)
+            .map_err(failed("control", "connecting"))
     }
 
     /// Looks for this learner as an actor would.

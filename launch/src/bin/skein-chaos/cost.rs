@@ -2,6 +2,7 @@
 
 use anyhow::{Context, Result};
 use skein_protocol::config::Config;
+use skein_protocol::stages::Stage;
 use skein_protocol::summary::Summary;
 
 use crate::stage::Recipe;
@@ -59,9 +60,7 @@ impl Cost {
             })
         };
         let all: f64 = median_of(&self.with, |summary| summary.thread_cpu_secs.values().sum());
-        let waits = median_of(&self.with, |summary| {
-            summary.phase_secs.get("checkpoint").copied().unwrap_or_default()
-        });
+        let waits = median_of(&self.with, |summary| summary.stages.of(Stage::Checkpoint).secs());
         let receives = cpu("reception") / all;
         println!("Cost, medians of {} trainings each, seconds:", self.with.len());
         println!(

@@ -9,6 +9,7 @@ use skein_learner::flights::assembly::Keep;
 use skein_learner::flights::desk::{Desk, Order, Place};
 use skein_protocol::config::TransportSection;
 use skein_protocol::ids::{ActorId, Attempt, Epoch, FlightId, Incarnation, PolicyVersion, RunId};
+use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
@@ -172,6 +173,7 @@ impl Learner {
             state: script.one_of(&[ActorState::Serving, ActorState::Serving, ActorState::Leaving]),
             newest_policy: None,
             flights_flown: 0,
+            times: Times::default(),
         };
         self.desk.on_status(&status, self.now);
     }

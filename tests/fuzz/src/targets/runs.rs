@@ -116,7 +116,8 @@ fn result_samples() -> Vec<Vec<u8>> {
     // Read, not made: it has fields for whatever a run may come to, and a reader that knows fewer of them reads it too.
     let summary = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"1024266715d59141","final_version":80,
         "best_version":70,"best_confirmed_walls_passed":4.9,"flights":800,"steps":42837,"updates":20418,"vae_updates":400,
-        "evaluation_flights":400,"tickets_reissued":0,"records_refused":0,"wall_secs":333.3,"phase_secs":{"flying":12.5}}"#;
+        "evaluation_flights":400,"tickets_reissued":0,"records_refused":0,"wall_secs":333.3,
+        "stages":[{"thread":"actors","stage":"physics","count":42000,"secs":12.5},{"thread":"training","stage":"idle","count":80,"secs":200.0}]}"#;
     let read: Summary = serde_json::from_str(summary).unwrap();
     let written = serde_json::to_vec(&read).unwrap();
     vec![tagged(0, &serde_json::to_vec(&report).unwrap()), tagged(1, &written)]

@@ -1,0 +1,127 @@
+//! An actor as a process: how soon after its start the first record is there, and how much memory it takes.
+//!
+//! The learner's ends are this program's, and answer at once: what is measured is the actor alone. Each figure is a line of JSON; `--quick` tries once.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+use skein_protocol::ids::{ActorId, Incarnation};
+use skein_protocol::ticket::ControlRecord;
+use skein_protocol::transition::{RecordKind, TransitionRecord};
+
+use common::{Learner, ticket};
+
+/// Longer than any machine takes for a step.
+const PATIENCE: Duration = Duration::from_secs(20);
+/// Flights after which memory is looked at: all buffers are as large as they get.
+const FLIGHTS: u64 = 10;
+const ACTOR: ActorId = ActorId(0);
+
+fn main() {
+    let starts = if std::env::args().any(|argument| argument == "--quick") {
+        1
+    } else {
+        15
+    };
+    let learner = Learner::open();
+    learner.ports.publish(&learner.snapshot()).expect("there is memory");
+    let mut start_secs = Vec::new();
+    let mut resident_bytes = 0;
+    for _ in 0..starts {
+        let (secs, bytes) = learner.watch_an_actor();
+        start_secs.push(secs);
+        resident_bytes = resident_bytes.max(bytes);
+    }
+    start_secs.sort_by(f64::total_cmp);
+    let line = |name, figure, unit| println!("{}", json!({ "name": name, "figure": figure, "unit": unit }));
+    line("actor_process/start", start_secs[starts / 2] * 1e3, "ms");
+    line("actor_process/resident", resident_bytes as f64 / 1e6, "MB");
+}
+
+impl Learner {
+    /// Starts an actor and lets it fly; seconds until its first record, and bytes resident after some flights.
+    fn watch_an_actor(&self) -> (f64, u64) {
+        let started = Instant::now();
+        let actor = Actor::start(self.directory.path());
+        let incarnation = self.until(|| {
+            let status = self.ports.receive_status().expect("its memory can be mapped")?;
+            // Late words of the actor before are none of this one's.
+            let status = status.read(self.identity.run)?;
+            (status.pid == actor.0.id()).then_some(status.incarnation)
+        });
+        self.fly(0, incarnation);
+        self.until(|| self.record(incarnation));
+        let secs = started.elapsed().as_secs_f64();
+        for flight in 1..FLIGHTS {
+            self.until(|| Some(self.record(incarnation)?.kind == RecordKind::Closing.code()).filter(|closed| *closed));
+            self.fly(flight, incarnation);
+        }
+        (secs, actor.resident_bytes())
+    }
+
+    fn fly(&self, flight: u64, incarnation: Incarnation) {
+        let ticket = ticket(self.identity.run, flight, 1);
+        self.ports.maintain().expect("the actor's memory can be mapped");
+        self.ports
+            .send_control(ControlRecord::fly(&ticket, ACTOR, incarnation))
+            .expect("there is memory");
+        self.ports.wake_actors().expect("the event can be raised");
+    }
+
+    fn record(&self, incarnation: Incarnation) -> Option<TransitionRecord> {
+        let record = self
+            .ports
+            .receive_transition()
+            .expect("the actor's memory can be mapped")?;
+        (record.incarnation == incarnation.0).then_some(*record)
+    }
+
+    /// Looks for something until it is there.
+    fn until<T>(&self, mut look: impl FnMut() -> Option<T>) -> T {
+        let start = Instant::now();
+        loop {
+            if let Some(found) = look() {
+                return found;
+            }
+            assert!(start.elapsed() < PATIENCE, "the actor says nothing");
+            self.ports
+                .wait(Duration::from_micros(100))
+                .expect("events can be waited for");
+        }
+    }
+}
+
+/// A process that ends with this value.
+struct Actor(Child);
+
+impl Actor {
+    fn start(run: &Path) -> Self {
+        let child = Command::new(env!("CARGO_BIN_EXE_skein-actor"))
+            .args(["--id", "0", "--run"])
+            .arg(run)
+            .stdin(Stdio::null())
+            .spawn();
+        Self(child.expect("the actor is built with its benchmarks"))
+    }
+
+    /// Memory that it has to itself or shares, as the kernel counts it.
+    fn resident_bytes(&self) -> u64 {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.0.id())).expect("it is there");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+        let kib: Option<u64> = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
+        kib.expect("the kernel tells it in KiB") << 10
+    }
+}
+
+impl Drop for Actor {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}

@@ -1,0 +1,226 @@
+//! One actor's whole step, from the camera to the record sent, against the sum of its stages.
+//!
+//! An iteration is a training flight through real shared memory, no longer than it must be: the shorter, the more of them nobody disturbs; every stage is given exactly what it was made of,
+//! so that whatever the whole takes beyond the sum of the stages is the loop's own. The learner's end is emptied after each flight, outside the time taken.
+
+mod common;
+
+use std::hint::black_box;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use criterion::measurement::WallTime;
+use criterion::{BenchmarkGroup, Criterion, Throughput};
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
+use skein_actor::agent::Agent;
+use skein_actor::courses::{Courses, Simulators};
+use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
+use skein_actor::inference::{Network, Scratch};
+use skein_protocol::ids::{ActorId, Incarnation};
+use skein_protocol::seeds::{Purpose, derive};
+use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
+use skein_protocol::snapshot::SnapshotLayout;
+use skein_protocol::ticket::Ticket;
+use skein_protocol::transition::{RecordKind, TransitionRecord};
+use skein_protocol::{ACTION, IMAGE_PIXELS};
+
+use common::{Learner, OBSERVATION, ticket};
+
+const ACTOR: ActorId = ActorId(0);
+const INCARNATION: Incarnation = Incarnation(0);
+
+fn main() {
+    let mut criterion = Criterion::default().configure_from_args();
+    let transport = Transport::open();
+    let config = &transport.learner.config;
+    let network = Network::new(&transport.learner.snapshot(), &SnapshotLayout::of(config));
+    let courses = Arc::new(Courses::of_run(config).expect("shipped courses can be flown"));
+    let tickets = [ticket(transport.learner.identity.run, 1, 1)];
+    let mut pilot = Pilot::new(
+        ACTOR,
+        INCARNATION,
+        Simulators::new(Arc::clone(&courses)),
+        Agent::new(OBSERVATION),
+    );
+    let flights: Vec<Vec<TransitionRecord>> = tickets
+        .iter()
+        .map(|ticket| {
+            fly(&mut pilot, ticket, &network, &transport);
+            transport.received()
+        })
+        .collect();
+    let steps = flights.iter().map(|records| records.len() - 1).sum::<usize>();
+
+    let mut group = criterion.benchmark_group("actor_step");
+    group.throughput(Throughput::Elements(steps as u64));
+    group.bench_function("whole", |bencher| {
+        bencher.iter_custom(|iterations| {
+            timed(iterations, flights.len(), &transport, |flight| {
+                fly(&mut pilot, &tickets[flight], &network, &transport);
+            })
+        });
+    });
+    environment(&mut group, &tickets, &flights, &mut Simulators::new(courses));
+    inference(&mut group, &flights, &network);
+    sending(&mut group, &tickets, &flights, &transport);
+    group.finish();
+    criterion.final_summary();
+}
+
+fn fly(pilot: &mut Pilot, ticket: &Ticket, network: &Network, transport: &Transport) {
+    let flown = pilot.fly(ticket, network, &mut Link(&transport.actor));
+    black_box(flown.expect("memory is free, as all records were taken in"));
+}
+
+/// Take-off, physics and camera: the same starts and actions.
+fn environment(
+    group: &mut BenchmarkGroup<'_, WallTime>,
+    tickets: &[Ticket],
+    flights: &[Vec<TransitionRecord>],
+    simulators: &mut Simulators,
+) {
+    let mut image = [0; IMAGE_PIXELS];
+    group.bench_function("environment", |bencher| {
+        bencher.iter(|| {
+            for (ticket, records) in tickets.iter().zip(flights) {
+                let simulator = simulators.of(ticket.course).expect("the course is loaded");
+                let mut start = Pcg64Mcg::seed_from_u64(derive(ticket.seed, Purpose::StartPosition, 0));
+                simulator
+                    .reset(ticket.start_level, &mut start)
+                    .expect("it has this level");
+                simulator.render(&mut image);
+                for record in steps_of(records) {
+                    black_box(simulator.step(record.action).expect("the flight was flown before"));
+                    simulator.render(&mut image);
+                    black_box(&image);
+                }
+            }
+        });
+    });
+}
+
+/// Encoder and policy: the same images and observations.
+fn inference(group: &mut BenchmarkGroup<'_, WallTime>, flights: &[Vec<TransitionRecord>], network: &Network) {
+    let mut scratch = Scratch::default();
+    group.bench_function("encoder", |bencher| {
+        bencher.iter(|| {
+            for record in flights.iter().flatten() {
+                black_box(network.encode(black_box(&record.depth), &mut scratch));
+            }
+        });
+    });
+    let mut noise = Pcg64Mcg::seed_from_u64(3);
+    let mut observed = vec![0.0; OBSERVATION.len()];
+    group.bench_function("policy", |bencher| {
+        bencher.iter(|| {
+            for record in flights.iter().flat_map(|records| steps_of(records)) {
+                OBSERVATION.write(&record.latent, &record.velocity_mps, &[0.0; ACTION], &mut observed);
+                black_box(network.distribution(&observed, &mut scratch).sample(&mut noise));
+            }
+        });
+    });
+}
+
+/// Loan, header and sending of as many records, two on loan at a time.
+fn sending(
+    group: &mut BenchmarkGroup<'_, WallTime>,
+    tickets: &[Ticket],
+    flights: &[Vec<TransitionRecord>],
+    transport: &Transport,
+) {
+    let begin = |ticket: &Ticket, step| {
+        let mut record = transport.actor.loan_transition().expect("all records were taken in");
+        record.begin(ticket, ACTOR, INCARNATION, step);
+        record
+    };
+    let send = |record| transport.actor.send_transition(record).expect("the learner is there");
+    group.bench_function("sending", |bencher| {
+        bencher.iter_custom(|iterations| {
+            timed(iterations, flights.len(), transport, |flight| {
+                let mut record = begin(&tickets[flight], 0);
+                for step in 1..flights[flight].len() as u32 {
+                    let next = begin(&tickets[flight], step);
+                    send(std::mem::replace(&mut record, next));
+                }
+                send(record);
+            })
+        });
+    });
+}
+
+/// Time that `work` takes on all of so many flights, `iterations` times; the learner's end is emptied after each, at nobody's cost.
+fn timed(iterations: u64, flights: usize, transport: &Transport, mut work: impl FnMut(usize)) -> Duration {
+    let mut spent = Duration::ZERO;
+    for _ in 0..iterations {
+        for flight in 0..flights {
+            let start = Instant::now();
+            work(flight);
+            spent += start.elapsed();
+            transport.empty();
+        }
+    }
+    spent
+}
+
+fn steps_of(records: &[TransitionRecord]) -> impl Iterator<Item = &TransitionRecord> {
+    records.iter().filter(|record| record.kind == RecordKind::Step.code())
+}
+
+/// Both ends of a run's services, on one thread.
+struct Transport {
+    actor: ActorPorts,
+    learner: Learner,
+}
+
+impl Transport {
+    fn open() -> Self {
+        let learner = Learner::open();
+        let actor = ActorPorts::join(&learner.identity, &learner.config).expect("the learner is there");
+        learner.ports.maintain().expect("the actor's memory can be mapped");
+        Self { actor, learner }
+    }
+
+    fn empty(&self) {
+        while let Some(record) = self
+            .learner
+            .ports
+            .receive_transition()
+            .expect("the actor's memory is mapped")
+        {
+            drop(record);
+        }
+    }
+
+    fn received(&self) -> Vec<TransitionRecord> {
+        let mut records = Vec::new();
+        while let Some(record) = self
+            .learner
+            .ports
+            .receive_transition()
+            .expect("the actor's memory is mapped")
+        {
+            records.push(*record);
+        }
+        records
+    }
+}
+
+struct Link<'a>(&'a ActorPorts);
+
+impl RecordLink for Link<'_> {
+    type Loan = LoanedTransition;
+    type Error = ServiceError;
+
+    fn loan(&mut self) -> Result<LoanedTransition, ServiceError> {
+        self.0.loan_transition()
+    }
+
+    fn send(&mut self, record: LoanedTransition) -> Result<(), ServiceError> {
+        self.0.send_transition(record)
+    }
+
+    fn directive(&mut self) -> Result<Directive, ServiceError> {
+        Ok(Directive::Continue)
+    }
+}

@@ -1,0 +1,69 @@
+//! The depth camera: frames a second drawn, and traced ray by ray in the same scene.
+//!
+//! An iteration is a flight's worth of poses through the whole corridor, leaning as drones do, so that near walls and open corridor are in it as they
+//! are in training.
+
+use std::hint::black_box;
+use std::path::Path;
+
+use criterion::{BenchmarkId, Criterion, Throughput};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion};
+use skein_simulator::camera::{CameraSettings, DepthCamera, IMAGE_PIXELS, ReferenceCamera};
+use skein_simulator::course::Course;
+
+/// Poses drawn an iteration.
+const DRAWN: usize = 240;
+/// Poses traced an iteration: every twelfth of those drawn.
+const TRACED: usize = DRAWN / 12;
+
+fn main() {
+    let mut criterion = Criterion::default().configure_from_args();
+    for course in ["training", "non_rectangular"] {
+        camera(&mut criterion, course);
+    }
+    criterion.final_summary();
+}
+
+fn camera(criterion: &mut Criterion, name: &str) {
+    let courses = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
+    let course = Course::load(courses.join(name).with_extension("toml")).expect("shipped courses can be flown");
+    let settings = CameraSettings::default();
+    let mut camera = DepthCamera::new(&settings, &course).expect("default settings make sense");
+    let reference = ReferenceCamera::new(&settings, &course).expect("a course's surfaces are a mesh");
+    let poses: Vec<_> = (0..DRAWN).map(|number| pose(&course, number)).collect();
+    let mut image = [0; IMAGE_PIXELS];
+
+    let mut group = criterion.benchmark_group("camera");
+    group.throughput(Throughput::Elements(DRAWN as u64));
+    group.bench_function(BenchmarkId::new("drawn", name), |bencher| {
+        bencher.iter(|| {
+            for pose in &poses {
+                camera.render(black_box(pose), &mut image);
+                black_box(&image);
+            }
+        });
+    });
+    group.throughput(Throughput::Elements(TRACED as u64));
+    group.bench_function(BenchmarkId::new("traced", name), |bencher| {
+        bencher.iter(|| {
+            for pose in poses.iter().step_by(DRAWN / TRACED) {
+                reference.render(black_box(pose), &mut image);
+                black_box(&image);
+            }
+        });
+    });
+    group.finish();
+}
+
+/// A pose of a flight that goes to each opening in turn.
+fn pose(course: &Course, number: usize) -> Isometry3<f32> {
+    let x = 1.0 + (course.corridor().length_m - 2.0) * number as f32 / DRAWN as f32;
+    let ahead = course
+        .walls()
+        .iter()
+        .find(|wall| wall.x_m() + course.wall_thickness_m() > x);
+    let [y, z] = ahead.map_or([0.0, course.corridor().height_m / 2.0], |wall| wall.safe_point());
+    let wave = number as f32 * 0.25;
+    let turn = UnitQuaternion::from_euler_angles(0.4 * wave.sin(), 0.1 * wave.cos(), 0.0);
+    Isometry3::from_parts(Translation3::new(x, y, z), turn)
+}

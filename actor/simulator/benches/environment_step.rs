@@ -1,0 +1,74 @@
+//! The environment step: half a second of flight, physics alone and with the image after it.
+//!
+//! An iteration is a whole flight through the training course, the oracle steering, take-off included.
+
+use std::hint::black_box;
+use std::path::Path;
+use std::sync::Arc;
+
+use criterion::{BenchmarkId, Criterion, Throughput};
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
+use skein_simulator::camera::IMAGE_PIXELS;
+use skein_simulator::course::Course;
+use skein_simulator::oracle::Oracle;
+use skein_simulator::simulator::{Simulator, SimulatorSettings};
+use skein_simulator::vehicle::{Preset, VehicleSettings};
+
+/// Seed of the one start that is flown from.
+const START: u64 = 1;
+
+#[derive(Clone, Copy)]
+enum Camera {
+    Off,
+    On,
+}
+
+fn main() {
+    let mut criterion = Criterion::default().configure_from_args();
+    let courses = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
+    let course = Arc::new(Course::load(courses.join("training.toml")).expect("shipped courses can be flown"));
+    let mut group = criterion.benchmark_group("environment_step");
+    for (preset, name) in [
+        (Preset::Airsim, "airsim"),
+        (Preset::Hummingbird, "hummingbird"),
+        (Preset::Point, "point"),
+    ] {
+        let settings = SimulatorSettings {
+            vehicle: VehicleSettings {
+                preset,
+                ..Default::default()
+            },
+            ..Default::default()
+        };
+        let mut simulator = Simulator::new(Arc::clone(&course), &settings).expect("default settings make sense");
+        group.throughput(Throughput::Elements(fly(&mut simulator, Camera::Off)));
+        for (camera, what) in [(Camera::Off, "physics"), (Camera::On, "with_camera")] {
+            group.bench_function(BenchmarkId::new(what, name), |bencher| {
+                bencher.iter(|| fly(&mut simulator, camera));
+            });
+        }
+    }
+    group.finish();
+    criterion.final_summary();
+}
+
+/// Flies once through the course; the number of steps it took.
+fn fly(simulator: &mut Simulator, camera: Camera) -> u64 {
+    let mut image = [0; IMAGE_PIXELS];
+    simulator
+        .reset(1, &mut Pcg64Mcg::seed_from_u64(START))
+        .expect("every course has a first level");
+    for steps in 1.. {
+        let action = Oracle::act(simulator.course(), &simulator.state());
+        let report = simulator.step(action).expect("the oracle's commands are finite");
+        if let Camera::On = camera {
+            simulator.render(&mut image);
+            black_box(&image);
+        }
+        if report.outcome.is_some() {
+            return steps;
+        }
+    }
+    unreachable!("the step limit ends every flight")
+}

@@ -1,0 +1,186 @@
+//! The machine that figures were measured on.
+
+use std::fmt;
+use std::fs;
+use std::hint::black_box;
+use std::path::Path;
+use std::thread;
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+use skein_kernels::{Isa, peak_flops};
+
+/// Bytes copied at a time, beyond any cache.
+const COPIED: usize = 128 << 20;
+/// Times that they are copied; the fastest counts.
+const COPIES: usize = 4;
+
+/// Instruction sets that decide how fast kernels are, as `/proc/cpuinfo` spells them.
+const INSTRUCTIONS: [&str; 10] = [
+    "sse4_2",
+    "avx",
+    "avx2",
+    "fma",
+    "f16c",
+    "avx512f",
+    "avx512_vnni",
+    "avx512_bf16",
+    "amx_bf16",
+    "amx_int8",
+];
+
+/// What one core can do at best, measured. A line of `machine.jsonl`, written between two benchmarks: what holds the core up then must not pass for all it
+/// can do, so the best of all lines counts.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Core {
+    /// f32 operations a second.
+    pub f32_flops: f64,
+    /// Bytes a second copied from memory to memory.
+    pub copied_bytes_per_sec: f64,
+}
+
+/// What is known of it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Machine {
+    /// The processor's name, with family and model: virtual machines often hide the rest.
+    pub processor: String,
+    /// Cores that processes may use.
+    pub cores: usize,
+    /// Of the instruction sets that matter, those it has.
+    pub instructions: Vec<&'static str>,
+    /// One of them.
+    pub core: Core,
+    /// Memory, bytes.
+    pub memory_bytes: u64,
+    /// The kernel.
+    pub kernel: String,
+    /// Processes that wanted to run, on average over the last five minutes: more than the benchmarks' one, and times are too long.
+    pub load: f64,
+}
+
+impl Core {
+    /// The core that the calling thread runs on.
+    pub fn measure() -> Self {
+        Self {
+            f32_flops: peak_flops(Isa::best()),
+            copied_bytes_per_sec: copied_bytes_per_sec(),
+        }
+    }
+
+    /// The best of what the lines of `path` say; measured now where there are none.
+    pub fn best_of(path: &Path) -> Self {
+        let text = fs::read_to_string(path).unwrap_or_default();
+        let lines = text.lines().filter_map(|line| serde_json::from_str(line).ok());
+        lines
+            .reduce(|a: Self, b: Self| Self {
+                f32_flops: a.f32_flops.max(b.f32_flops),
+                copied_bytes_per_sec: a.copied_bytes_per_sec.max(b.copied_bytes_per_sec),
+            })
+            .unwrap_or_else(Self::measure)
+    }
+}
+
+impl Machine {
+    /// This machine, whose cores are like `core`.
+    pub fn with(core: Core) -> Self {
+        let load = read("/proc/loadavg");
+        let info = read("/proc/cpuinfo");
+        let field = |name: &str| {
+            info.lines()
+                .filter_map(|line| line.split_once(':'))
+                .find_map(|(key, value)| (key.trim() == name).then(|| value.trim().to_owned()))
+                .unwrap_or_else(|| "unknown".to_owned())
+        };
+        let flags = field("flags");
+        let memory = read("/proc/meminfo");
+        let memory_kib = memory
+            .lines()
+            .find_map(|line| line.strip_prefix("MemTotal:")?.split_whitespace().next()?.parse().ok());
+        Self {
+            processor: format!(
+                "{} (family {}, model {})",
+                field("model name"),
+                field("cpu family"),
+                field("model")
+            ),
+            cores: cores(&info),
+            instructions: INSTRUCTIONS
+                .into_iter()
+                .filter(|set| flags.split_whitespace().any(|flag| flag == *set))
+                .collect(),
+            core,
+            memory_bytes: memory_kib.unwrap_or(0_u64) << 10,
+            kernel: read("/proc/sys/kernel/osrelease").trim().to_owned(),
+            load: load
+                .split_whitespace()
+                .nth(1)
+                .and_then(|word| word.parse().ok())
+                .unwrap_or(0.0),
+        }
+    }
+}
+
+fn copied_bytes_per_sec() -> f64 {
+    let source = vec![1_u8; COPIED];
+    let mut target = vec![2_u8; COPIED];
+    let copies = (0..COPIES).map(|_| {
+        let start = Instant::now();
+        target.copy_from_slice(black_box(&source));
+        black_box(&target);
+        start.elapsed().as_secs_f64()
+    });
+    COPIED as f64 / copies.fold(f64::INFINITY, f64::min)
+}
+
+/// The machine's cores; the calling thread itself may be pinned to one.
+fn cores(info: &str) -> usize {
+    let listed = info.lines().filter(|line| line.starts_with("processor")).count();
+    listed.max(thread::available_parallelism().map_or(1, Into::into))
+}
+
+/// What a file of the system says; nothing where there is none.
+fn read(path: &str) -> String {
+    fs::read_to_string(path).unwrap_or_default()
+}
+
+impl fmt::Display for Machine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "{}, {} cores, {:.0} GB of memory, Linux {}, load {:.1}",
+            self.processor,
+            self.cores,
+            self.memory_bytes as f64 / 1e9,
+            self.kernel,
+            self.load
+        )?;
+        write!(
+            f,
+            "{}; one core: {:.1} GFLOP/s in f32, {:.1} GB/s copied",
+            self.instructions.join(" "),
+            self.core.f32_flops / 1e9,
+            self.core.copied_bytes_per_sec / 1e9
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_best_of_what_was_measured_counts() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("machine.jsonl");
+        let line = |f32_flops, copied_bytes_per_sec| {
+            let core = Core {
+                f32_flops,
+                copied_bytes_per_sec,
+            };
+            serde_json::to_string(&core).unwrap()
+        };
+        fs::write(&path, format!("{}\n{}\n", line(2e9, 1e9), line(1e9, 3e9))).unwrap();
+        let best = Core::best_of(&path);
+        assert_eq!((best.f32_flops, best.copied_bytes_per_sec), (2e9, 3e9));
+    }
+}

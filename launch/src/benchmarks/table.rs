@@ -1,0 +1,348 @@
+//! The table: each figure beside what it must reach and what it is compared with.
+
+use comfy_table::presets::{ASCII_MARKDOWN, UTF8_FULL_CONDENSED};
+use comfy_table::{Cell, CellAlignment, ContentArrangement, Table as Grid};
+use serde::Serialize;
+
+use super::catalogue::{Row, Show, per_second};
+use super::figures::{Figure, Figures};
+
+/// Columns of a terminal that the table fits into.
+const WIDTH: u16 = 130;
+
+/// The rows, judged.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Table {
+    lines: Vec<Line>,
+}
+
+/// A row with its numbers.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct Line {
+    stage: String,
+    unit: String,
+    /// In `unit`.
+    figure: Option<f64>,
+    /// Of the core's f32 peak.
+    peak_share: Option<f64>,
+    target: String,
+    baseline: Option<Compared>,
+    /// How many times better than the baseline.
+    ratio: Option<f64>,
+    verdict: Verdict,
+}
+
+/// What a figure is compared with, and its number in the row's unit.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct Compared {
+    what: String,
+    figure: f64,
+}
+
+/// Whether a row reaches what is asked of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Verdict {
+    Met,
+    Missed,
+    NothingAsked,
+    NotMeasured,
+}
+
+/// Whether times mean anything.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Judging {
+    /// They do.
+    Times,
+    /// It was run to see that it works; nothing is judged.
+    Nothing,
+}
+
+impl Table {
+    /// `rows` with their `figures`, where one core does `f32_flops`.
+    pub fn new(rows: &[Row], figures: &Figures, f32_flops: f64) -> Self {
+        Self {
+            lines: rows.iter().map(|row| Line::new(row, figures, f32_flops)).collect(),
+        }
+    }
+
+    /// For a terminal.
+    pub fn to_terminal(&self, judging: Judging) -> String {
+        let mut grid = self.grid(judging);
+        grid.load_preset(UTF8_FULL_CONDENSED)
+            .set_content_arrangement(ContentArrangement::Dynamic)
+            .set_width(WIDTH);
+        grid.to_string()
+    }
+
+    /// For a document.
+    pub fn to_markdown(&self, judging: Judging) -> String {
+        let mut grid = self.grid(judging);
+        grid.load_preset(ASCII_MARKDOWN);
+        grid.to_string()
+    }
+
+    fn grid(&self, judging: Judging) -> Grid {
+        let mut grid = Grid::new();
+        grid.set_header(["stage", "figure", "must reach", "baseline", "ratio", "met"]);
+        for line in &self.lines {
+            let right = |text: String| Cell::new(text).set_alignment(CellAlignment::Right);
+            grid.add_row([
+                Cell::new(&line.stage),
+                right(line.figure_text()),
+                right(line.target.clone()),
+                Cell::new(line.baseline_text()),
+                right(
+                    line.ratio
+                        .map(|ratio| format!("{} ×", number(ratio)))
+                        .unwrap_or_default(),
+                ),
+                Cell::new(match (judging, line.verdict) {
+                    (Judging::Times, Verdict::Met) => "yes",
+                    (Judging::Times, Verdict::Missed) => "NO",
+                    (Judging::Nothing, _) | (_, Verdict::NothingAsked | Verdict::NotMeasured) => "",
+                }),
+            ]);
+        }
+        grid
+    }
+}
+
+impl Line {
+    fn new(row: &Row, figures: &Figures, f32_flops: f64) -> Self {
+        let measured = figures.get(&row.figure);
+        let figure = measured.and_then(|measured| measured.shown(row.show, &row.unit, row.scale));
+        let peak_share = match (row.show, measured) {
+            (Show::PeakShare, Some(Figure::Timed { secs, elements, .. })) => Some(elements / secs / f32_flops),
+            _ => None,
+        };
+        let baseline = measured.and_then(|measured| compared(row, measured, figures));
+        let ratio = figure
+            .zip(baseline.as_ref())
+            .map(|(figure, baseline)| match less_is_better(row) {
+                true => baseline.figure / figure,
+                false => figure / baseline.figure,
+            });
+        Self {
+            stage: row.stage.clone(),
+            unit: row.unit.clone(),
+            figure,
+            peak_share,
+            target: target(row),
+            verdict: judge(row, figure, peak_share, ratio),
+            baseline,
+            ratio,
+        }
+    }
+
+    fn figure_text(&self) -> String {
+        match (self.figure, self.peak_share) {
+            (None, _) => "not measured".to_owned(),
+            (Some(figure), None) => format!("{} {}", number(figure), self.unit),
+            (Some(figure), Some(share)) => format!("{} {}, {}", number(figure), self.unit, of_peak(share)),
+        }
+    }
+
+    fn baseline_text(&self) -> String {
+        let text = |baseline: &Compared| format!("{}: {}", baseline.what, number(baseline.figure));
+        self.baseline.as_ref().map(text).unwrap_or_default()
+    }
+}
+
+/// Times are better when they are less, and so is what must not exceed something.
+fn less_is_better(row: &Row) -> bool {
+    match row.show {
+        Show::Rate => false,
+        Show::Time | Show::PeakShare => true,
+        Show::Value => row.at_most.is_some(),
+    }
+}
+
+/// What `measured` is compared with, if that was measured too.
+fn compared(row: &Row, measured: &Figure, figures: &Figures) -> Option<Compared> {
+    let Some(baseline) = &row.baseline else {
+        return match measured {
+            Figure::Told(told) => Some(Compared {
+                what: told.baseline.clone()?,
+                figure: told.baseline_figure? * row.scale,
+            }),
+            Figure::Timed { .. } => None,
+        };
+    };
+    // Times add up, rates do not.
+    let added = match row.show {
+        Show::Rate => Show::Time,
+        show @ (Show::Time | Show::PeakShare | Show::Value) => show,
+    };
+    let parts = baseline.of.iter().map(|of| figures.get(of)?.shown(added, "s", 1.0));
+    let sum: f64 = parts.sum::<Option<f64>>()?;
+    let figure = match row.show {
+        Show::Rate => 1.0 / sum,
+        Show::Time | Show::PeakShare => sum * per_second(&row.unit)?,
+        Show::Value => sum,
+    };
+    Some(Compared {
+        what: baseline.what.clone(),
+        figure: figure * row.scale,
+    })
+}
+
+fn target(row: &Row) -> String {
+    let figure = match (row.show, row.at_least, row.at_most) {
+        (Show::PeakShare, Some(share), _) => Some(format!("≥ {}", of_peak(share))),
+        (_, Some(least), _) => Some(format!("≥ {}", number(least))),
+        (_, _, Some(most)) => Some(format!("≤ {}", number(most))),
+        (_, None, None) => None,
+    };
+    let ratio = row.ratio_at_least.map(|ratio| format!("≥ {} ×", number(ratio)));
+    [figure, ratio].into_iter().flatten().collect::<Vec<_>>().join(", ")
+}
+
+fn judge(row: &Row, figure: Option<f64>, peak_share: Option<f64>, ratio: Option<f64>) -> Verdict {
+    let Some(figure) = figure else {
+        return Verdict::NotMeasured;
+    };
+    let reached = [
+        row.at_least.map(|least| peak_share.unwrap_or(figure) >= least),
+        row.at_most.map(|most| figure <= most),
+        row.ratio_at_least
+            .map(|least| ratio.is_some_and(|ratio| ratio >= least)),
+    ];
+    let mut reached = reached.into_iter().flatten().peekable();
+    if reached.peek().is_none() {
+        Verdict::NothingAsked
+    } else if reached.all(|reached| reached) {
+        Verdict::Met
+    } else {
+        Verdict::Missed
+    }
+}
+
+fn of_peak(share: f64) -> String {
+    format!("{:.0} % of peak", 100.0 * share)
+}
+
+/// Three digits that mean something, thousands set apart.
+pub(super) fn number(value: f64) -> String {
+    if value == 0.0 || !value.is_finite() {
+        return value.to_string();
+    }
+    let magnitude = value.abs().log10().floor() as i32;
+    let unit = 10_f64.powi(magnitude - 2);
+    let rounded = (value / unit).round() * unit;
+    let decimals = (2 - rounded.abs().log10().floor() as i32).max(0) as usize;
+    let text = format!("{rounded:.decimals$}");
+    let (whole, fraction) = text.split_once('.').unwrap_or((&text, ""));
+    let fraction = fraction.trim_end_matches('0');
+    let mut grouped = String::new();
+    for (index, digit) in whole.chars().enumerate() {
+        let left = whole.len() - index;
+        if index > 0 && left % 3 == 0 && whole.len() > 4 {
+            grouped.push(',');
+        }
+        grouped.push(digit);
+    }
+    if fraction.is_empty() {
+        grouped
+    } else {
+        format!("{grouped}.{fraction}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::catalogue::Baseline;
+    use super::super::figures::tests::timed;
+    use super::*;
+
+    fn row(show: Show, unit: &str) -> Row {
+        Row {
+            stage: "a stage".to_owned(),
+            figure: "a/figure".to_owned(),
+            show,
+            unit: unit.to_owned(),
+            scale: 1.0,
+            at_least: None,
+            at_most: None,
+            baseline: None,
+            ratio_at_least: None,
+        }
+    }
+
+    fn line(row: &Row, figures: &Figures) -> Line {
+        Line::new(row, figures, 1e9)
+    }
+
+    #[test]
+    fn numbers_have_three_digits_and_rounding_may_carry() {
+        let shown = [
+            (151_325.0, "151,000"),
+            (5746.0, "5750"),
+            (0.36149, "0.361"),
+            (9.996, "10"),
+            (99.96, "100"),
+            (50.0, "50"),
+            (1.1, "1.1"),
+            (0.0, "0"),
+        ];
+        for (value, text) in shown {
+            assert_eq!(number(value), text);
+        }
+    }
+
+    #[test]
+    fn the_parts_of_a_baseline_add_up_by_their_times() {
+        let figures = timed(&[("a/figure", 100.0, 10.0), ("a/one", 300.0, 10.0), ("a/two", 100.0, 5.0)]);
+        let compared = Row {
+            baseline: Some(Baseline {
+                what: "both".to_owned(),
+                of: vec!["a/one".to_owned(), "a/two".to_owned()],
+            }),
+            at_least: Some(5e7),
+            ratio_at_least: Some(5.1),
+            ..row(Show::Rate, "frames/s")
+        };
+        let found = line(&compared, &figures);
+        // 10 ns an element, and 30 + 20 ns.
+        assert!((found.figure.unwrap() / 1e8 - 1.0).abs() < 1e-9, "{found:?}");
+        assert!(
+            (found.baseline.as_ref().unwrap().figure / 2e7 - 1.0).abs() < 1e-9,
+            "{found:?}"
+        );
+        assert!((found.ratio.unwrap() - 5.0).abs() < 1e-9, "{found:?}");
+        assert_eq!(found.verdict, Verdict::Missed, "the ratio falls short");
+        let met = Row {
+            ratio_at_least: Some(4.9),
+            ..compared
+        };
+        assert_eq!(line(&met, &figures).verdict, Verdict::Met);
+    }
+
+    #[test]
+    fn a_share_of_the_peak_is_judged_by_the_share() {
+        // 600 operations in 1000 ns, of 1000 that the core could do.
+        let figures = timed(&[("a/figure", 1000.0, 600.0)]);
+        let asked = |share| Row {
+            at_least: Some(share),
+            ..row(Show::PeakShare, "µs")
+        };
+        let found = line(&asked(0.8), &figures);
+        assert_eq!(found.figure_text(), "1 µs, 60 % of peak");
+        assert_eq!(found.target, "≥ 80 % of peak");
+        assert_eq!(found.verdict, Verdict::Missed);
+        assert_eq!(line(&asked(0.5), &figures).verdict, Verdict::Met);
+    }
+
+    #[test]
+    fn what_was_not_measured_is_not_met() {
+        let asked = Row {
+            at_most: Some(1.0),
+            ..row(Show::Value, "MB")
+        };
+        let found = line(&asked, &Figures::default());
+        assert_eq!(
+            (found.verdict, found.figure_text().as_str()),
+            (Verdict::NotMeasured, "not measured")
+        );
+    }
+}

@@ -1,0 +1,86 @@
+//! Drawing a minibatch from a full split replay buffer, from small buffers to large ones.
+//!
+//! The configured size is 2^17; the others show what a batch costs once its rows no longer lie in a cache.
+
+use criterion::{BenchmarkId, Criterion, Throughput};
+use rand::{Rng, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use skein_learner::flight::{CommittedFlight, StepObservation};
+use skein_learner::replay::{Minibatch, Replay};
+use skein_protocol::LATENT;
+use skein_protocol::config::{Config, Observation};
+use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
+use skein_protocol::transition::Outcome;
+
+/// Transitions a minibatch.
+const BATCH: usize = 256;
+/// Steps of each flight that fills the buffer.
+const STEPS: usize = 64;
+/// Every so many steps pass a wall: more than the success part's share, so that it fills no later than the other.
+const STEPS_PER_WALL: usize = 4;
+
+fn main() {
+    let mut criterion = Criterion::default().configure_from_args();
+    let mut group = criterion.benchmark_group("replay");
+    group.throughput(Throughput::Elements(1));
+    for exponent in [17, 10, 12, 14, 16, 18, 20] {
+        let mut replay = None;
+        group.bench_function(BenchmarkId::new("sample", 1_usize << exponent), |bencher| {
+            // Only when it is asked for: the large ones take a while to fill.
+            let replay = replay.get_or_insert_with(|| full(1 << exponent));
+            let mut rng = Pcg64Mcg::seed_from_u64(1);
+            let mut minibatch = Minibatch::default();
+            bencher.iter(|| replay.sample(&mut rng, BATCH, &mut minibatch));
+        });
+    }
+    group.finish();
+    criterion.final_summary();
+}
+
+/// A buffer for `capacity` transitions, both parts full.
+fn full(capacity: usize) -> Replay {
+    let mut config = Config::default();
+    config.replay.capacity = capacity;
+    config.learning.observation = Observation::LatentVelocity;
+    let mut replay = Replay::new(&config);
+    replay
+        .freeze_latents(1, |_| Ok::<_, std::convert::Infallible>(Vec::new()))
+        .expect("there are no images to encode");
+    let mut rng = Pcg64Mcg::seed_from_u64(2);
+    for flight in 0.. {
+        if replay.len() == capacity {
+            break;
+        }
+        replay
+            .insert(flown(flight, &mut rng))
+            .expect("the flight's parts have one length");
+    }
+    replay
+}
+
+fn flown(number: u64, rng: &mut impl Rng) -> CommittedFlight {
+    let mut draw = || (rng.next_u32() as f32 / u32::MAX as f32) * 2.0 - 1.0;
+    CommittedFlight {
+        flight: FlightId(number),
+        epoch: Epoch(number),
+        policy_version: PolicyVersion(0),
+        actor: ActorId(0),
+        level: 1,
+        observations: (0..=STEPS)
+            .map(|_| StepObservation {
+                latent: [(); LATENT].map(|()| draw()),
+                velocity_mps: [(); 3].map(|()| draw()),
+                position_m: [0.0; 3],
+                orientation: [0.0, 0.0, 0.0, 1.0],
+            })
+            .collect(),
+        actions: (0..STEPS).map(|_| [draw(), draw()]).collect(),
+        rewards: (0..STEPS).map(|_| draw()).collect(),
+        reward_terms: vec![[0.0; 4]; STEPS],
+        level_up: (0..STEPS).map(|step| step % STEPS_PER_WALL == 0).collect(),
+        outcome: Outcome::Collided,
+        walls_passed: 0,
+        course_walls: 5,
+        depth: None,
+    }
+}

@@ -1,0 +1,229 @@
+//! The learner's side: reception as in a run, with a training thread that only takes flights out.
+
+use std::collections::VecDeque;
+use std::hint::black_box;
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::AtomicBool;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use skein_learner::flight::CommittedFlight;
+use skein_learner::flights::assembly::Keep;
+use skein_learner::flights::reception::{Batch, Reception};
+use skein_learner::threads::cpu_secs;
+use skein_protocol::config::Config;
+use skein_protocol::ids::{Attempt, Epoch, FlightId, PolicyVersion};
+use skein_protocol::run::{LearnerSeat, RunDirectory, RunIdentity};
+use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+use skein_protocol::transition::TransitionRecord;
+use tempfile::TempDir;
+
+use crate::SYNTHETIC_ACTOR;
+use crate::synthetic::STEPS;
+
+/// How long actors may take to come, and to leave.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Batches that are ordered ahead, so that nobody waits for orders.
+const BATCHES_AHEAD: usize = 3;
+
+/// What the learner is put under.
+pub(crate) struct Load {
+    pub(crate) keep: Keep,
+    pub(crate) warm_up: Duration,
+    pub(crate) measured: Duration,
+}
+
+/// What came of it.
+pub(crate) struct Throughput {
+    /// Records of flights that were taken out of their batches, whole and in order.
+    pub(crate) records_per_second: f64,
+    /// Processor time of the receiving thread.
+    pub(crate) thread_micros: f64,
+    /// Processor time of all of the learner.
+    pub(crate) process_micros: f64,
+    /// Time to copy a record's bytes in this process.
+    pub(crate) copy_micros: f64,
+}
+
+/// A learner, its actors, and the flights it has ordered.
+pub(crate) struct Learner {
+    identity: RunIdentity,
+    directory: RunDirectory,
+    reception: Reception,
+    actors: Vec<Child>,
+    batches: VecDeque<Batch>,
+    next_flight: u64,
+    // Last, for the others lie in it.
+    _seat: LearnerSeat,
+    _folder: TempDir,
+}
+
+impl Learner {
+    /// A learner of a run of its own, without actors.
+    pub(crate) fn start() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let directory = RunDirectory::new(folder.path().canonicalize().unwrap().join("run"));
+        let mut config = Config::default();
+        // Synthetic actors fly no snapshot.
+        config.sac.hidden_width = 8;
+        directory.create(&config).unwrap();
+        let (identity, config) = directory.open().unwrap();
+        let seat = LearnerSeat::take(&directory, &identity).unwrap();
+        Self {
+            reception: Reception::start(&identity, seat.life(), &config).unwrap(),
+            identity,
+            directory,
+            actors: Vec::new(),
+            batches: VecDeque::new(),
+            next_flight: 0,
+            _seat: seat,
+            _folder: folder,
+        }
+    }
+
+    /// Starts synthetic actors until there are so many.
+    pub(crate) fn start_actors(&mut self, count: u32) {
+        for number in self.actors.len()..count as usize {
+            let actor = Command::new(std::env::current_exe().unwrap())
+                .arg(SYNTHETIC_ACTOR)
+                .arg(self.directory.root())
+                .arg(number.to_string())
+                .stdin(Stdio::null())
+                .stdout(Stdio::null())
+                .spawn()
+                .unwrap();
+            self.actors.push(actor);
+        }
+        let deadline = Instant::now() + PATIENCE;
+        while self.reception.shared().live_actors().len() < self.actors.len() {
+            assert!(Instant::now() < deadline, "not all of {count} actors have come");
+            sleep(Duration::from_millis(5));
+        }
+    }
+
+    /// What the learner's part in `load` costs.
+    pub(crate) fn throughput(&mut self, load: &Load) -> Throughput {
+        let copy_micros = copy_micros(load.measured / 4);
+        self.take_flights(load.keep, load.warm_up);
+        let cpu = || {
+            let threads = cpu_secs();
+            (threads["reception"], threads.values().sum::<f64>())
+        };
+        let (began, (thread_before, process_before)) = (Instant::now(), cpu());
+        let records = self.take_flights(load.keep, load.measured) as f64;
+        let (took, (thread_after, process_after)) = (began.elapsed(), cpu());
+        self.take_rest();
+
+        let faults = self.reception.shared().faults();
+        assert!(
+            faults.reissued_by_reason().values().all(|&count| count == 0),
+            "{faults:?}"
+        );
+        assert!(
+            faults.refused_by_reason().values().all(|&count| count == 0),
+            "{faults:?}"
+        );
+        let micros = |secs: f64| secs * 1e6 / records;
+        Throughput {
+            records_per_second: records / took.as_secs_f64(),
+            thread_micros: micros(thread_after - thread_before),
+            process_micros: micros(process_after - process_before),
+            copy_micros,
+        }
+    }
+
+    /// Sends the actors home, and ends.
+    pub(crate) fn finish(mut self) {
+        self.reception.finish();
+        await_ends(&mut self.actors);
+    }
+
+    /// Orders flights and takes them out for so long; returns the number of their records.
+    fn take_flights(&mut self, keep: Keep, time: Duration) -> usize {
+        let end = Instant::now() + time;
+        let mut records = 0;
+        while Instant::now() < end {
+            while self.batches.len() < BATCHES_AHEAD {
+                self.order(keep);
+            }
+            match self.batches[0].next(&AtomicBool::new(false)).unwrap() {
+                Some(flight) => records += look_at(&flight, keep),
+                None => drop(self.batches.pop_front()),
+            }
+        }
+        records
+    }
+
+    /// Takes out what is ordered.
+    fn take_rest(&mut self) {
+        for mut batch in self.batches.drain(..) {
+            while batch.next(&AtomicBool::new(false)).unwrap().is_some() {}
+        }
+    }
+
+    fn order(&mut self, keep: Keep) {
+        let flights = (4 * self.actors.len() as u64).max(16);
+        let numbers = self.next_flight..self.next_flight + flights;
+        let ticket = |flight| Ticket {
+            run: self.identity.run,
+            flight: FlightId(flight),
+            attempt: Attempt(0),
+            policy_version: PolicyVersion(0),
+            course: CourseChoice::Training,
+            start_level: 1,
+            exploration: Exploration::Sample,
+            seed: flight,
+        };
+        let tickets = numbers.clone().map(ticket).collect();
+        self.batches
+            .push_back(self.reception.fly(Epoch(0), keep, tickets).unwrap());
+        self.next_flight = numbers.end;
+    }
+}
+
+/// Makes sure that all of a flight is there; returns the number of its records.
+fn look_at(flight: &CommittedFlight, keep: Keep) -> usize {
+    flight.check().unwrap();
+    assert_eq!(flight.steps(), STEPS as usize);
+    assert_eq!(flight.depth.is_some(), keep == Keep::Depth);
+    if let Some(depth) = &flight.depth {
+        assert_eq!(
+            (depth[0], depth[depth.len() - 1]),
+            (flight.actor.0 as u8, flight.actor.0 as u8)
+        );
+    }
+    flight.observations.len()
+}
+
+/// Waits for the actors' ends; whoever does not end is killed.
+fn await_ends(actors: &mut [Child]) {
+    let deadline = Instant::now() + PATIENCE;
+    for actor in actors {
+        while actor.try_wait().unwrap().is_none() {
+            if Instant::now() > deadline {
+                actor.kill().unwrap();
+                panic!("an actor does not end");
+            }
+            sleep(Duration::from_millis(5));
+        }
+        assert!(actor.wait().unwrap().success());
+    }
+}
+
+/// Time to copy a record out of memory as large as an actor's into a flight, as [`Keep::Depth`] asks for.
+fn copy_micros(time: Duration) -> f64 {
+    let record = size_of::<TransitionRecord>();
+    let (of_actor, of_flight) = (512, STEPS as usize + 1);
+    let from = vec![7_u8; of_actor * record];
+    let mut into = vec![0_u8; of_flight * record];
+    let (began, mut copied) = (Instant::now(), 0_usize);
+    while began.elapsed() < time {
+        for _ in 0..of_flight {
+            let (source, target) = (copied % of_actor * record, copied % of_flight * record);
+            into[target..target + record].copy_from_slice(black_box(&from[source..source + record]));
+            copied += 1;
+        }
+        black_box(&mut into);
+    }
+    began.elapsed().as_secs_f64() * 1e6 / copied as f64
+}

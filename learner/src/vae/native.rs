@@ -1,0 +1,332 @@
+//! The engine of our own: forward, backward and Adam over [`skein_kernels`].
+//!
+//! Images lie channels-last from the first byte to the last gradient, so that what a kernel sees are runs of memory, read where they lie. The gradients are written
+//! out by hand, layer by layer; what autograd computes is what they are tested against. All results are the same bits for any number of threads and on every
+//! processor.
+
+mod batch;
+mod buffer;
+mod code;
+mod elementwise;
+mod layer;
+mod members;
+mod network;
+mod order;
+mod step;
+mod stopwatch;
+mod unfold;
+
+use skein_kernels::{AdamStep, Isa, Team};
+use skein_protocol::config::VaeSection;
+use skein_protocol::seeds::{Purpose, derive};
+use skein_protocol::{IMAGE_PIXELS, LATENT};
+
+use self::batch::Batch;
+use self::buffer::Buffer;
+use self::elementwise::{sigmoids, squares};
+use self::members::{Member, by_image, share};
+use self::network::Network;
+use self::order::Order;
+use self::step::{Objective, Step};
+use self::stopwatch::Pass as LayerPass;
+use super::VaeMetrics;
+use crate::error::UpdateError;
+use crate::networks::{Decoder, Encoder, Layout};
+use crate::noise::Noise;
+use crate::state::{Part, Stateful};
+
+pub use stopwatch::{LAYERS, Pass, Spent};
+
+/// Images reconstructed at once: bounds memory, and the weights are read once for all of them.
+const CHUNK: usize = 32;
+
+/// Encoder, decoder and Adam's state, in the order of [`Order`].
+#[derive(Debug)]
+pub struct NativeVae {
+    isa: Isa,
+    team: Team,
+    members: Vec<Member>,
+    order: Order,
+    /// Length of the part of PyTorch's order that actors need.
+    published_len: usize,
+    network: Network,
+    /// Whether `network` has packed these parameters.
+    packed: bool,
+    parameters: Buffer,
+    moments: [Buffer; 2],
+    /// All but that of the weights of the decoder's first convolution, which exists in blocks only.
+    gradient: Buffer,
+    batch: Batch,
+    noise: Vec<f32>,
+    steps: u64,
+    learning_rate: f64,
+    kl_weight: f64,
+}
+
+impl NativeVae {
+    /// An untrained VAE whose parameters depend on the run's seed alone; the same as [`super::TorchVae`]'s.
+    pub fn new(section: &VaeSection, run_seed: u64, threads: usize) -> Self {
+        Self::with_isa(section, run_seed, threads, Isa::best())
+    }
+
+    pub(crate) fn with_isa(section: &VaeSection, run_seed: u64, threads: usize, isa: Isa) -> Self {
+        let mut layout = Layout::default();
+        let published_len = Encoder::describe(&mut layout).published_len();
+        let _ = Decoder::describe(&mut layout);
+        let order = Order::of(&layout);
+        let initial = layout.initial_values(derive(run_seed, Purpose::VaeParameters, 0));
+        let len = initial.len();
+        let team = Team::new(threads);
+        let mut vae = Self {
+            isa,
+            members: (0..team.size()).map(|_| Member::new(isa)).collect(),
+            team,
+            published_len,
+            network: Network::new(isa, &order),
+            packed: false,
+            parameters: Buffer::zeroed(len),
+            moments: [len, len].map(Buffer::zeroed),
+            gradient: Buffer::zeroed(len),
+            batch: Batch::default(),
+            noise: Vec::new(),
+            steps: 0,
+            learning_rate: section.learning_rate,
+            kl_weight: section.kl_weight,
+            order,
+        };
+        vae.parameters.copy_from_slice(&vae.order.from_pytorch(&initial));
+        vae
+    }
+
+    /// One step of Adam on a minibatch of depth images, `[n, 72, 128]`.
+    ///
+    /// # Errors
+    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was changed then.
+    pub fn update(&mut self, images: &[u8], noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
+        let count = images.len() / IMAGE_PIXELS;
+        self.noise.resize(count * LATENT, 0.0);
+        noise.fill_normal(&mut self.noise);
+
+        let objective = self.objective(images);
+        self.check(&objective)?;
+        self.step();
+        Ok(VaeMetrics {
+            loss: objective.loss,
+            pixel_error: objective.error / IMAGE_PIXELS as f32,
+            divergence: objective.divergence,
+        })
+    }
+
+    /// Loss and gradient for these images and `self.noise`.
+    fn objective(&mut self, images: &[u8]) -> Objective {
+        self.pack();
+        let mut step = Step {
+            isa: self.isa,
+            team: &mut self.team,
+            members: &mut self.members,
+            network: &mut self.network,
+            batch: &mut self.batch,
+            parameters: &self.parameters,
+            kl_weight: self.kl_weight,
+        };
+        step.objective(images, &self.noise, &mut self.gradient)
+    }
+
+    /// Whether all that a step would use is finite. A gradient counts as not finite when its squared norm, or for the decoder's first convolution a bound of it,
+    /// overflows.
+    fn check(&mut self, objective: &Objective) -> Result<(), UpdateError> {
+        let watch = &mut self.members[0].watch;
+        watch.start();
+        let blocks = self.network.unfold.place.weight.clone();
+        let norm = squares(self.isa, &self.gradient[..blocks.start])
+            + squares(self.isa, &self.gradient[blocks.end..])
+            + self.network.unfold.gradient_bound(self.isa, &self.batch.unfolded);
+        watch.rest();
+        for (tensor, value) in [
+            ("vae loss", objective.loss),
+            ("vae squared error", objective.error),
+            ("vae divergence", objective.divergence),
+            ("vae gradient", norm as f32),
+        ] {
+            if !value.is_finite() {
+                let update = self.steps + 1;
+                return Err(UpdateError::NonFinite { tensor, update });
+            }
+        }
+        Ok(())
+    }
+
+    /// Adam, and what the next step needs of the weights.
+    fn step(&mut self) {
+        self.steps += 1;
+        let (isa, learning_rate, number) = (self.isa, self.learning_rate, self.steps);
+        let adam = AdamStep { learning_rate, number };
+        let [first, second] = &mut self.moments;
+        let input = &*self.batch.unfolded;
+        let mut blocks = self
+            .network
+            .unfold
+            .blocks(&mut self.parameters, [&mut *first, &mut *second]);
+        share(&mut self.team, &mut self.members, &mut blocks, |_, block, member| {
+            let _ = block.gradient(isa, input, &mut member.unfold);
+            member.watch.layer(network::UNFOLD, LayerPass::Gradient);
+            block.step(isa, adam, &mut member.unfold);
+            member.watch.adam_and_packing();
+        });
+        drop(blocks);
+        let watch = &mut self.members[0].watch;
+        watch.start();
+        let blocks = self.network.unfold.place.weight.clone();
+        for part in [0..blocks.start, blocks.end..self.parameters.len()] {
+            let moments = [&mut first[part.clone()], &mut second[part.clone()]];
+            let (parameters, gradient) = (&mut self.parameters[part.clone()], &self.gradient[part]);
+            adam.apply(&mut self.team, isa, parameters, gradient, moments);
+        }
+        self.network.pack(&mut self.team, &self.parameters);
+        watch.adam_and_packing();
+    }
+
+    /// Packs the weights if they changed otherwise than by a step.
+    fn pack(&mut self) {
+        if !self.packed {
+            self.network.pack(&mut self.team, &self.parameters);
+            self.network.unfold.pack(&self.parameters);
+            self.packed = true;
+        }
+    }
+
+    /// The code's mean for each image, `[n, 32]`. `images`: `[n, 72, 128]`, any number of them.
+    pub fn encode(&mut self, images: &[u8]) -> Vec<[f32; LATENT]> {
+        self.pack();
+        let (network, parameters) = (&self.network, &*self.parameters);
+        let mut codes = vec![[0.0; LATENT]; images.len() / IMAGE_PIXELS];
+        share(&mut self.team, &mut self.members, &mut codes, |index, code, member| {
+            let depth = &images[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
+            for (image, len) in member.images.iter_mut().zip(network.seen_lens()) {
+                image.resize(len);
+            }
+            let images = member.images.each_mut().map(|image| &mut **image);
+            network.see(parameters, depth, images, &mut member.watch);
+            *code = network.mean(parameters, &member.images[4]);
+        });
+        codes
+    }
+
+    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1]. `images`: `[n, 72, 128]`.
+    pub fn reconstruct(&mut self, images: &[u8]) -> Vec<f32> {
+        let mut seen = Vec::with_capacity(images.len());
+        for images in images.chunks(CHUNK * IMAGE_PIXELS) {
+            let codes = self.encode(images);
+            let (isa, count) = (self.isa, codes.len());
+            let (network, parameters, batch) = (&mut self.network, &*self.parameters, &mut self.batch);
+            batch.resize(network, count);
+            let finish = skein_kernels::Finish::Rectified;
+            network.linear.forward(
+                &mut self.team,
+                parameters,
+                codes.as_flattened(),
+                finish,
+                &mut batch.unfolded,
+            );
+            network.unfold.multiply(&mut self.team, &batch.unfolded);
+            let network = &*network;
+            let mut drawn = by_image(batch.drawn.each_mut().map(|buffer| &mut **buffer), count);
+            share(
+                &mut self.team,
+                &mut self.members,
+                &mut drawn,
+                |index, images, member| {
+                    let images = images.each_mut().map(|image| &mut **image);
+                    network.draw(parameters, index, images, &mut member.columns, &mut member.watch);
+                },
+            );
+            drop(drawn);
+            sigmoids(isa, &mut batch.drawn[3]);
+            seen.extend_from_slice(&batch.drawn[3]);
+        }
+        seen
+    }
+
+    /// Length of the part of the parameters that actors need.
+    pub fn published_len(&self) -> usize {
+        self.published_len
+    }
+
+    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot layout's order.
+    ///
+    /// # Panics
+    /// When `into` is not [`NativeVae::published_len`] long.
+    pub fn publish(&self, into: &mut [f32]) {
+        assert_eq!(into.len(), self.published_len, "one place for each number");
+        self.order.to_pytorch(&self.parameters, into);
+    }
+
+    /// VAE steps done so far.
+    pub fn updates(&self) -> u64 {
+        self.steps
+    }
+
+    /// Where the time went since this was last asked.
+    pub fn take_spent(&mut self) -> Spent {
+        let mut spent = Spent::default();
+        for member in &mut self.members {
+            spent.add(&std::mem::take(&mut member.watch.spent));
+        }
+        spent
+    }
+
+    /// Floating-point operations of the passes of each layer for an image, in the order of [`LAYERS`] and [`Pass::ALL`]. Pixels have no gradient.
+    pub fn operations(&self) -> [[f64; 3]; 10] {
+        let mut operations = self.network.operations().map(|pass| [pass; 3]);
+        operations[0][Pass::Backward as usize] = 0.0;
+        operations
+    }
+}
+
+#[cfg(test)]
+impl NativeVae {
+    /// Makes a tensor's first number something else.
+    pub(super) fn spoil(&mut self, tensor: &str, value: f32) {
+        let place = self.order.tensor(tensor).start;
+        self.parameters[place] = value;
+        self.packed = false;
+    }
+
+    /// Loss, squared error and divergence, and the whole gradient in PyTorch's order. `noise`: standard normal, `[n, 32]`.
+    pub(super) fn loss_and_gradient(&mut self, images: &[u8], noise: &[f32]) -> ([f32; 3], Vec<f32>) {
+        self.noise = noise.to_vec();
+        let Objective {
+            loss,
+            error,
+            divergence,
+        } = self.objective(images);
+        let (mut whole, place) = (self.gradient.to_vec(), self.network.unfold.place.weight.clone());
+        let [first, second] = &mut self.moments;
+        let blocks = self.network.unfold.blocks(&mut self.parameters, [first, second]);
+        let len = place.len() / blocks.len();
+        for (block, into) in blocks.iter().zip(whole[place].chunks_exact_mut(len)) {
+            let scratch = &mut self.members[0].unfold;
+            into.copy_from_slice(block.gradient(self.isa, &self.batch.unfolded, scratch));
+        }
+        let mut gradient = vec![0.0; whole.len()];
+        self.order.to_pytorch(&whole, &mut gradient);
+        ([loss, error, divergence], gradient)
+    }
+}
+
+impl Stateful for NativeVae {
+    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        // Whoever asks may change them.
+        self.packed = false;
+        let [first, second] = &mut self.moments;
+        // Names of its own: another engine's numbers lie in another order.
+        let parts = [
+            ("parameters", Part::Numbers(&mut self.parameters)),
+            ("adam.first_moment", Part::Numbers(first)),
+            ("adam.second_moment", Part::Numbers(second)),
+            ("adam.steps", Part::Count(&mut self.steps)),
+        ];
+        let named = |(name, part)| (format!("vae.native.{name}"), part);
+        parts.into_iter().map(named).collect()
+    }
+}

@@ -1,0 +1,69 @@
+//! How images are shared among the members of a team.
+
+use skein_kernels::{Isa, Team};
+
+use super::buffer::Buffer;
+use super::stopwatch::Stopwatch;
+use super::unfold::UnfoldScratch;
+
+/// Working memory of a member.
+#[derive(Debug)]
+pub(super) struct Member {
+    pub(super) columns: Vec<f32>,
+    pub(super) unfold: UnfoldScratch,
+    /// Images of the encoder, when they need not be kept.
+    pub(super) images: [Buffer; 5],
+    pub(super) watch: Stopwatch,
+}
+
+impl Member {
+    pub(super) fn new(isa: Isa) -> Self {
+        Self {
+            columns: Vec::new(),
+            unfold: UnfoldScratch::new(isa),
+            images: Default::default(),
+            watch: Stopwatch::default(),
+        }
+    }
+}
+
+/// Lets each member do its share of `items`, in order: `work` is given an item's number and the item.
+pub(super) fn share<T: Send>(
+    team: &mut Team,
+    members: &mut [Member],
+    items: &mut [T],
+    work: impl Fn(usize, &mut T, &mut Member) + Sync,
+) {
+    let (size, count) = (members.len(), items.len());
+    let (mut rest, mut first) = (items, 0);
+    let mut shares = Vec::with_capacity(size);
+    for (index, member) in members.iter_mut().enumerate() {
+        let end = count * (index + 1) / size;
+        let (own, others) = rest.split_at_mut(end - first);
+        shares.push((first, own, member));
+        (rest, first) = (others, end);
+    }
+    team.split_rows(&mut shares, 1, 1, |_, shares| {
+        for (first, own, member) in shares {
+            member.watch.start();
+            for (index, item) in own.iter_mut().enumerate() {
+                work(*first + index, item, member);
+            }
+        }
+    });
+}
+
+/// The parts of each buffer that belong to each of `count` images.
+pub(super) fn by_image<const N: usize>(buffers: [&mut [f32]; N], count: usize) -> Vec<[&mut [f32]; N]> {
+    let mut parts = buffers.map(|buffer| buffer.chunks_exact_mut(buffer.len() / count));
+    (0..count)
+        .map(|_| std::array::from_fn(|index| parts[index].next().expect("a part for each image")))
+        .collect()
+}
+
+/// `rows`, each `len` long, in a part for each member with the number of its first row; fewer when there are fewer rows.
+pub(super) fn portions(rows: &mut [f32], len: usize, members: usize) -> Vec<(usize, &mut [f32])> {
+    let each = (rows.len() / len).div_ceil(members).max(1);
+    let portions = rows.chunks_mut(each * len).enumerate();
+    portions.map(|(index, rows)| (index * each, rows)).collect()
+}

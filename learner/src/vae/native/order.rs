@@ -1,0 +1,216 @@
+//! The order in which the native engine keeps its parameters, and the way from PyTorch's order and back.
+//!
+//! Images lie channels-last, so weights do: `[rows' channels, kernel row, kernel column, image's channels]` for both kinds of convolution, where the rows are
+//! a convolution's output and a transposed one's input. Initial values are drawn, and snapshots published, in PyTorch's order, which is the contract with actors.
+
+use std::ops::Range;
+
+use crate::networks::Layout;
+
+/// Where a layer's two tensors lie in the vector.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(super) struct Affine {
+    pub(super) weight: Range<usize>,
+    pub(super) bias: Range<usize>,
+}
+
+/// One of PyTorch's tensors, as four dimensions, and which of them is the outermost, the second, … here.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Entry {
+    name: String,
+    shape: [usize; 4],
+    axes: [usize; 4],
+    start: usize,
+}
+
+/// The order of the parameters.
+#[derive(Debug, Clone)]
+pub(super) struct Order {
+    /// In PyTorch's order.
+    entries: Vec<Entry>,
+}
+
+/// Dimensions of a tensor of this name and shape, and their order here.
+fn arranged(name: &str, shape: &[usize]) -> ([usize; 4], [usize; 4]) {
+    const AS_IT_IS: [usize; 4] = [0, 1, 2, 3];
+    const CHANNELS_LAST: [usize; 4] = [0, 2, 3, 1];
+    match (name, shape) {
+        // Each kernel row makes an image row of its own, for the input has one row only; so each is a matrix of its own.
+        ("decoder.conv1.weight", &[inputs, outputs, height, width]) => ([inputs, outputs, height, width], [2, 0, 3, 1]),
+        (_, &[rows, channels, height, width]) => ([rows, channels, height, width], CHANNELS_LAST),
+        ("encoder.mean.weight" | "encoder.log_variance.weight", &[outputs, features]) => (
+            [outputs, FEATURE_CHANNELS, features / FEATURE_CHANNELS, 1],
+            CHANNELS_LAST,
+        ),
+        ("decoder.linear.weight", &[features, inputs]) => (
+            [UNFOLDED_CHANNELS, features / UNFOLDED_CHANNELS, 1, inputs],
+            [1, 0, 2, 3],
+        ),
+        ("decoder.linear.bias", &[features]) => ([UNFOLDED_CHANNELS, features / UNFOLDED_CHANNELS, 1, 1], [1, 0, 2, 3]),
+        (_, &[len]) => ([len, 1, 1, 1], AS_IT_IS),
+        _ => unreachable!("{name} has shape {shape:?}, which no layer of the VAE has"),
+    }
+}
+
+/// Channels of the encoder's last image.
+const FEATURE_CHANNELS: usize = 256;
+/// Channels of the decoder's first image.
+const UNFOLDED_CHANNELS: usize = 1024;
+
+impl Order {
+    /// Of the tensors of `layout`, encoder and decoder.
+    pub(super) fn of(layout: &Layout) -> Self {
+        let mut entries: Vec<Entry> = layout
+            .tensors()
+            .iter()
+            .map(|tensor| {
+                let shape: Vec<usize> = tensor.shape.iter().map(|&size| size as usize).collect();
+                let (shape, axes) = arranged(&tensor.name, &shape);
+                let name = tensor.name.clone();
+                Entry {
+                    name,
+                    shape,
+                    axes,
+                    start: 0,
+                }
+            })
+            .collect();
+        // The two heads are one layer here: their weights lie side by side, and then their biases.
+        let mut places: Vec<usize> = (0..entries.len()).collect();
+        let place = |name: &str| entries.iter().position(|entry| entry.name == name);
+        if let (Some(bias), Some(weight)) = (place("encoder.mean.bias"), place("encoder.log_variance.weight")) {
+            places.swap(bias, weight);
+        }
+        let mut start = 0;
+        for place in places {
+            entries[place].start = start;
+            start += entries[place].len();
+        }
+        Self { entries }
+    }
+
+    /// Where the layer's tensors lie.
+    ///
+    /// # Panics
+    /// When there is no such layer.
+    pub(super) fn layer(&self, name: &str) -> Affine {
+        Affine {
+            weight: self.tensor(&format!("{name}.weight")),
+            bias: self.tensor(&format!("{name}.bias")),
+        }
+    }
+
+    /// Where a tensor lies.
+    ///
+    /// # Panics
+    /// When there is none of this name.
+    pub(super) fn tensor(&self, name: &str) -> Range<usize> {
+        let found = self.entries.iter().find(|entry| entry.name == name);
+        let entry = found.expect("the layout describes every layer of the VAE");
+        entry.start..entry.start + entry.len()
+    }
+
+    /// From PyTorch's order.
+    pub(super) fn from_pytorch(&self, values: &[f32]) -> Vec<f32> {
+        let mut arranged = vec![0.0; values.len()];
+        self.walk(|here, there| arranged[here] = values[there]);
+        arranged
+    }
+
+    /// Writes the beginning of PyTorch's order, as many tensors as fit.
+    pub(super) fn to_pytorch(&self, values: &[f32], into: &mut [f32]) {
+        self.walk(|here, there| {
+            if let Some(into) = into.get_mut(there) {
+                *into = values[here];
+            }
+        });
+    }
+
+    /// Calls `pair` with the place of every number, here and in PyTorch's order.
+    fn walk(&self, mut pair: impl FnMut(usize, usize)) {
+        let mut first = 0;
+        for entry in &self.entries {
+            let strides = [3, 2, 1, 0].map(|axis: usize| entry.shape[axis + 1..].iter().product::<usize>());
+            let [d, c, b, a] = strides;
+            let strides = entry.axes.map(|axis| [a, b, c, d][axis]);
+            let sizes = entry.axes.map(|axis| entry.shape[axis]);
+            let mut here = entry.start;
+            for i in 0..sizes[0] {
+                for j in 0..sizes[1] {
+                    for k in 0..sizes[2] {
+                        let there = first + i * strides[0] + j * strides[1] + k * strides[2];
+                        for l in 0..sizes[3] {
+                            pair(here, there + l * strides[3]);
+                            here += 1;
+                        }
+                    }
+                }
+            }
+            first += entry.len();
+        }
+    }
+}
+
+impl Entry {
+    fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::networks::{Decoder, Encoder};
+
+    fn order() -> (Order, usize) {
+        let mut layout = Layout::default();
+        let _ = (Encoder::describe(&mut layout), Decoder::describe(&mut layout));
+        (Order::of(&layout), layout.len())
+    }
+
+    #[test]
+    fn every_number_has_one_place_and_comes_back_to_its_own() {
+        let (order, len) = order();
+        // Exact in f32 up to 2^24.
+        let numbers: Vec<f32> = (0..len).map(|number| number as f32).collect();
+        let arranged = order.from_pytorch(&numbers);
+        assert_ne!(arranged, numbers);
+        let mut back = vec![f32::NAN; len];
+        order.to_pytorch(&arranged, &mut back);
+        assert_eq!(back, numbers);
+    }
+
+    #[test]
+    fn a_weight_lies_where_its_formula_says() {
+        let (order, len) = order();
+        let numbers: Vec<f32> = (0..len).map(|number| number as f32).collect();
+        let arranged = order.from_pytorch(&numbers);
+        let first_of = |name: &str| {
+            let entries = order.entries.iter();
+            entries
+                .take_while(|entry| entry.name != name)
+                .map(Entry::len)
+                .sum::<usize>()
+        };
+        // encoder.conv2 [64, 32, 4, 4]: output 5, input 7, kernel row 1, kernel column 2.
+        let name = "encoder.conv2.weight";
+        let there = first_of(name) + ((5 * 32 + 7) * 4 + 1) * 4 + 2;
+        let here = order.tensor(name).start + ((5 * 4 + 1) * 4 + 2) * 32 + 7;
+        assert_eq!(arranged[here], there as f32);
+        // decoder.conv1 [1024, 128, 5, 7]: input 1000, output 100, kernel row 3, kernel column 4.
+        let name = "decoder.conv1.weight";
+        let there = first_of(name) + ((1000 * 128 + 100) * 5 + 3) * 7 + 4;
+        let here = order.tensor(name).start + ((3 * 1024 + 1000) * 7 + 4) * 128 + 100;
+        assert_eq!(arranged[here], there as f32);
+        // decoder.linear [3072, 32]: channel 9 of 1024, pixel 2 of 3, code 11.
+        let name = "decoder.linear.weight";
+        let there = first_of(name) + (9 * 3 + 2) * 32 + 11;
+        let here = order.tensor(name).start + (2 * 1024 + 9) * 32 + 11;
+        assert_eq!(arranged[here], there as f32);
+        // Heads [32, 3072]: output 3, channel 200 of 256, pixel 10 of 12; the second one behind the first.
+        let name = "encoder.log_variance.weight";
+        let there = first_of(name) + 3 * 3072 + 200 * 12 + 10;
+        let here = order.tensor("encoder.mean.weight").start + (32 + 3) * 3072 + 10 * 256 + 200;
+        assert_eq!(arranged[here], there as f32);
+    }
+}

@@ -1,0 +1,271 @@
+//! Loss and gradient of a minibatch, pass by pass.
+//!
+//! Whatever concerns one image alone is done image by image, so that what one layer leaves is in the caches when the next one comes, and images are
+//! shared among the members of the team. What concerns the whole batch (the linear layers, the decoder's first convolution, the gradients of weights) is shared by rows
+//! or columns. No sum is ever split between members.
+
+use skein_kernels::{Finish, Isa, Start, Team};
+use skein_protocol::{IMAGE_PIXELS, LATENT};
+
+use super::batch::Batch;
+use super::buffer::Buffer;
+use super::code;
+use super::elementwise::{column_sums, gate, reconstruction_error};
+use super::layer::Layer;
+use super::members::{Member, by_image, portions, share};
+use super::network::{DECODER, HEADS, LINEAR, Network, UNFOLD};
+use super::order::Affine;
+use super::stopwatch::Pass;
+
+/// The loss and its parts; see [`super::super::VaeMetrics`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Objective {
+    pub(super) loss: f32,
+    pub(super) error: f32,
+    pub(super) divergence: f32,
+}
+
+/// What the passes work with.
+pub(super) struct Step<'a> {
+    pub(super) isa: Isa,
+    pub(super) team: &'a mut Team,
+    pub(super) members: &'a mut [Member],
+    pub(super) network: &'a mut Network,
+    pub(super) batch: &'a mut Batch,
+    pub(super) parameters: &'a [f32],
+    pub(super) kl_weight: f64,
+}
+
+impl Step<'_> {
+    /// The loss of depth images, `[n, 72, 128]`, and its gradient but for the weights of the decoder's first convolution, for which what flows back is left in
+    /// [`super::unfold::Unfold`]. `noise`: standard normal, `[n, 32]`.
+    pub(super) fn objective(&mut self, depth: &[u8], noise: &[f32], gradient: &mut [f32]) -> Objective {
+        let count = depth.len() / IMAGE_PIXELS;
+        self.batch.resize(self.network, count);
+        self.see(depth);
+        let divergence = self.draw_codes(noise) / count as f64;
+        self.draw_and_flow_back(count);
+        self.unfold_flow_back();
+        self.code_flow_back(noise, self.kl_weight / count as f64);
+        self.see_flow_back(count);
+        self.gradients(gradient);
+
+        let error = self.batch.errors.iter().sum::<f64>() / count as f64;
+        Objective {
+            loss: (error + self.kl_weight * divergence) as f32,
+            error: error as f32,
+            divergence: divergence as f32,
+        }
+    }
+
+    /// Encoder.
+    fn see(&mut self, depth: &[u8]) {
+        let count = depth.len() / IMAGE_PIXELS;
+        let (network, parameters) = (&*self.network, self.parameters);
+        let mut images = by_image(self.batch.seen.each_mut().map(|buffer| &mut **buffer), count);
+        share(self.team, self.members, &mut images, |index, images, member| {
+            let depth = &depth[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
+            let images = images.each_mut().map(|image| &mut **image);
+            network.see(parameters, depth, images, &mut member.watch);
+        });
+    }
+
+    /// Heads, codes, the decoder's linear layer, and what it makes of the first image. Returns the sum of divergences.
+    fn draw_codes(&mut self, noise: &[f32]) -> f64 {
+        let (network, parameters, batch) = (&mut *self.network, self.parameters, &mut *self.batch);
+        let watch = &mut self.members[0].watch;
+        watch.start();
+        network
+            .heads
+            .forward(self.team, parameters, &batch.seen[4], Finish::Plain, &mut batch.heads);
+        watch.layer(HEADS, Pass::Forward);
+        let divergence = code::draw(self.isa, &batch.heads, noise, &mut batch.codes);
+        watch.rest();
+        network.linear.forward(
+            self.team,
+            parameters,
+            &batch.codes,
+            Finish::Rectified,
+            &mut batch.unfolded,
+        );
+        watch.layer(LINEAR, Pass::Forward);
+        network.unfold.multiply(self.team, &batch.unfolded);
+        watch.layer(UNFOLD, Pass::Forward);
+        divergence
+    }
+
+    /// The rest of the decoder, the squared error, and the way back to its first image.
+    fn draw_and_flow_back(&mut self, count: usize) {
+        let (isa, network, parameters) = (self.isa, &*self.network, self.parameters);
+        let Batch {
+            seen: [pixels, ..],
+            drawn: [a, b, c, d],
+            drawn_flow: [e, f, g],
+            drawn_sums,
+            errors,
+            ..
+        } = &mut *self.batch;
+        let buffers: [&mut Buffer; 8] = [a, b, c, d, e, f, g, drawn_sums];
+        let images = by_image(buffers.map(|buffer| &mut **buffer), count);
+        let mut items: Vec<_> = images.into_iter().zip(errors).collect();
+        let weight = 2.0 / count as f32;
+        share(self.team, self.members, &mut items, |index, (images, error), member| {
+            let Member { columns, watch, .. } = member;
+            let [a, b, c, d, e, f, g, sums] = images;
+            network.draw(parameters, index, [a, b, c, d], columns, watch);
+            let pixels = &pixels[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
+            **error = reconstruction_error(isa, d, pixels, weight);
+            watch.rest();
+            let mut sums = Sums::new(network.decoder_places(), sums);
+            let ways = [(2, &*c, &mut *g), (1, &*b, f), (0, &*a, e)];
+            let mut flowing = &**d;
+            for (index, output, into) in ways {
+                sums.add(isa, index + 1, flowing);
+                watch.layer(DECODER + index, Pass::Gradient);
+                network.decoder[index].look(flowing, Start::Zero, Finish::Gated(output), into);
+                watch.layer(DECODER + index, Pass::Backward);
+                flowing = into;
+            }
+            sums.add(isa, 0, flowing);
+            watch.layer(UNFOLD, Pass::Gradient);
+        });
+    }
+
+    /// Through the decoder's first convolution, back to its input.
+    fn unfold_flow_back(&mut self) {
+        let (parameters, batch) = (self.parameters, &mut *self.batch);
+        let watch = &mut self.members[0].watch;
+        watch.start();
+        self.network.unfold.gather(&batch.drawn_flow[0]);
+        watch.layer(UNFOLD, Pass::Backward);
+        let (unfold, gate) = (&self.network.unfold, &batch.unfolded);
+        // Whole images, so that members have equal parts.
+        let mut parts = portions(&mut batch.unfolded_flow, super::unfold::INPUT_LEN, self.members.len());
+        share(self.team, self.members, &mut parts, |_, (first, input), member| {
+            let gate = &gate[*first * super::unfold::INPUT_LEN..][..input.len()];
+            unfold.backward(parameters, &mut member.unfold, *first, gate, input);
+            member.watch.layer(UNFOLD, Pass::Backward);
+        });
+    }
+
+    /// Through the code, back to the features.
+    fn code_flow_back(&mut self, noise: &[f32], divergence_weight: f64) {
+        let (network, batch) = (&*self.network, &mut *self.batch);
+        let watch = &mut self.members[0].watch;
+        watch.start();
+        network
+            .linear
+            .backward(self.team, &batch.unfolded_flow, Finish::Plain, &mut batch.codes_flow);
+        watch.layer(LINEAR, Pass::Backward);
+        let weight = divergence_weight as f32;
+        code::flow_back(
+            self.isa,
+            &batch.heads,
+            noise,
+            &batch.codes_flow,
+            weight,
+            &mut batch.heads_flow,
+        );
+        watch.rest();
+        let (finish, into) = (Finish::Gated(&batch.seen[4]), &mut batch.seen_flow[3]);
+        network.heads.backward(self.team, &batch.heads_flow, finish, into);
+        watch.layer(HEADS, Pass::Backward);
+    }
+
+    /// Through the encoder, back to its first image.
+    fn see_flow_back(&mut self, count: usize) {
+        let (isa, network) = (self.isa, &*self.network);
+        let Batch {
+            seen,
+            seen_flow: [a, b, c, d],
+            seen_sums,
+            ..
+        } = &mut *self.batch;
+        let buffers: [&mut Buffer; 5] = [a, b, c, d, seen_sums];
+        let mut images = by_image(buffers.map(|buffer| &mut **buffer), count);
+        share(self.team, self.members, &mut images, |index, images, member| {
+            let Member { columns, watch, .. } = member;
+            let [a, b, c, d, sums] = images;
+            let mut sums = Sums::new(network.encoder_places(), sums);
+            let mut flowing = &**d;
+            for (layer, into) in [(3, c), (2, b), (1, a)] {
+                sums.add(isa, layer, flowing);
+                watch.layer(layer, Pass::Gradient);
+                into.fill(0.0);
+                network.encoder[layer].spread(flowing, columns, into);
+                gate(isa, into, &seen[layer][index * into.len()..][..into.len()]);
+                watch.layer(layer, Pass::Backward);
+                flowing = into;
+            }
+            sums.add(isa, 0, flowing);
+            watch.layer(0, Pass::Gradient);
+        });
+    }
+
+    /// Of all weights but the decoder's first convolution's, and of all biases.
+    fn gradients(&mut self, gradient: &mut [f32]) {
+        let (isa, network, batch) = (self.isa, &*self.network, &*self.batch);
+        let watch = &mut self.members[0].watch;
+        watch.start();
+        let mut of_layer = |index: usize, layer: &Layer, rows: &[f32], images: &[f32], gradient: &mut [f32]| {
+            layer.gradient(self.team, isa, rows, images, gradient);
+            watch.layer(index, Pass::Gradient);
+        };
+        for (index, layer) in network.encoder.iter().enumerate() {
+            of_layer(index, layer, &batch.seen_flow[index], &batch.seen[index], gradient);
+        }
+        for (index, layer) in network.decoder.iter().enumerate() {
+            let flowing = batch.drawn_flow.get(index + 1).unwrap_or(&batch.drawn[3]);
+            of_layer(DECODER + index, layer, &batch.drawn[index], flowing, gradient);
+        }
+        network
+            .heads
+            .gradient(self.team, isa, &batch.heads_flow, &batch.seen[4], gradient);
+        watch.layer(HEADS, Pass::Gradient);
+        network
+            .linear
+            .gradient(self.team, isa, &batch.unfolded_flow, &batch.codes, gradient);
+        watch.layer(LINEAR, Pass::Gradient);
+        total(isa, network.encoder_places(), &batch.seen_sums, gradient);
+        total(isa, network.decoder_places(), &batch.drawn_sums, gradient);
+        watch.rest();
+    }
+}
+
+/// What flows back to the biases of four layers from one image, a layer behind the other.
+struct Sums<'a> {
+    parts: [&'a mut [f32]; 4],
+}
+
+impl<'a> Sums<'a> {
+    fn new(places: [&Affine; 4], sums: &'a mut [f32]) -> Self {
+        let mut rest = sums;
+        let parts = places.map(|place| {
+            let (own, others) = std::mem::take(&mut rest).split_at_mut(place.bias.len());
+            rest = others;
+            own
+        });
+        Self { parts }
+    }
+
+    /// `flowing`: the gradient with respect to the output of the layer at this place, before its ReLU.
+    fn add(&mut self, isa: Isa, layer: usize, flowing: &[f32]) {
+        column_sums(isa, flowing, self.parts[layer]);
+    }
+}
+
+/// The biases' gradients, from the sums of each image.
+fn total(isa: Isa, places: [&Affine; 4], sums: &[f32], gradient: &mut [f32]) {
+    let mut total = [0.0; 512];
+    let biases: usize = places.iter().map(|place| place.bias.len()).sum();
+    let total = &mut total[..biases.next_multiple_of(16)];
+    column_sums(isa, sums, total);
+    let mut rest = &*total;
+    for place in places {
+        let (own, others) = rest.split_at(place.bias.len());
+        gradient[place.bias.clone()].copy_from_slice(own);
+        rest = others;
+    }
+}
+
+const _: () = assert!(LATENT.is_multiple_of(16));

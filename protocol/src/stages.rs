@@ -1,0 +1,461 @@
+//! Where time goes: every stage of the data's way, and what each thread has spent on it.
+//!
+//! A [`LapTimer`] is never stopped: each lap books the time since the one before to a stage. So a thread's stages are its whole time and their shares sum
+//! to one, and a lap costs a single reading of the clock. Nothing that is learned depends on any of it.
+
+use std::fmt;
+use std::time::{Duration, Instant};
+
+use bytemuck::{Pod, Zeroable};
+use comfy_table::presets::UTF8_FULL_CONDENSED;
+use comfy_table::{CellAlignment, Table};
+use iceoryx2::prelude::ZeroCopySend;
+use serde::{Deserialize, Serialize};
+
+/// Whose time it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Thread {
+    /// All actors together; each has one thread.
+    Actors,
+    /// The learner's receiving thread.
+    Receiving,
+    /// The learner's training thread.
+    Training,
+}
+
+impl Thread {
+    /// In the summary.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Actors => "actors",
+            Self::Receiving => "receiving",
+            Self::Training => "training",
+        }
+    }
+
+    const fn title(self) -> &'static str {
+        match self {
+            Self::Actors => "actors, together",
+            Self::Receiving => "learner: receiving",
+            Self::Training => "learner: training",
+        }
+    }
+}
+
+macro_rules! stages {
+    ($($thread:ident { $($(#[$doc:meta])* $stage:ident => $name:literal),* $(,)? })*) => {
+        /// What a thread is at, in the order of the data's way. The first sentence of each says what is done, the second what is counted.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        pub enum Stage { $($($(#[$doc])* $stage),*),* }
+
+        impl Stage {
+            /// All of them, in the order of the data's way.
+            pub const ALL: &[Self] = &[$($(Self::$stage),*),*];
+
+            /// In the summary and the table; a thread has it once.
+            pub const fn name(self) -> &'static str {
+                match self { $($(Self::$stage => $name),*),* }
+            }
+
+            /// Whose it is.
+            pub const fn thread(self) -> Thread {
+                match self { $($(Self::$stage => Thread::$thread),*),* }
+            }
+        }
+    };
+}
+
+stages! {
+    Actors {
+        /// Snapshots are taken in and made ready to fly with. Snapshots.
+        TakeSnapshot => "snapshot",
+        /// The simulator is set to the start of a flight. Flights.
+        TakeOff => "take-off",
+        /// The drone moves until its next decision. Environment steps.
+        Physics => "physics",
+        /// A depth image is rendered into its record. Observations: one more than steps in each flight.
+        Camera => "camera",
+        /// The image is encoded. Observations.
+        Encoder => "encoder",
+        /// An action is chosen. Environment steps.
+        Policy => "policy",
+        /// A record is loaned from shared memory, completed by reward and end, and sent. Records.
+        Send => "send",
+        /// The learner is listened to, and given signs of life. Looks.
+        ActorControl => "control",
+        /// There is no ticket, or its snapshot is not there yet. Waits.
+        ActorIdle => "idle",
+    }
+    Receiving {
+        /// Records are checked, put together into flights, and delivered. Records.
+        Assemble => "assemble",
+        /// Orders are taken; tickets, snapshots and signs of life go out. Rounds.
+        HandOut => "hand out",
+        /// Nobody has sent anything. Waits.
+        ReceivingIdle => "idle",
+    }
+    Training {
+        /// Flights go into replay and metrics. Flights.
+        TakeIn => "take in",
+        /// A minibatch of depth images is gathered. Minibatches.
+        SampleImages => "sample images",
+        /// A step of the VAE. Steps.
+        VaeStep => "VAE step",
+        /// Stored codes are made anew by the trained VAE. Once.
+        Recode => "recode",
+        /// A minibatch of transitions is gathered. Minibatches.
+        Sample => "sample",
+        /// An update of critic, policy and temperature. Updates.
+        SacUpdate => "SAC update",
+        /// The parameters are copied into a snapshot and handed over. Snapshots.
+        Publish => "publish",
+        /// Evaluation flights are waited for. Flights.
+        Evaluate => "evaluation",
+        /// The state is copied for a checkpoint and handed over. Checkpoints.
+        Checkpoint => "checkpoint",
+        /// The start, orders, curves, the files at the end, waits that were broken off. Not counted.
+        OtherTraining => "other",
+        /// Training flights are waited for. Waits.
+        TrainingIdle => "idle",
+    }
+}
+
+const STAGES: usize = Stage::ALL.len();
+
+/// The stages of an actor: the first of [`Stage::ALL`].
+pub const ACTOR_STAGES: usize = {
+    let mut stages = 0;
+    while matches!(Stage::ALL[stages].thread(), Thread::Actors) {
+        stages += 1;
+    }
+    stages
+};
+
+/// Time, and what was done in it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable, ZeroCopySend)]
+#[repr(C)]
+pub struct Tally {
+    /// How often.
+    pub count: u64,
+    /// How long, in nanoseconds.
+    pub nanos: u64,
+}
+
+// Lies in shared memory: two 8-byte fields, no padding.
+const _: () = assert!(size_of::<Tally>() == 16);
+
+impl Tally {
+    /// More than any thread comes to: nine years, in nanoseconds.
+    const BEYOND: u64 = 1 << 58;
+
+    fn plus(self, other: Self) -> Self {
+        Self {
+            count: self.count.saturating_add(other.count),
+            nanos: self.nanos.saturating_add(other.nanos),
+        }
+    }
+
+    fn minus(self, other: Self) -> Self {
+        Self {
+            count: self.count.saturating_sub(other.count),
+            nanos: self.nanos.saturating_sub(other.nanos),
+        }
+    }
+
+    /// In seconds.
+    pub fn secs(self) -> f64 {
+        self.nanos as f64 / 1e9
+    }
+}
+
+/// What was spent on each stage.
+///
+/// Stored as a list, without stages that did not occur: `thread`, `stage`, `count`, `secs`. Stages of another version are left out when it is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "Vec<Row>", into = "Vec<Row>")]
+pub struct Times([Tally; STAGES]);
+
+impl Default for Times {
+    fn default() -> Self {
+        Self([Tally::default(); STAGES])
+    }
+}
+
+impl Times {
+    /// What was spent on `stage`.
+    pub fn of(&self, stage: Stage) -> Tally {
+        self.0[stage as usize]
+    }
+
+    /// What `thread` has spent in all, in nanoseconds.
+    pub fn total_nanos(&self, thread: Thread) -> u64 {
+        let own = Stage::ALL.iter().filter(|stage| stage.thread() == thread);
+        own.fold(0, |sum, stage| sum.saturating_add(self.of(*stage).nanos))
+    }
+
+    /// Adds to `stage`.
+    pub fn add(&mut self, stage: Stage, count: u64, time: Duration) {
+        let nanos = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
+        let tally = &mut self.0[stage as usize];
+        *tally = tally.plus(Tally { count, nanos });
+    }
+
+    /// Both together.
+    #[must_use]
+    pub fn plus(&self, other: &Self) -> Self {
+        Self(std::array::from_fn(|stage| self.0[stage].plus(other.0[stage])))
+    }
+
+    /// What has come since `earlier`; nothing where that is more.
+    #[must_use]
+    pub fn since(&self, earlier: &Self) -> Self {
+        Self(std::array::from_fn(|stage| self.0[stage].minus(earlier.0[stage])))
+    }
+
+    /// An actor's stages, on the wire.
+    pub(crate) fn of_actor(&self) -> [Tally; ACTOR_STAGES] {
+        std::array::from_fn(|stage| self.0[stage])
+    }
+
+    /// What an actor says of itself, or `None` when it cannot be.
+    pub(crate) fn read_actor(tallies: &[Tally; ACTOR_STAGES]) -> Option<Self> {
+        let mut times = Self::default();
+        times.0[..ACTOR_STAGES].copy_from_slice(tallies);
+        let possible = |tally: &Tally| tally.count < Tally::BEYOND && tally.nanos < Tally::BEYOND;
+        tallies.iter().all(possible).then_some(times)
+    }
+
+    /// Stages that occurred.
+    fn occurred(&self) -> impl Iterator<Item = (Stage, Tally)> {
+        let all = Stage::ALL.iter().map(|stage| (*stage, self.of(*stage)));
+        all.filter(|(_, tally)| *tally != Tally::default())
+    }
+}
+
+/// A stage of [`Times`] in a file.
+#[derive(Serialize, Deserialize)]
+struct Row {
+    thread: String,
+    stage: String,
+    count: u64,
+    secs: f64,
+}
+
+impl From<Times> for Vec<Row> {
+    fn from(times: Times) -> Self {
+        let row = |(stage, tally): (Stage, Tally)| Row {
+            thread: stage.thread().name().to_owned(),
+            stage: stage.name().to_owned(),
+            count: tally.count,
+            secs: tally.secs(),
+        };
+        times.occurred().map(row).collect()
+    }
+}
+
+impl From<Vec<Row>> for Times {
+    fn from(rows: Vec<Row>) -> Self {
+        let mut times = Self::default();
+        for row in rows {
+            let is_of = |stage: &&Stage| stage.thread().name() == row.thread && stage.name() == row.stage;
+            if let Some(stage) = Stage::ALL.iter().find(is_of) {
+                // Saturates: whatever a file says is a time.
+                let nanos = (row.secs * 1e9).round() as u64;
+                times.add(*stage, row.count, Duration::from_nanos(nanos));
+            }
+        }
+        times
+    }
+}
+
+/// A table: a row a stage, in the order of the data's way.
+impl fmt::Display for Times {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut table = Table::new();
+        table.load_preset(UTF8_FULL_CONDENSED);
+        table.set_header(["where the time went", "stage", "count", "total", "each", "share"]);
+        let mut thread = None;
+        for (stage, tally) in self.occurred() {
+            let of_thread = self.total_nanos(stage.thread());
+            let title = if thread.replace(stage.thread()) == Some(stage.thread()) {
+                ""
+            } else {
+                stage.thread().title()
+            };
+            table.add_row([
+                title.to_owned(),
+                stage.name().to_owned(),
+                some(tally.count, tally.count.to_string()),
+                format!("{:.2} s", tally.secs()),
+                some(tally.count, each(tally)),
+                format!("{:.1} %", 100.0 * tally.nanos as f64 / of_thread.max(1) as f64),
+            ]);
+        }
+        for column in table.column_iter_mut().skip(2) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+        write!(f, "{table}")
+    }
+}
+
+/// `text`, unless there is nothing to be counted.
+fn some(count: u64, text: String) -> String {
+    if count == 0 { String::new() } else { text }
+}
+
+fn each(tally: Tally) -> String {
+    let secs = tally.secs() / tally.count.max(1) as f64;
+    match secs {
+        0.0..1e-3 => format!("{:.2} µs", secs * 1e6),
+        1e-3..1.0 => format!("{:.2} ms", secs * 1e3),
+        _ => format!("{secs:.2} s"),
+    }
+}
+
+/// Books one thread's time, lap by lap.
+#[derive(Debug, Clone)]
+pub struct LapTimer {
+    times: Times,
+    last: Instant,
+}
+
+impl LapTimer {
+    /// Runs from now on.
+    pub fn start() -> Self {
+        Self {
+            times: Times::default(),
+            last: Instant::now(),
+        }
+    }
+
+    /// Books the time since the last lap to `stage`, in which `count` were done; 0 for a part of what is counted elsewhere.
+    pub fn lap(&mut self, stage: Stage, count: u64) {
+        let now = Instant::now();
+        self.times.add(stage, count, now - self.last);
+        self.last = now;
+    }
+
+    /// All laps so far.
+    pub fn times(&self) -> &Times {
+        &self.times
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+
+    fn sample() -> Times {
+        let mut times = Times::default();
+        for (nanos, stage) in (1_234_567_891..).step_by(1_111_111_111).zip(Stage::ALL) {
+            times.add(*stage, 7, Duration::from_nanos(nanos));
+        }
+        times
+    }
+
+    #[test]
+    fn a_thread_names_each_of_its_stages_once_and_threads_do_not_mix() {
+        let names: HashSet<_> = Stage::ALL
+            .iter()
+            .map(|stage| (stage.thread().name(), stage.name()))
+            .collect();
+        assert_eq!(names.len(), STAGES);
+        let of_actors = Stage::ALL.iter().filter(|stage| stage.thread() == Thread::Actors);
+        assert_eq!(of_actors.count(), ACTOR_STAGES);
+        for (index, stage) in Stage::ALL.iter().enumerate() {
+            assert_eq!(*stage as usize, index);
+        }
+    }
+
+    #[test]
+    fn laps_are_a_threads_whole_time() {
+        let begun = Instant::now();
+        let mut timer = LapTimer::start();
+        for stage in [Stage::Physics, Stage::Camera, Stage::Physics] {
+            std::thread::sleep(Duration::from_millis(2));
+            timer.lap(stage, 1);
+        }
+        let times = timer.times();
+        let total = Duration::from_nanos(times.total_nanos(Thread::Actors));
+        assert!(total >= Duration::from_millis(6) && total <= begun.elapsed());
+        assert_eq!((times.of(Stage::Physics).count, times.of(Stage::Camera).count), (2, 1));
+        assert!(times.of(Stage::Physics).nanos > 4_000_000);
+        assert_eq!(times.total_nanos(Thread::Training), 0);
+    }
+
+    #[test]
+    fn what_was_is_taken_away_and_nothing_goes_below_nothing_or_overflows() {
+        let (all, none) = (sample(), Times::default());
+        assert_eq!(all.plus(&all).since(&all), all);
+        assert_eq!(none.since(&all), none);
+        let endless = Times(
+            [Tally {
+                count: u64::MAX,
+                nanos: u64::MAX,
+            }; STAGES],
+        );
+        assert_eq!(endless.plus(&all), endless);
+        assert_eq!(endless.total_nanos(Thread::Training), u64::MAX);
+    }
+
+    #[test]
+    fn a_file_brings_back_what_was_spent_and_says_nothing_of_what_was_not() {
+        let json = serde_json::to_string(&sample()).unwrap();
+        assert_eq!(serde_json::from_str::<Times>(&json).unwrap(), sample());
+        assert_eq!(serde_json::to_string(&Times::default()).unwrap(), "[]");
+    }
+
+    #[test]
+    fn whatever_a_file_says_is_a_time_and_stages_of_another_version_are_left_out() {
+        let row = |thread: &str, stage: &str, count: u64, secs: &str| {
+            format!(r#"{{"thread":"{thread}","stage":"{stage}","count":{count},"secs":{secs}}}"#)
+        };
+        let rows = [
+            row("actors", "physics", 1, "-3.0"),
+            row("actors", "camera", u64::MAX, "1e300"),
+            row("actors", "camera", 5, "1e300"),
+            row("actors", "telepathy", 5, "1.0"),
+            row("ground staff", "idle", 5, "1.0"),
+        ];
+        let times: Times = serde_json::from_str(&format!("[{}]", rows.join(","))).unwrap();
+        assert_eq!(times.of(Stage::Physics), Tally { count: 1, nanos: 0 });
+        let most = Tally {
+            count: u64::MAX,
+            nanos: u64::MAX,
+        };
+        assert_eq!(times.of(Stage::Camera), most);
+        assert_eq!(times.occurred().count(), 2);
+        assert!(times.to_string().contains("100.0 %"));
+    }
+
+    #[test]
+    fn the_table_has_a_row_a_stage_and_the_shares_of_a_thread_sum_to_one() {
+        let table = sample().to_string();
+        let mut shares = Vec::new();
+        let rows = table.lines().filter(|line| line.contains('%'));
+        for (row, stage) in rows.zip(Stage::ALL) {
+            let cells: Vec<_> = row.trim_matches('│').split('┆').map(str::trim).collect();
+            assert_eq!((cells[1], cells[2]), (stage.name(), "7"));
+            let share: f64 = cells[5].trim_end_matches(" %").parse().unwrap();
+            shares.push((stage.thread(), share));
+        }
+        assert_eq!(shares.len(), STAGES);
+        for thread in [Thread::Actors, Thread::Receiving, Thread::Training] {
+            assert_eq!(table.matches(thread.title()).count(), 1, "{table}");
+            let own = shares.iter().filter(|(of, _)| *of == thread);
+            let sum: f64 = own.map(|(_, share)| share).sum();
+            assert!((sum - 100.0).abs() < 0.05 * STAGES as f64, "{sum} in\n{table}");
+        }
+    }
+
+    #[test]
+    fn times_are_told_in_units_that_one_can_read() {
+        let told = |nanos| each(Tally { count: 10, nanos });
+        assert_eq!(told(1_300), "0.13 µs");
+        assert_eq!(told(2_500_000), "250.00 µs");
+        assert_eq!(told(12_300_000), "1.23 ms");
+        assert_eq!(told(120_000_000_000), "12.00 s");
+    }
+}
