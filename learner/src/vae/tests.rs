@@ -1,7 +1,6 @@
 //! The native engine against libtorch's automatic gradients, and against itself on other instructions and threads.
 
 use skein_kernels::Isa;
-use tch::{Kind, no_grad_guard};
 
 use super::*;
 

@@ -27,8 +27,9 @@ const ROW: usize = (STRIDE * (INPUTS - 1) + KERNEL_WIDTH) * CHANNELS;
 /// Numbers in the input, and in the image.
 pub(super) const INPUT_LEN: usize = INPUTS * INPUT_CHANNELS;
 pub(super) const IMAGE_LEN: usize = ROWS * ROW;
-/// Blocks that a run is cut into.
-pub(super) const PARTS: usize = 2;
+/// Blocks that a run is cut into. One: [`super::order::Order`] keeps the weights of a kernel row as `[1024, 7 · 128]`, so blocks of less would read them in the
+/// wrong order.
+pub(super) const PARTS: usize = 1;
 /// Numbers of a run in a block.
 const PART: usize = RUN / PARTS;
 /// Blocks of weights.
