@@ -12,6 +12,7 @@ use skein_actor::agent::Agent;
 use skein_actor::courses::{Courses, Simulators};
 use skein_actor::environment_loop::Pilot;
 use skein_actor::service::{Ending, Service};
+use skein_protocol::allocation::return_large_blocks;
 use skein_protocol::failure::{EXIT_LEARNER_GONE, with_causes};
 use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::logging::{LogFormat, log_to_file};
@@ -35,6 +36,7 @@ struct Arguments {
 }
 
 fn main() -> ExitCode {
+    return_large_blocks();
     match run(&Arguments::parse()) {
         Ok(Ending::Stopped | Ending::Signalled) => ExitCode::SUCCESS,
         Ok(Ending::LearnerSilent) => {

@@ -8,13 +8,11 @@ use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 
 use crate::inference::Network;
 
-/// Snapshots held: with policy lag 1 two are flown, an evaluation flies a third, and one has just arrived. As many as the learner keeps for late joiners.
-const HELD: usize = 4;
-
 /// The newest snapshots.
 #[derive(Debug)]
 pub struct Weights {
     layout: SnapshotLayout,
+    most: usize,
     /// In order of arrival, the newest last.
     held: VecDeque<Held>,
 }
@@ -37,18 +35,25 @@ impl Held {
 }
 
 impl Weights {
-    /// No snapshot yet.
-    pub fn new(layout: SnapshotLayout) -> Self {
+    /// No snapshot yet, and never more than the `most` that came last.
+    pub fn new(layout: SnapshotLayout, most: usize) -> Self {
         Self {
             layout,
-            held: VecDeque::with_capacity(HELD),
+            most,
+            held: VecDeque::with_capacity(most),
         }
+    }
+
+    /// For a run with `policy_lag`. Tickets name the newest snapshot, an evaluation's too, and with policy lag 1 the one before it: no other is published
+    /// before their flights are committed. One more is there for what comes before its ticket.
+    pub fn for_lag(layout: SnapshotLayout, policy_lag: u64) -> Self {
+        Self::new(layout, policy_lag as usize + 2)
     }
 
     /// Takes in a snapshot; the one that came first goes when there are too many.
     pub fn insert(&mut self, snapshot: Snapshot) {
         self.held.retain(|held| held.version() != snapshot.version);
-        if self.held.len() == HELD {
+        if self.held.len() == self.most {
             self.held.pop_front();
         }
         self.held.push_back(Held::Raw(snapshot));
@@ -84,7 +89,7 @@ mod tests {
     fn weights(versions: impl IntoIterator<Item = u64>) -> Weights {
         let layout = SnapshotLayout::new(32, 1);
         let values = layout.values();
-        let mut weights = Weights::new(layout);
+        let mut weights = Weights::new(layout, 4);
         for version in versions {
             weights.insert(Snapshot {
                 version: PolicyVersion(version),

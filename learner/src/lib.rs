@@ -3,7 +3,6 @@
 //! Training is a function of configuration and seed: flights are taken in flight order, every random draw has a seed of its own, and nothing here
 //! depends on who flew a flight, or when.
 
-pub mod allocation;
 pub mod best;
 pub mod checkpoint;
 pub mod curriculum;

@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result};
 use clap::Parser;
-use skein_learner::allocation::keep_freed_memory;
 use skein_learner::training::{self, TrainingError};
+use skein_protocol::allocation::keep_freed_memory;
 use skein_protocol::failure::{EXIT_START_AGAIN, with_causes};
 use skein_protocol::logging::{LogFormat, log_to_file};
 use skein_protocol::run::{LearnerSeat, RunDirectory};

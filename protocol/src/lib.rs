@@ -2,9 +2,11 @@
 //!
 //! Everything that two processes must agree on is defined here, and nothing else: who flies what ([`ticket`]), what a flown step looks like on the
 //! wire ([`transition`]), what a policy snapshot contains ([`snapshot`]), the iceoryx2 services that carry them ([`services`]), the configuration of a
-//! run ([`config`]) and the files it leaves ([`run`], [`evaluation`], [`summary`]), and what their time is counted by ([`stages`]). It knows neither libtorch nor the physics engine, so that every
+//! run ([`config`]) and the files it leaves ([`run`], [`evaluation`], [`summary`]), and what their time is counted by ([`stages`]); and what all of our programs do alike
+//! ([`allocation`], [`logging`]). It knows neither libtorch nor the physics engine, so that every
 //! process can afford to depend on it.
 
+pub mod allocation;
 pub mod claims;
 pub mod config;
 pub mod durable;

@@ -65,7 +65,7 @@ impl<'a> LearnerLine<'a> {
             identity: service.identity,
             actor: service.actor,
             incarnation: service.incarnation,
-            weights: Weights::new(SnapshotLayout::of(service.config)),
+            weights: Weights::for_lag(SnapshotLayout::of(service.config), service.config.learning.policy_lag),
             tickets: VecDeque::new(),
             limits: Limits {
                 heartbeat: transport.heartbeat(),

@@ -51,6 +51,8 @@ impl Role {
 pub struct Usage {
     /// Memory that is mapped and present, shared memory included.
     pub resident_bytes: u64,
+    /// As many were there at one time.
+    pub most_resident_bytes: u64,
     /// The part of it that is its own: neither files nor shared memory.
     pub anonymous_bytes: u64,
     /// Open file descriptors.
@@ -136,6 +138,7 @@ impl Process {
         };
         Ok(Usage {
             resident_bytes: figure("VmRSS:")? * 1024,
+            most_resident_bytes: figure("VmHWM:")? * 1024,
             anonymous_bytes: figure("RssAnon:")? * 1024,
             descriptors: fs::read_dir(folder.join("fd"))?.count() as u64,
             threads: figure("Threads:")?,

@@ -18,8 +18,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
-use skein_learner::allocation::keep_freed_memory;
 use skein_learner::flights::assembly::Keep;
+use skein_protocol::allocation::keep_freed_memory;
 
 use crate::learner::{Learner, Load, Throughput};
 use crate::report::report;

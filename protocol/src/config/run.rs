@@ -21,7 +21,8 @@ pub struct RunSection {
     /// processor, `libtorch` on a CUDA device, where there is no other.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub engine: Option<Engine>,
-    /// Threads of the learner's tensor operations. Part of the result: another count sums in another order. Default 2.
+    /// Threads that the learner's networks are computed with. Of the engine `libtorch` part of the result, as another count sums in another order; of `native` not.
+    /// Default 2.
     pub learner_threads: usize,
 }
 

@@ -11,7 +11,7 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 
 use super::joining::{JoinError, learner_of};
-use super::memory::reserve;
+use super::memory::{let_go, reserve};
 use super::opening::{Manner, Opener};
 use super::{Ipc, ServiceError, failed, node, wait};
 use crate::config::Config;
@@ -165,7 +165,11 @@ impl ActorPorts {
     /// [`ServiceError`] when the learner's memory cannot be mapped.
     pub fn receive_snapshot(&self) -> Result<Option<Result<Snapshot, crate::snapshot::SnapshotError>>, ServiceError> {
         let sample = self.weights.receive().map_err(failed("weights", "receiving"))?;
-        Ok(sample.map(|sample| Snapshot::receive(sample.user_header(), sample.payload(), self.run, &self.layout)))
+        Ok(sample.map(|sample| {
+            let received = Snapshot::receive(sample.user_header(), sample.payload(), self.run, &self.layout);
+            let_go(sample.payload());
+            received
+        }))
     }
 
     /// Wakes the learner.

@@ -7,6 +7,7 @@ use std::fs::{self, OpenOptions};
 use std::io;
 
 use rustix::fs::FallocateFlags;
+use rustix::mm::{Advice, madvise};
 
 use super::learner::SNAPSHOT_SLOTS;
 use super::opening::{control_buffer, control_slots, transition_buffer};
@@ -55,6 +56,24 @@ pub(super) fn reserve(identity: &RunIdentity, life: Life) -> Result<(), ServiceE
     Ok(())
 }
 
+/// Takes the whole pages of `shared`, which lies in a segment, out of this process's memory; they stay in the segment, and come back when they are read.
+/// An actor looks at each snapshot once: if it kept what it has looked at, all of the learner's segment would count as its own.
+pub(super) fn let_go(shared: &[u8]) {
+    let page = rustix::param::page_size();
+    let skipped = shared.as_ptr().align_offset(page);
+    let Some(pages) = shared.get(skipped..) else { return };
+    let whole = pages.len() / page * page;
+    if whole == 0 {
+        return;
+    }
+    // SAFETY: these pages lie within `shared`. They are mapped from a file and shared, so the file keeps what is written on them, and whoever reads them again
+    // is given the same bytes.
+    let let_go = unsafe { madvise(pages.as_ptr().cast_mut().cast(), whole, Advice::LinuxDontNeed) };
+    if let Err(error) = let_go {
+        tracing::debug!(%error, "pages of a snapshot are kept");
+    }
+}
+
 fn reserve_segment(segment: &std::path::Path) -> io::Result<()> {
     use std::os::unix::fs::MetadataExt;
     /// Bytes in which the system counts what a file takes.
@@ -74,6 +93,56 @@ mod tests {
     use super::super::tests::Run;
     use super::super::{ActorPorts, LearnerPorts};
     use super::*;
+
+    /// Bytes of shared memory that this process has in its own, of the mapping that `address` lies in.
+    fn resident(address: *const u8) -> usize {
+        let maps = fs::read_to_string("/proc/self/smaps").unwrap();
+        let number = |text: &str| usize::from_str_radix(text, 16).ok();
+        let mut is_it = false;
+        for line in maps.lines() {
+            let first = line.split_whitespace().next().unwrap();
+            if let Some((start, end)) = first.split_once('-')
+                && let (Some(start), Some(end)) = (number(start), number(end))
+            {
+                is_it = (start..end).contains(&(address as usize));
+            } else if is_it && first == "Rss:" {
+                return line.split_whitespace().nth(1).unwrap().parse::<usize>().unwrap() << 10;
+            }
+        }
+        panic!("{address:?} is not mapped");
+    }
+
+    #[test]
+    fn what_is_let_go_is_out_of_this_process_and_comes_back_unchanged() {
+        let mut file = tempfile::tempfile_in("/dev/shm").unwrap();
+        let written: Vec<u8> = (0..1 << 20).map(|index| (index % 251) as u8).collect();
+        std::io::Write::write_all(&mut file, &written).unwrap();
+        // SAFETY: a new mapping of a file that nobody else has.
+        let mapped = unsafe {
+            rustix::mm::mmap(
+                std::ptr::null_mut(),
+                written.len(),
+                rustix::mm::ProtFlags::READ,
+                rustix::mm::MapFlags::SHARED,
+                &file,
+                0,
+            )
+        };
+        let start = mapped.unwrap().cast::<u8>();
+        // SAFETY: all of the mapping, which is never unmapped.
+        let shared = unsafe { std::slice::from_raw_parts(start.cast_const(), written.len()) };
+        assert_eq!(shared, written);
+        let before = resident(start);
+        // Not on a page's boundary: what shares a page with others is not let go.
+        let_go(&shared[100..written.len() - 100]);
+        let after = resident(start);
+        assert!(
+            before >= written.len() && after <= 3 * rustix::param::page_size(),
+            "{before} {after}"
+        );
+        let_go(&shared[10..20]);
+        assert_eq!(shared, written);
+    }
 
     #[test]
     fn what_is_needed_is_what_is_taken_and_a_little_more() {
