@@ -1,7 +1,8 @@
 //! One actor's whole step, from the camera to the record sent, against the sum of its stages.
 //!
-//! An iteration is a training flight through real shared memory, no longer than it must be: the shorter, the more of them nobody disturbs; every stage is given exactly what it was made of,
-//! so that whatever the whole takes beyond the sum of the stages is the loop's own. The learner's end is emptied after each flight, outside the time taken.
+//! An iteration is a training flight through real shared memory, no longer than it must be: the shorter, the more of them nobody disturbs. Every stage is
+//! given exactly what it was made of, so that whatever the whole takes beyond the sum of the stages is the loop's own. The learner's end is emptied after
+//! each flight, outside the time taken.
 
 mod common;
 

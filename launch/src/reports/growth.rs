@@ -73,6 +73,8 @@ fn draw_lines(area: &Area<'_>, growth: &Growth, lines: &[Line<'_>]) -> Result<()
         .axis_style(INK.mix(0.4).stroke_width(px(1)))
         .bold_line_style(GRID.stroke_width(px(1)))
         .light_line_style(TRANSPARENT)
+        // More would run into each other before a power of ten.
+        .x_labels(6)
         .x_label_formatter(&|x| brief(*x))
         .y_label_formatter(&|y| brief(*y))
         .x_desc(&growth.x)

@@ -51,34 +51,35 @@ fn main() {
     let mut least = BTreeMap::new();
     for count in actors {
         learner.start_actors(count);
-        for (kept, keep) in [("images copied", Keep::Depth), ("latents only", Keep::Latents)] {
+        for (kept, keep) in [("_with_images", Keep::Depth), ("", Keep::Latents)] {
             let measured = learner.throughput(&Load {
                 keep,
                 warm_up: Duration::from_secs_f64(seconds / 4.0),
                 measured: Duration::from_secs_f64(seconds),
             });
             let least = *least.entry(kept).or_insert(measured.process_micros);
-            tell(&format!("transport, {count} actors, {kept}"), &measured, least);
+            tell(count, kept, &measured, least);
         }
     }
     learner.finish();
 }
 
-/// Prints what was measured under a load; with the least number of actors, the learner needed `least` microseconds a record.
-fn tell(load: &str, measured: &Throughput, least: f64) {
-    let name = |figure| format!("{load}: {figure}");
+/// Prints what was measured with `count` actors, of records of which `kept` is kept; with the least number of actors, the learner needed `least`
+/// microseconds a record.
+fn tell(count: u32, kept: &str, measured: &Throughput, least: f64) {
+    let name = |figure: &str| format!("transport/{figure}{kept}/{count}");
     let copied = ("memcpy of the same bytes", measured.copy_micros);
     report(
-        &name("records committed"),
+        &name("records"),
         measured.records_per_second,
         "records/s",
         ("memcpy of the same bytes", 1e6 / measured.copy_micros),
     );
-    report(&name("receiving thread"), measured.thread_micros, "us/record", copied);
+    report(&name("receiving_thread"), measured.thread_micros, "µs", copied);
     report(
         &name("learner"),
         measured.process_micros,
-        "us/record",
+        "µs",
         ("with the fewest actors", least),
     );
 }

@@ -9,6 +9,7 @@ use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, Incarnation, PolicyVersion};
 use skein_protocol::run::{Presence, RunDirectory};
 use skein_protocol::services::{ActorPorts, LoanedTransition};
+use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind};
@@ -128,6 +129,7 @@ impl Actor {
             // As if there had been a snapshot.
             newest_policy: Some(PolicyVersion(0)),
             flights_flown: 0,
+            times: Times::default(),
         };
         self.ports
             .send_status(StatusRecord::new(self.ports.run(), &status))

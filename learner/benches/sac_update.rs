@@ -1,0 +1,69 @@
+//! A SAC update, batch 256, on one thread: on our kernels, as its networks grow wider, and on libtorch with automatic gradients.
+
+use criterion::{BenchmarkId, Criterion, Throughput};
+use skein_kernels::Team;
+use skein_learner::device::use_threads;
+use skein_learner::noise::Noise;
+use skein_learner::sac::{Columns, Sac};
+use skein_protocol::ACTION;
+use skein_protocol::config::{Engine, Observation, SacSection};
+use tch::Device;
+
+const OBSERVATION: Observation = Observation::LatentVelocity;
+/// The default.
+const WIDTH: usize = 256;
+
+fn main() {
+    let mut criterion = Criterion::default().configure_from_args();
+    use_threads(1);
+    let rows = SacSection::default().batch_size;
+    let mut noise = Noise::new(1);
+    let mut draw = |width: usize| -> Vec<f32> { (0..rows * width).map(|_| noise.uniform(1.0)).collect() };
+    let [observations, actions, rewards, next_observations] =
+        [OBSERVATION.len(), ACTION, 1, OBSERVATION.len()].map(&mut draw);
+    let columns = Columns {
+        observations: &observations,
+        actions: &actions,
+        rewards: &rewards,
+        next_observations: &next_observations,
+        terminated: &vec![0.0; rows],
+    };
+    for width in [64, 128, WIDTH, 512, 1024] {
+        update(&mut criterion, Engine::Native, width, columns);
+    }
+    update(&mut criterion, Engine::Libtorch, WIDTH, columns);
+    criterion.final_summary();
+}
+
+fn update(criterion: &mut Criterion, engine: Engine, width: usize, columns: Columns<'_>) {
+    let section = SacSection {
+        hidden_width: width,
+        ..SacSection::default()
+    };
+    let mut sac = Sac::new(&section, OBSERVATION, 1, engine, Device::Cpu);
+    let (mut team, mut noise) = (Team::new(1), Noise::new(2));
+    let mut group = criterion.benchmark_group("sac_update");
+    group.throughput(Throughput::Elements(operations(columns.rewards.len(), width)));
+    group.bench_function(BenchmarkId::new(engine.to_string(), width), |bencher| {
+        bencher.iter(|| {
+            sac.update(&mut team, columns, &mut noise)
+                .expect("random rewards are finite")
+        });
+    });
+    group.finish();
+}
+
+/// Floating-point operations that the products of one update cannot do without, a multiplication and an addition counted as two; nothing else is counted.
+fn operations(rows: usize, width: usize) -> u64 {
+    let (observation, estimates) = (OBSERVATION.len(), 2);
+    // Weights: the layers of the policy, and those of the critic.
+    let policy_first = observation * width;
+    let policy_rest = 2 * width * width + width * 2 * ACTION;
+    let critic_first = (observation + ACTION) * width;
+    let critic_rest = width * width + width * estimates;
+    let forward = 2 * (policy_first + policy_rest) + 3 * (critic_first + critic_rest);
+    // Gradients of all weights; what flows back through all layers but the first ones, and through the critic once more, to the action only.
+    let gradients = policy_first + policy_rest + critic_first + critic_rest;
+    let back = policy_rest + 2 * critic_rest + width * ACTION;
+    (2 * rows * (forward + gradients + back)) as u64
+}

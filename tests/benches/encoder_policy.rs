@@ -1,0 +1,72 @@
+//! An actor's thinking, one image and one action at a time: native, and by libtorch, which only the learner has. The one benchmark that needs both.
+
+use std::hint::black_box;
+
+use criterion::{Criterion, Throughput};
+use skein_actor::inference::{Network, Scratch};
+use skein_learner::device::use_threads;
+use skein_learner::sac::TorchSac;
+use skein_learner::vae::{TorchVae, images_from_bytes};
+use skein_protocol::config::{Config, Observation};
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::snapshot::{ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout};
+use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LATENT};
+use tch::Device;
+
+/// As in `local.toml`.
+const OBSERVATION: Observation = Observation::LatentVelocity;
+const STRIDE: usize = 2;
+
+fn main() {
+    let mut criterion = Criterion::default().configure_from_args();
+    use_threads(1);
+    let mut config = Config::default();
+    config.learning.observation = OBSERVATION;
+    let vae = TorchVae::new(&config.vae, 1, Device::Cpu);
+    let sac = TorchSac::new(&config.sac, OBSERVATION, 1, Device::Cpu);
+    let layout = SnapshotLayout::of(&config);
+    let mut values = vec![0.0; layout.values()];
+    vae.publish(&mut values[layout.encoder()]);
+    sac.publish(&mut values[layout.policy()]);
+    let version = PolicyVersion(0);
+    let network = Network::new(&Snapshot { version, values }, &layout);
+
+    let image: [u8; IMAGE_PIXELS] = std::array::from_fn(|pixel| (pixel * 7) as u8);
+    let mut observation = vec![0.0; OBSERVATION.len()];
+    let mut observe = |latent: [f32; LATENT]| {
+        OBSERVATION.write(&latent, &[1.0, 0.1, 0.1], &[0.0; ACTION], &mut observation);
+        observation.clone()
+    };
+    let mut group = criterion.benchmark_group("encoder_policy");
+    group.throughput(Throughput::Elements(operations(config.sac.hidden_width)));
+    group.bench_function("native", |bencher| {
+        let mut scratch = Scratch::default();
+        bencher.iter(|| {
+            let latent = network.encode(black_box(&image), &mut scratch);
+            black_box(network.distribution(&observe(latent), &mut scratch).mode())
+        });
+    });
+    group.bench_function("libtorch", |bencher| {
+        bencher.iter(|| {
+            let mut latent = [0.0; LATENT];
+            vae.encode(&images_from_bytes(black_box(&image)))
+                .copy_data(&mut latent, LATENT);
+            black_box(sac.mode(&observe(latent)))
+        });
+    });
+    group.finish();
+    criterion.final_summary();
+}
+
+/// Floating-point operations of the products of both networks, a multiplication and an addition counted as two; nothing else is counted.
+fn operations(width: usize) -> u64 {
+    let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
+    let mut products = 0;
+    for channels in ENCODER_CHANNELS.windows(2) {
+        size = size.map(|length| (length - ENCODER_KERNEL) / STRIDE + 1);
+        products += size[0] * size[1] * ENCODER_KERNEL * ENCODER_KERNEL * channels[0] * channels[1];
+    }
+    products += ENCODER_FEATURES * LATENT;
+    products += OBSERVATION.len() * width + 2 * width * width + width * 2 * ACTION;
+    2 * products as u64
+}
