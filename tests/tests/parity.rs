@@ -1,4 +1,4 @@
-//! The actor's native networks are the learner's: the same parameters give the same numbers, to 1e-5.
+//! The actor's networks are the learner's: the same parameters give the same numbers, to 1e-5 by libtorch and to the last bit by the native engine's encoder.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
 
@@ -7,8 +7,8 @@ use rand_pcg::Pcg64Mcg;
 use skein_actor::inference::{Network, Scratch};
 use skein_learner::networks::{Layout, Parameters, Policy};
 use skein_learner::sac::Sac;
-use skein_learner::vae::{TorchVae as Vae, images_from_bytes};
-use skein_protocol::config::{Config, Observation};
+use skein_learner::vae::{NativeVae, TorchVae as Vae, images_from_bytes};
+use skein_protocol::config::{Config, Engine, Observation};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
@@ -21,6 +21,8 @@ const OBSERVATIONS: [Observation; 3] = [
     Observation::LatentVelocity,
     Observation::LatentVelocityAction,
 ];
+
+const ENGINES: [Engine; 2] = [Engine::Native, Engine::Libtorch];
 
 fn config(observation: Observation) -> Config {
     let mut config = Config::default();
@@ -135,14 +137,35 @@ fn both_bound_an_extreme_spread_alike() {
 
 #[test]
 fn what_the_learner_publishes_flies_as_the_learner_says() {
-    for observation in OBSERVATIONS {
+    for (observation, engine) in OBSERVATIONS
+        .into_iter()
+        .flat_map(|observation| ENGINES.map(|engine| (observation, engine)))
+    {
         let config = config(observation);
-        let sac = Sac::new(&config.sac, observation, 9, Device::Cpu);
+        let sac = Sac::new(&config.sac, observation, 9, engine, Device::Cpu);
         let network = network(&config, &vae(&config, 9), |into| sac.publish(into));
         let observed = vec![0.3; observation.len()];
-        let learner = rows(&sac.mode(&Tensor::from_slice(&observed).unsqueeze(0)));
+        let learner = sac.mode(&observed);
         let native = network.distribution(&observed, &mut Scratch::default()).mode();
         assert_alive("action", &native);
-        assert_close("action", &native, &learner[0]);
+        assert_close("action", &native, &learner);
+    }
+}
+
+#[test]
+fn the_native_engine_encodes_as_the_actor_does_bit_for_bit() {
+    let config = config(Observation::Latent);
+    let mut native = NativeVae::new(&config.vae, 3, 2);
+    let torch = vae(&config, 3);
+    let mut rng = Pcg64Mcg::seed_from_u64(3);
+    let images: Vec<[u8; IMAGE_PIXELS]> = (0..3).map(|_| std::array::from_fn(|_| rng.random())).collect();
+    let learner = native.encode(&images.concat());
+    // Both engines begin with the same parameters.
+    let network = network(&config, &torch, |_| {});
+    let mut scratch = Scratch::default();
+    for (image, learner) in images.iter().zip(learner) {
+        let actor = network.encode(image, &mut scratch);
+        assert_alive("latent", &actor);
+        assert_eq!(actor, learner);
     }
 }

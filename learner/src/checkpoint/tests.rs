@@ -62,6 +62,13 @@ fn state(flights: u64) -> CheckpointState {
                 window_walls_passed: 0.1,
                 confirmed_walls_passed: 2.5,
             }),
+            trained: Some(skein_protocol::summary::Trained {
+                rate: 0.92,
+                flights: 60,
+                steps: 11,
+                updates: 2,
+                wall_secs: 0.5,
+            }),
             metrics: MetricsState {
                 flights,
                 flights_extent: crate::metrics::FlightsExtent::empty(),

@@ -292,11 +292,14 @@ impl NativeSac {
         const GRAIN: usize = 1024;
         let (leader, rate, isa) = (&self.critic_parameters.values, self.target_rate, self.isa);
         team.split_rows(&mut self.target_parameters, 1, GRAIN, |first, own| {
-            isa.vectorised(|| {
-                for (own, leader) in own.iter_mut().zip(&leader[first..]) {
-                    *own = (leader - *own).mul_add(rate, *own);
-                }
-            });
+            isa.vectorised(
+                #[inline(always)]
+                || {
+                    for (own, leader) in own.iter_mut().zip(&leader[first..]) {
+                        *own = (leader - *own).mul_add(rate, *own);
+                    }
+                },
+            );
         });
     }
 

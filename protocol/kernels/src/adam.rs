@@ -45,16 +45,19 @@ impl AdamStep {
                 )
             };
             let gradient = &gradient[part];
-            isa.vectorised(|| {
-                let moments = first.iter_mut().zip(second);
-                for ((parameter, gradient), (first, second)) in parameters.iter_mut().zip(gradient).zip(moments) {
-                    // m ← β₁ m + (1 - β₁) g; v ← β₂ v + (1 - β₂) g²
-                    *first = (gradient - *first).mul_add(1.0 - BETA_1, *first);
-                    *second = gradient.mul_add(*gradient, -*second).mul_add(1.0 - BETA_2, *second);
-                    let spread = second.sqrt().mul_add(root, EPSILON);
-                    *parameter = (*first / spread).mul_add(rate, *parameter);
-                }
-            });
+            isa.vectorised(
+                #[inline(always)]
+                || {
+                    let moments = first.iter_mut().zip(second);
+                    for ((parameter, gradient), (first, second)) in parameters.iter_mut().zip(gradient).zip(moments) {
+                        // m ← β₁ m + (1 - β₁) g; v ← β₂ v + (1 - β₂) g²
+                        *first = (gradient - *first).mul_add(1.0 - BETA_1, *first);
+                        *second = gradient.mul_add(*gradient, -*second).mul_add(1.0 - BETA_2, *second);
+                        let spread = second.sqrt().mul_add(root, EPSILON);
+                        *parameter = (*first / spread).mul_add(rate, *parameter);
+                    }
+                },
+            );
         });
     }
 }

@@ -117,17 +117,20 @@ impl Windows {
         let (run_len, len) = (self.runs[0].len, self.runs[0].len * runs.len());
         assert_eq!(image.len(), self.image_len, "the image the windows are of");
         assert_eq!(numbers.len(), starts.len() * len, "all numbers of each window");
-        isa.vectorised(|| {
-            for (row, run) in runs.iter().enumerate() {
-                for (&start, numbers) in starts.iter().zip(numbers.chunks_exact(len)) {
-                    let from = &numbers[row * run_len..][..run_len];
-                    let into = &mut image[start + run.offset..][..run_len];
-                    for (into, from) in into.iter_mut().zip(from) {
-                        *into += from;
+        isa.vectorised(
+            #[inline(always)]
+            || {
+                for (row, run) in runs.iter().enumerate() {
+                    for (&start, numbers) in starts.iter().zip(numbers.chunks_exact(len)) {
+                        let from = &numbers[row * run_len..][..run_len];
+                        let into = &mut image[start + run.offset..][..run_len];
+                        for (into, from) in into.iter_mut().zip(from) {
+                            *into += from;
+                        }
                     }
                 }
-            }
-        });
+            },
+        );
     }
 }
 

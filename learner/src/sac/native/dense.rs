@@ -164,14 +164,17 @@ impl Dense {
             gradient(team, self.isa, left, right, &mut into[layer.weight.clone()]);
             let bias = &mut into[layer.bias.clone()];
             team.split_rows(bias, 1, COLUMN_GRAIN, |first, sums| {
-                self.isa.vectorised(|| {
-                    sums.fill(0.0);
-                    for row in flowing.chunks_exact(layer.outputs) {
-                        for (sum, term) in sums.iter_mut().zip(&row[first..]) {
-                            *sum += term;
+                self.isa.vectorised(
+                    #[inline(always)]
+                    || {
+                        sums.fill(0.0);
+                        for row in flowing.chunks_exact(layer.outputs) {
+                            for (sum, term) in sums.iter_mut().zip(&row[first..]) {
+                                *sum += term;
+                            }
                         }
-                    }
-                });
+                    },
+                );
             });
         }
     }

@@ -58,15 +58,18 @@ impl Learned {
 
 /// Squared length of a gradient: infinite or not a number if one of its numbers is, or if it overflows. Sixteen sums side by side, the same on every processor.
 pub(super) fn squared_norm(isa: Isa, gradient: &[f32]) -> f32 {
-    isa.vectorised(|| {
-        let mut sums = [0.0_f32; 16];
-        let mut whole = gradient.chunks_exact(sums.len());
-        for numbers in &mut whole {
-            for (sum, number) in sums.iter_mut().zip(numbers) {
-                *sum = number.mul_add(*number, *sum);
+    isa.vectorised(
+        #[inline(always)]
+        || {
+            let mut sums = [0.0_f32; 16];
+            let mut whole = gradient.chunks_exact(sums.len());
+            for numbers in &mut whole {
+                for (sum, number) in sums.iter_mut().zip(numbers) {
+                    *sum = number.mul_add(*number, *sum);
+                }
             }
-        }
-        let rest = whole.remainder().iter().map(|number| number * number);
-        rest.chain(sums).sum()
-    })
+            let rest = whole.remainder().iter().map(|number| number * number);
+            rest.chain(sums).sum()
+        },
+    )
 }

@@ -70,20 +70,23 @@ impl Sample {
         } = self;
         let given = noise.iter().zip(mean).zip(log_std);
         let made = deviation.iter_mut().zip(actions).zip(slope).zip(element_log_prob);
-        isa.vectorised(|| {
-            for (((noise, mean), log_std), (((deviation, action), slope), log_prob)) in given.zip(made) {
-                let log_std = log_std.clamp(LOG_STD.0, LOG_STD.1);
-                *deviation = exp(log_std) * noise;
-                let x = *mean + *deviation;
-                // With e = exp(-2|x|): tanh|x| = (1 - e) / (1 + e), its derivative 4 e / (1 + e)²: exact where tanh saturates.
-                let e = exp(-2.0 * x.abs());
-                *action = ((1.0 - e) / (1.0 + e)).copysign(x);
-                *slope = 4.0 * e / ((1.0 + e) * (1.0 + e));
-                // log(1 - tanh²x) = 2 (ln 2 - x - softplus(-2x)) = 2 (ln 2 - |x| - ln(1 + e)).
-                let correction = 2.0 * (LN_2 - x.abs() - ln_1p(e));
-                *log_prob = -0.5 * noise * noise - log_std - HALF_LN_TAU - correction;
-            }
-        });
+        isa.vectorised(
+            #[inline(always)]
+            || {
+                for (((noise, mean), log_std), (((deviation, action), slope), log_prob)) in given.zip(made) {
+                    let log_std = log_std.clamp(LOG_STD.0, LOG_STD.1);
+                    *deviation = exp(log_std) * noise;
+                    let x = *mean + *deviation;
+                    // With e = exp(-2|x|): tanh|x| = (1 - e) / (1 + e), its derivative 4 e / (1 + e)²: exact where tanh saturates.
+                    let e = exp(-2.0 * x.abs());
+                    *action = ((1.0 - e) / (1.0 + e)).copysign(x);
+                    *slope = 4.0 * e / ((1.0 + e) * (1.0 + e));
+                    // log(1 - tanh²x) = 2 (ln 2 - x - softplus(-2x)) = 2 (ln 2 - |x| - ln(1 + e)).
+                    let correction = 2.0 * (LN_2 - x.abs() - ln_1p(e));
+                    *log_prob = -0.5 * noise * noise - log_std - HALF_LN_TAU - correction;
+                }
+            },
+        );
         let elements = self.element_log_prob.chunks_exact(ACTION);
         for (log_prob, elements) in self.log_prob.iter_mut().zip(elements) {
             *log_prob = elements.iter().sum();

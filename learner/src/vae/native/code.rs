@@ -18,13 +18,16 @@ pub(super) fn draw(isa: Isa, heads: &[f32], noise: &[f32], codes: &mut [f32]) ->
     for ((heads, noise), codes) in rows.zip(codes.chunks_exact_mut(LATENT)) {
         let heads: &Heads = heads.try_into().expect("two heads");
         let mut terms = [0.0_f32; LATENT];
-        isa.vectorised(|| {
-            for place in 0..LATENT {
-                let (mean, log_variance) = (heads[place], heads[LATENT + place].clamp(-BOUND, BOUND));
-                codes[place] = exp(0.5 * log_variance).mul_add(noise[place], mean);
-                terms[place] = mean * mean + exp(log_variance) - log_variance - 1.0;
-            }
-        });
+        isa.vectorised(
+            #[inline(always)]
+            || {
+                for place in 0..LATENT {
+                    let (mean, log_variance) = (heads[place], heads[LATENT + place].clamp(-BOUND, BOUND));
+                    codes[place] = exp(0.5 * log_variance).mul_add(noise[place], mean);
+                    terms[place] = mean * mean + exp(log_variance) - log_variance - 1.0;
+                }
+            },
+        );
         total += terms.iter().map(|&term| f64::from(term)).sum::<f64>();
     }
     0.5 * total
@@ -46,21 +49,24 @@ pub(super) fn flow_back(
         .zip(heads_flow.chunks_exact_mut(2 * LATENT));
     for ((heads, noise), (flowing, into)) in rows.zip(flows) {
         let (mean_flow, log_variance_flow) = into.split_at_mut(LATENT);
-        isa.vectorised(|| {
-            for place in 0..LATENT {
-                let (mean, unbounded) = (heads[place], heads[LATENT + place]);
-                let log_variance = unbounded.clamp(-BOUND, BOUND);
-                mean_flow[place] = divergence_weight.mul_add(mean, flowing[place]);
-                let drawn = 0.5 * flowing[place] * noise[place] * exp(0.5 * log_variance);
-                let flow = (0.5 * divergence_weight).mul_add(exp(log_variance) - 1.0, drawn);
-                // Outside of the bounds nothing changes with it.
-                log_variance_flow[place] = if (-BOUND..=BOUND).contains(&unbounded) {
-                    flow
-                } else {
-                    0.0
-                };
-            }
-        });
+        isa.vectorised(
+            #[inline(always)]
+            || {
+                for place in 0..LATENT {
+                    let (mean, unbounded) = (heads[place], heads[LATENT + place]);
+                    let log_variance = unbounded.clamp(-BOUND, BOUND);
+                    mean_flow[place] = divergence_weight.mul_add(mean, flowing[place]);
+                    let drawn = 0.5 * flowing[place] * noise[place] * exp(0.5 * log_variance);
+                    let flow = (0.5 * divergence_weight).mul_add(exp(log_variance) - 1.0, drawn);
+                    // Outside of the bounds nothing changes with it.
+                    log_variance_flow[place] = if (-BOUND..=BOUND).contains(&unbounded) {
+                        flow
+                    } else {
+                        0.0
+                    };
+                }
+            },
+        );
     }
 }
 

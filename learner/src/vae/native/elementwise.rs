@@ -17,20 +17,26 @@ pub(super) fn fill(image: &mut [f32], bias: &[f32]) {
 
 /// Zero for what is below zero. Not a number stays what it is.
 pub(super) fn rectify(isa: Isa, values: &mut [f32]) {
-    isa.vectorised(|| {
-        for value in values {
-            *value = if *value < 0.0 { 0.0 } else { *value };
-        }
-    });
+    isa.vectorised(
+        #[inline(always)]
+        || {
+            for value in values {
+                *value = if *value < 0.0 { 0.0 } else { *value };
+            }
+        },
+    );
 }
 
 /// Zero where `by` is not above zero: the gradient through a ReLU whose output `by` is.
 pub(super) fn gate(isa: Isa, values: &mut [f32], by: &[f32]) {
-    isa.vectorised(|| {
-        for (value, by) in values.iter_mut().zip(by) {
-            *value = if *by > 0.0 { *value } else { 0.0 };
-        }
-    });
+    isa.vectorised(
+        #[inline(always)]
+        || {
+            for (value, by) in values.iter_mut().zip(by) {
+                *value = if *by > 0.0 { *value } else { 0.0 };
+            }
+        },
+    );
 }
 
 /// Adds up the rows of `[rows, sums.len()]`, in order.
@@ -39,26 +45,32 @@ pub(super) fn column_sums(isa: Isa, rows: &[f32], sums: &mut [f32]) {
     if columns < LANES {
         debug_assert_eq!(columns, 1, "a layer has one channel or many");
         let mut lanes = [0.0_f32; LANES];
-        isa.vectorised(|| {
-            for values in rows.chunks_exact(LANES) {
-                for (sum, value) in lanes.iter_mut().zip(values) {
-                    *sum += value;
+        isa.vectorised(
+            #[inline(always)]
+            || {
+                for values in rows.chunks_exact(LANES) {
+                    for (sum, value) in lanes.iter_mut().zip(values) {
+                        *sum += value;
+                    }
                 }
-            }
-        });
+            },
+        );
         sums[0] = lanes.iter().sum();
         return;
     }
     for (block, sums) in sums.chunks_exact_mut(LANES).enumerate() {
         let mut lanes = [0.0_f32; LANES];
-        isa.vectorised(|| {
-            for row in rows.chunks_exact(columns) {
-                let values: &[f32; LANES] = row[block * LANES..][..LANES].try_into().expect("so long");
-                for (sum, value) in lanes.iter_mut().zip(values) {
-                    *sum += value;
+        isa.vectorised(
+            #[inline(always)]
+            || {
+                for row in rows.chunks_exact(columns) {
+                    let values: &[f32; LANES] = row[block * LANES..][..LANES].try_into().expect("so long");
+                    for (sum, value) in lanes.iter_mut().zip(values) {
+                        *sum += value;
+                    }
                 }
-            }
-        });
+            },
+        );
         sums.copy_from_slice(&lanes);
     }
 }
@@ -70,13 +82,16 @@ pub(super) fn squares(isa: Isa, values: &[f32]) -> f64 {
     for stretch in values.chunks(1 << 14) {
         let mut lanes = [0.0_f32; 2 * LANES];
         let mut whole = stretch.chunks_exact(2 * LANES);
-        isa.vectorised(|| {
-            for values in &mut whole {
-                for (sum, value) in lanes.iter_mut().zip(values) {
-                    *sum = value.mul_add(*value, *sum);
+        isa.vectorised(
+            #[inline(always)]
+            || {
+                for values in &mut whole {
+                    for (sum, value) in lanes.iter_mut().zip(values) {
+                        *sum = value.mul_add(*value, *sum);
+                    }
                 }
-            }
-        });
+            },
+        );
         for (sum, value) in lanes.iter_mut().zip(whole.remainder()) {
             *sum = value.mul_add(*value, *sum);
         }
@@ -87,36 +102,45 @@ pub(super) fn squares(isa: Isa, values: &[f32]) -> f64 {
 
 /// Depth as the networks see it, in [0, 1].
 pub(super) fn scale(isa: Isa, bytes: &[u8], pixels: &mut [f32]) {
-    isa.vectorised(|| {
-        for (pixel, byte) in pixels.iter_mut().zip(bytes) {
-            *pixel = f32::from(*byte) * (1.0 / 255.0);
-        }
-    });
+    isa.vectorised(
+        #[inline(always)]
+        || {
+            for (pixel, byte) in pixels.iter_mut().zip(bytes) {
+                *pixel = f32::from(*byte) * (1.0 / 255.0);
+            }
+        },
+    );
 }
 
 /// The sigmoid of each number.
 pub(super) fn sigmoids(isa: Isa, values: &mut [f32]) {
-    isa.vectorised(|| {
-        for value in values {
-            *value = sigmoid(*value);
-        }
-    });
+    isa.vectorised(
+        #[inline(always)]
+        || {
+            for value in values {
+                *value = sigmoid(*value);
+            }
+        },
+    );
 }
 
 /// Replaces the numbers before the last sigmoid by `weight` times half the squared error's gradient with respect to them. Returns the sum of squared
 /// errors between sigmoid and `pixels`.
 pub(super) fn reconstruction_error(isa: Isa, values: &mut [f32], pixels: &[f32], weight: f32) -> f64 {
     let mut lanes = [0.0_f32; LANES];
-    isa.vectorised(|| {
-        for (values, pixels) in values.chunks_exact_mut(LANES).zip(pixels.chunks_exact(LANES)) {
-            for ((value, pixel), sum) in values.iter_mut().zip(pixels).zip(&mut lanes) {
-                let seen = sigmoid(*value);
-                let error = seen - pixel;
-                *sum = error.mul_add(error, *sum);
-                *value = weight * error * (seen * (1.0 - seen));
+    isa.vectorised(
+        #[inline(always)]
+        || {
+            for (values, pixels) in values.chunks_exact_mut(LANES).zip(pixels.chunks_exact(LANES)) {
+                for ((value, pixel), sum) in values.iter_mut().zip(pixels).zip(&mut lanes) {
+                    let seen = sigmoid(*value);
+                    let error = seen - pixel;
+                    *sum = error.mul_add(error, *sum);
+                    *value = weight * error * (seen * (1.0 - seen));
+                }
             }
-        }
-    });
+        },
+    );
     lanes.iter().map(|&lane| f64::from(lane)).sum()
 }
 

@@ -120,11 +120,14 @@ impl Unfold {
                 let into = image[pixel * STRIDE * CHANNELS..][..RUN].chunks_exact_mut(PART);
                 for (part, into) in into.enumerate() {
                     let from = self.column(row * PARTS + part, INPUTS * index + pixel);
-                    isa.vectorised(|| {
-                        for (into, from) in into.iter_mut().zip(from) {
-                            *into += from;
-                        }
-                    });
+                    isa.vectorised(
+                        #[inline(always)]
+                        || {
+                            for (into, from) in into.iter_mut().zip(from) {
+                                *into += from;
+                            }
+                        },
+                    );
                 }
             }
         }
