@@ -155,7 +155,8 @@ impl Unfold {
         }
     }
 
-    /// Second half: the gradient with respect to input pixels, `[pixels, 1024]`, the first of which is number `first`; nought where `gate` is.
+    /// Second half: the gradient with respect to the inputs of some images, `[3 · images, 1024]`, the first of which is number `first` of the batch; nought where
+    /// `gate` is.
     ///
     /// The weights are the left operand, read where they lie, and not packed for it: pixels are few, weights are many.
     pub(super) fn backward(
@@ -176,7 +177,7 @@ impl Unfold {
         seen.resize(pixels * BLOCKS * PART);
         for (pixel, seen) in seen.chunks_exact_mut(BLOCKS * PART).enumerate() {
             for (block, seen) in seen.chunks_exact_mut(PART).enumerate() {
-                seen.copy_from_slice(self.column(block, first + pixel));
+                seen.copy_from_slice(self.column(block, INPUTS * first + pixel));
             }
         }
         panels.pack(Matrix::of_rows(seen, BLOCKS * PART).transposed());
