@@ -10,16 +10,17 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use serde_json::json;
-use skein_protocol::ids::{ActorId, Incarnation};
-use skein_protocol::ticket::ControlRecord;
+use skein_protocol::ids::{ActorId, Incarnation, PolicyVersion};
+use skein_protocol::snapshot::Snapshot;
+use skein_protocol::ticket::{ControlRecord, Ticket};
 use skein_protocol::transition::{RecordKind, TransitionRecord};
 
 use common::{Learner, ticket};
 
 /// Longer than any machine takes for a step.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Flights after which memory is looked at: all buffers are as large as they get.
-const FLIGHTS: u64 = 10;
+/// Flights after which memory is looked at, each with a snapshot of its own: the actor then holds as many as it ever does, and has let go of others.
+const FLIGHTS: u64 = 12;
 const ACTOR: ActorId = ActorId(0);
 
 fn main() {
@@ -29,11 +30,12 @@ fn main() {
         15
     };
     let learner = Learner::open();
-    learner.ports.publish(&learner.snapshot()).expect("there is memory");
+    let mut version = 0;
+    learner.publish(version);
     let mut start_secs = Vec::new();
     let mut resident_bytes = 0;
     for _ in 0..starts {
-        let (secs, bytes) = learner.watch_an_actor();
+        let (secs, bytes) = learner.watch_an_actor(&mut version);
         start_secs.push(secs);
         resident_bytes = resident_bytes.max(bytes);
     }
@@ -44,8 +46,17 @@ fn main() {
 }
 
 impl Learner {
-    /// Starts an actor and lets it fly; seconds until its first record, and bytes resident after some flights.
-    fn watch_an_actor(&self) -> (f64, u64) {
+    fn publish(&self, version: u64) {
+        let snapshot = Snapshot {
+            version: PolicyVersion(version),
+            ..self.snapshot()
+        };
+        self.ports.publish(&snapshot).expect("there is memory");
+    }
+
+    /// Starts an actor and lets it fly, first with the snapshot of this `version`, then with newer ones; seconds until its first record, and the most bytes that
+    /// were resident.
+    fn watch_an_actor(&self, version: &mut u64) -> (f64, u64) {
         let started = Instant::now();
         let actor = Actor::start(self.directory.path());
         let incarnation = self.until(|| {
@@ -54,18 +65,23 @@ impl Learner {
             let status = status.read(self.identity.run)?;
             (status.pid == actor.0.id()).then_some(status.incarnation)
         });
-        self.fly(0, incarnation);
+        self.fly(0, *version, incarnation);
         self.until(|| self.record(incarnation));
         let secs = started.elapsed().as_secs_f64();
         for flight in 1..FLIGHTS {
             self.until(|| Some(self.record(incarnation)?.kind == RecordKind::Closing.code()).filter(|closed| *closed));
-            self.fly(flight, incarnation);
+            *version += 1;
+            self.publish(*version);
+            self.fly(flight, *version, incarnation);
         }
         (secs, actor.resident_bytes())
     }
 
-    fn fly(&self, flight: u64, incarnation: Incarnation) {
-        let ticket = ticket(self.identity.run, flight, 1);
+    fn fly(&self, flight: u64, version: u64, incarnation: Incarnation) {
+        let ticket = Ticket {
+            policy_version: PolicyVersion(version),
+            ..ticket(self.identity.run, flight, 1)
+        };
         self.ports.maintain().expect("the actor's memory can be mapped");
         self.ports
             .send_control(ControlRecord::fly(&ticket, ACTOR, incarnation))
@@ -109,10 +125,10 @@ impl Actor {
         Self(child.expect("the actor is built with its benchmarks"))
     }
 
-    /// Memory that it has to itself or shares, as the kernel counts it.
+    /// The most memory that it had to itself or shared, as the kernel counts it.
     fn resident_bytes(&self) -> u64 {
         let status = fs::read_to_string(format!("/proc/{}/status", self.0.id())).expect("it is there");
-        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
         let kib: Option<u64> = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
         kib.expect("the kernel tells it in KiB") << 10
     }

@@ -69,7 +69,8 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
     let log = directory.actor_log(actor);
     log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
 
-    info!(%actor, pid = std::process::id(), run = %identity.run, "actor started");
+    let isa = skein_kernels::Isa::best();
+    info!(%actor, pid = std::process::id(), run = %identity.run, %isa, "actor started");
     let _presence = Presence::enter(&identity)?;
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config)?));
     // Each learner that is joined gives it an incarnation.

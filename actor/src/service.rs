@@ -195,5 +195,5 @@ fn fly(pilot: &mut Pilot, ticket: &Ticket, network: &Network, line: &mut Learner
         Err(FlightError::Link(error)) => warn!(%error, "flight lost"),
     }
     // Here, so that the times of a flight that is taken in are known too.
-    line.report(ActorState::Serving)
+    line.wake_learner()
 }

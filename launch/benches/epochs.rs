@@ -14,7 +14,7 @@ use skein_protocol::summary::Summary;
 /// Settings of every run: nothing is learned, and hardly anything evaluated.
 const SETTINGS: [&str; 10] = [
     "simulator.vehicle.preset=airsim",
-    "learning.warmup_steps=1000000000",
+    "learning.warmup_steps=100000",
     "vae.train_steps=1",
     "vae.updates_per_step=1e-9",
     "sac.hidden_width=256",

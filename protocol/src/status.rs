@@ -6,7 +6,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use crate::ids::{ActorId, Incarnation, PolicyVersion, RunId};
 use crate::stages::{ACTOR_STAGES, Tally, Times};
 
-/// Sign of life of an actor, sent at its start, after every flight, at every heartbeat and at its end.
+/// Sign of life of an actor, sent at its start, when it finds nothing to fly, at every heartbeat and at its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
 #[type_name("skein.StatusRecord.v2")]

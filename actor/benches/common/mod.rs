@@ -20,6 +20,7 @@ pub(crate) struct Learner {
     pub(crate) config: Config,
     pub(crate) ports: LearnerPorts,
     _seat: LearnerSeat,
+    #[allow(dead_code, reason = "only the benchmark that starts a process says where")]
     pub(crate) directory: tempfile::TempDir,
 }
 

@@ -215,6 +215,11 @@ impl<'a> LearnerLine<'a> {
         Ok(())
     }
 
+    /// Calls the learner to what was sent.
+    pub(super) fn wake_learner(&self) -> Result<(), ServiceError> {
+        self.ports.wake_learner()
+    }
+
     /// Tells how this actor stands. It is no heartbeat: one that was missed is still found missing.
     pub(super) fn report(&self, state: ActorState) -> Result<(), ServiceError> {
         let status = ActorStatus {

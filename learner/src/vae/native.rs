@@ -94,7 +94,8 @@ impl NativeVae {
             kl_weight: section.kl_weight,
             order,
         };
-        vae.parameters.copy_from_slice(&vae.order.from_pytorch(&initial));
+        vae.parameters
+            .copy_from_slice(&vae.order.arrange_from_pytorch(&initial));
         vae
     }
 

@@ -137,6 +137,75 @@ proptest! {
 }
 
 #[test]
+fn a_single_row_is_its_definition_under_panels_that_are_met_at_once() {
+    for (terms, columns) in [(5, 64), (300, 65), (7, 128), (256, 200), (600, 256)] {
+        let (left, right) = (numbers(terms, 1), numbers(terms * columns, 2));
+        let (bias, gate) = (numbers(columns, 3), numbers(columns, 4));
+        let at = |term: usize, column: usize| right[term * columns + column];
+        let rows = [left.clone()];
+        let biased = defined(&rows, at, columns, |column| bias[column]);
+        let rectified: Vec<f32> = biased.iter().map(|value| value.max(0.0)).collect();
+        let plain = defined(&rows, at, columns, |_| 0.0);
+        let gated: Vec<f32> = plain
+            .iter()
+            .zip(&gate)
+            .map(|(value, gate)| if *gate > 0.0 { *value } else { 0.0 })
+            .collect();
+        for isa in available() {
+            let panels = Panels::of(isa, Matrix::of_rows(&right, columns));
+            // One window on an image of one position is a single row, too.
+            let windows = Windows::new([1, terms], 1, [1, terms], 1);
+            for rows in [Rows::Matrix(&left), Rows::Windows(&windows, &left)] {
+                for (start, finish, expected) in [
+                    (Start::Bias(&bias), Finish::Rectified, &rectified),
+                    (Start::Bias(&bias), Finish::Plain, &biased),
+                    (Start::Zero, Finish::Gated(&gate), &gated),
+                ] {
+                    let mut output = vec![f32::NAN; columns];
+                    product(rows, &panels, start, finish, &mut output);
+                    assert_eq!(&output, expected, "{isa}, {terms} terms, {columns} columns");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn spreading_by_rows_of_the_kernel_gives_the_same_bits_with_all_instructions() {
+    let windows = Windows::new([9, 11], 32, [3, 2], 2);
+    let (rows, weights) = (numbers(windows.count() * 20, 1), numbers(20 * windows.window_len(), 2));
+    let spread_with = |isa: Isa| {
+        let panels = Panels::of(isa, Matrix::of_rows(&weights, windows.window_len()));
+        let mut image = vec![0.25; windows.image_len()];
+        spread(&rows, &panels, &windows, &mut Vec::new(), &mut image);
+        image
+    };
+    let columns: Vec<f32> = rows
+        .chunks(20)
+        .flat_map(|row| {
+            let weights = &weights;
+            (0..windows.window_len()).map(move |number| {
+                (0..20).fold(0.0, |sum: f32, term| {
+                    row[term].mul_add(weights[term * 192 + number], sum)
+                })
+            })
+        })
+        .collect();
+    let mut added = vec![0.25; windows.image_len()];
+    windows.add_back(Isa::Portable, &columns, &mut added);
+    let portable = spread_with(Isa::Portable);
+    assert!(
+        portable
+            .iter()
+            .zip(&added)
+            .all(|(found, added)| (found - added).abs() < 1e-4)
+    );
+    for isa in available() {
+        assert_eq!(spread_with(isa), portable, "{isa}");
+    }
+}
+
+#[test]
 fn a_gradient_is_its_definition_for_any_number_of_members() {
     // More terms than are done at once, columns that fill no panel, rows that fill no tile.
     for (terms, rows, columns) in [(600, 7, 70), (1, 13, 4), (300, 64, 33), (0, 3, 5)] {

@@ -111,7 +111,7 @@ impl Order {
     }
 
     /// From PyTorch's order.
-    pub(super) fn from_pytorch(&self, values: &[f32]) -> Vec<f32> {
+    pub(super) fn arrange_from_pytorch(&self, values: &[f32]) -> Vec<f32> {
         let mut arranged = vec![0.0; values.len()];
         self.walk(|here, there| arranged[here] = values[there]);
         arranged
@@ -173,7 +173,7 @@ mod tests {
         let (order, len) = order();
         // Exact in f32 up to 2^24.
         let numbers: Vec<f32> = (0..len).map(|number| number as f32).collect();
-        let arranged = order.from_pytorch(&numbers);
+        let arranged = order.arrange_from_pytorch(&numbers);
         assert_ne!(arranged, numbers);
         let mut back = vec![f32::NAN; len];
         order.to_pytorch(&arranged, &mut back);
@@ -184,7 +184,7 @@ mod tests {
     fn a_weight_lies_where_its_formula_says() {
         let (order, len) = order();
         let numbers: Vec<f32> = (0..len).map(|number| number as f32).collect();
-        let arranged = order.from_pytorch(&numbers);
+        let arranged = order.arrange_from_pytorch(&numbers);
         let first_of = |name: &str| {
             let entries = order.entries.iter();
             entries
