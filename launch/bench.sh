@@ -26,7 +26,13 @@ while (($# > 0)); do
     case $1 in
     --quick) quick=--quick ;;
     --growth) growth=--growth ;;
-    --only) only+=(--only "${2:?--only takes a name}") && shift ;;
+    --only)
+        (($# > 1)) || {
+            echo "bench.sh: --only takes a name: see launch/bench.sh --help" >&2
+            exit 2
+        }
+        only+=(--only "$2") && shift
+        ;;
     *)
         echo "bench.sh: unknown argument \"$1\": see launch/bench.sh --help" >&2
         exit 2

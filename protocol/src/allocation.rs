@@ -8,7 +8,7 @@ use libc::{M_MMAP_THRESHOLD, M_TRIM_THRESHOLD};
 
 /// Bytes from which on a block is the system's again as soon as it is freed, in a learner: more than the largest tensor of an update.
 const LARGE_IN_LEARNER: i32 = 1 << 28;
-/// The same in an actor: less than a snapshot, more than anything else.
+/// The same in an actor: less than a snapshot and its largest layers, more than anything else.
 const LARGE_IN_ACTOR: i32 = 1 << 20;
 
 /// Keeps freed memory for the next who needs it, up to 2 GiB of it. To be called before there are threads.

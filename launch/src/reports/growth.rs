@@ -119,6 +119,6 @@ fn brief(value: f64) -> String {
         value if value >= 1e4 => (value / 1e3, " k"),
         value => (value, ""),
     };
-    let digits = format!("{value:.2}");
+    let digits = format!("{value:.6}");
     format!("{}{suffix}", digits.trim_end_matches('0').trim_end_matches('.'))
 }

@@ -274,7 +274,7 @@ impl Server {
     }
 
     fn wait(&mut self) {
-        let patience = if self.outbox.is_empty() {
+        let patience = if self.outbox.is_empty() && !self.is_wake_due {
             self.heartbeat
         } else {
             RETRY_INTERVAL

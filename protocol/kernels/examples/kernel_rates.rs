@@ -1,4 +1,7 @@
 //! Prints how near the kernels come to what a core can do at most.
+//!
+//! `cargo run --release -p skein-kernels --example kernel_rates`
+
 use skein_kernels::*;
 use std::time::Instant;
 

@@ -11,7 +11,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicPtr, AtomicUsize, Ordering};
 use std::thread::{self, JoinHandle};
 
-/// Looks for work before a member sleeps: some 20 to 50 µs, longer than what lies between two products, shorter than what lies between two epochs.
+/// Looks for work before a member sleeps: some tens of microseconds, as long as the processor pauses between two; longer than what lies between two
+/// products, shorter than what lies between two epochs.
 const LOOKS: usize = 4096;
 
 /// A fixed number of threads, the caller's among them.
