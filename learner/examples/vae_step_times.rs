@@ -1,68 +1,27 @@
-//! Prints how long a VAE step and a SAC update take on this machine, on both engines, and how near that is to what its cores can do.
+//! Prints how long a VAE step takes on this machine, on both engines, where in the network the time goes, and how near that is to what its cores can do.
 //!
-//! `cargo run --release -p skein-learner --example update_times -- [THREADS] [sac|vae]`
+//! `cargo run --release -p skein-learner --example vae_step_times -- [THREADS]`
 
 use std::time::Instant;
 
-use skein_kernels::{Isa, Team, peak_flops};
+use skein_kernels::{Isa, peak_flops};
 use skein_learner::device::use_threads;
 use skein_learner::noise::Noise;
-use skein_learner::sac::{Columns, Sac};
 use skein_learner::vae::{LAYERS, NativeVae, TorchVae, images_from_bytes};
 use skein_protocol::IMAGE_PIXELS;
-use skein_protocol::config::{Engine, Observation, SacSection, VaeSection};
+use skein_protocol::config::VaeSection;
 use tch::Device;
 
 fn main() {
     let threads = std::env::args()
         .nth(1)
         .map_or(1, |argument| argument.parse().expect("THREADS is a number"));
-    let which = std::env::args().nth(2);
-    let wanted = |what: &str| which.as_deref().is_none_or(|which| which == what);
     use_threads(threads);
     let isa = Isa::best();
     let peak = peak_flops(isa) * threads as f64;
     println!("{isa}, peak of {threads} threads: {:.1} GFLOP/s", peak / 1e9);
-    if wanted("sac") {
-        sac(threads, peak);
-    }
-    if wanted("vae") {
-        for batch in [32, 16] {
-            vae(batch, threads, peak);
-        }
-    }
-}
-
-fn sac(threads: usize, peak: f64) {
-    let mut noise = Noise::new(1);
-    let section = SacSection::default();
-    let observation = Observation::LatentVelocity;
-    let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(1.0)).collect() };
-    let rows = section.batch_size;
-    let columns = [rows * observation.len(), rows * 2, rows, rows * observation.len()].map(&mut draw);
-    let [observations, actions, rewards, next_observations] = &columns;
-    let columns = Columns {
-        observations,
-        actions,
-        rewards,
-        next_observations,
-        terminated: &vec![0.0; rows],
-    };
-    let mut team = Team::new(threads);
-    for engine in [Engine::Libtorch, Engine::Native] {
-        let mut sac = Sac::new(&section, observation, 1, engine, Device::Cpu);
-        let mut sac_noise = Noise::new(2);
-        let millis = report(&format!("SAC update, {engine}"), rows, 250, || {
-            sac.update(&mut team, columns, &mut sac_noise)
-                .expect("random rewards are finite");
-        });
-        let operations = update_operations(rows, observation.len(), section.hidden_width);
-        println!(
-            "  {:.1} MFLOP, {:.1} GFLOP/s: {:.1} % of {threads} cores",
-            operations / 1e6,
-            operations / millis / 1e6,
-            100.0 * operations / (millis * 1e-3 * peak)
-        );
+    for batch in [32, 16] {
+        vae(batch, threads, peak);
     }
 }
 
@@ -125,21 +84,6 @@ fn vae(batch: usize, threads: usize, peak: f64) {
     report("VAE encode, libtorch", batch, 20, || {
         let _ = torch.encode(&images);
     });
-}
-
-/// Floating-point operations that the products of one update cannot do without, a multiplication and an addition counted as two; nothing else is counted.
-fn update_operations(rows: usize, observation: usize, width: usize) -> f64 {
-    let (action, estimates) = (2, 2);
-    // Weights: the layers of the policy, and those of the critic.
-    let policy_first = observation * width;
-    let policy_rest = 2 * width * width + width * 2 * action;
-    let critic_first = (observation + action) * width;
-    let critic_rest = width * width + width * estimates;
-    let forward = 2 * (policy_first + policy_rest) + 3 * (critic_first + critic_rest);
-    // Gradients of all weights; what flows back through all layers but the first ones, and through the critic once more, to the action only.
-    let gradients = policy_first + policy_rest + critic_first + critic_rest;
-    let back = policy_rest + 2 * critic_rest + width * action;
-    (2 * rows * (forward + gradients + back)) as f64
 }
 
 /// Runs `work` a few times to warm up, then `repetitions` times; prints and returns the median, which a busy machine disturbs least.
