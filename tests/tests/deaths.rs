@@ -148,12 +148,13 @@ fn a_copy_of_a_runs_directory_is_not_resumed_while_the_run_is_under_way() {
     run.until_flights(30);
     let copies = tempfile::tempdir().unwrap();
     let copy = copies.path().join("copy");
+    // It complains of files that a living run replaces meanwhile, and copies the rest.
     let copied = Command::new("cp")
         .arg("-r")
         .arg(run.directory().root())
         .arg(&copy)
         .status();
-    assert!(copied.unwrap().success());
+    assert!(copied.is_ok(), "{copied:?}");
     // Between two lives of the learner, too.
     run.process("skein-learner").signal(Signal::KILL);
     let refused = run_program("skein", &["run", "--resume", copy.to_str().unwrap(), "--actors", "1"]);
