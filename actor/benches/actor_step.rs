@@ -17,7 +17,7 @@ use rand_pcg::Pcg64Mcg;
 use skein_actor::agent::Agent;
 use skein_actor::courses::{Courses, Simulators};
 use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
-use skein_actor::inference::{Network, Scratch};
+use skein_inference::{Network, Scratch};
 use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
@@ -35,7 +35,11 @@ fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     let transport = Transport::open();
     let config = &transport.learner.config;
-    let network = Network::new(&transport.learner.snapshot(), &SnapshotLayout::of(config));
+    let network = Network::new(
+        &transport.learner.snapshot(),
+        &SnapshotLayout::of(config),
+        config.vae.encoder_precision,
+    );
     let courses = Arc::new(Courses::of_run(config).expect("shipped courses can be flown"));
     let tickets = [ticket(transport.learner.identity.run, 1, 1)];
     let mut pilot = Pilot::new(

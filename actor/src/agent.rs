@@ -8,7 +8,7 @@ use skein_protocol::ticket::Exploration;
 use skein_protocol::transition::TransitionRecord;
 use skein_simulator::simulator::Simulator;
 
-use crate::inference::{Network, Scratch};
+use skein_inference::{Network, Scratch};
 
 /// Working memory of one thread that looks and acts.
 #[derive(Debug)]

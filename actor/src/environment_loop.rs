@@ -21,7 +21,7 @@ use skein_simulator::simulator::{self, LevelUp, SimulationError, Simulator, Step
 
 use crate::agent::Agent;
 use crate::courses::{NoCourse, Simulators};
-use crate::inference::Network;
+use skein_inference::Network;
 
 /// Flies tickets.
 pub struct Pilot {

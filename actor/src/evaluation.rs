@@ -21,7 +21,7 @@ use skein_protocol::transition::TransitionRecord;
 use crate::agent::Agent;
 use crate::courses::{Courses, EvaluationCourse, Simulators};
 use crate::environment_loop::{Directive, FlightError, FlightFault, Pilot, RecordLink};
-use crate::inference::Network;
+use skein_inference::Network;
 
 /// Most threads of an evaluation: more cores than any machine we know of has, few enough for every system's limits.
 pub const MAX_THREADS: usize = 512;
@@ -130,7 +130,11 @@ impl Evaluation<'_> {
 
     /// Every flight's end, in course and flight order.
     fn fly_all(&self) -> Result<Vec<Result<EvaluatedFlight, EvaluationError>>, EvaluationError> {
-        let network = Network::new(self.snapshot, &SnapshotLayout::of(self.config));
+        let network = Network::new(
+            self.snapshot,
+            &SnapshotLayout::of(self.config),
+            self.config.vae.encoder_precision,
+        );
         let next = AtomicU64::new(0);
         let threads = self.threads();
         let mut flown: Vec<_> = std::thread::scope(|scope| {

@@ -23,7 +23,7 @@ use tracing::{debug, info, info_span, warn};
 
 use self::line::LearnerLine;
 use crate::environment_loop::{FlightError, Pilot};
-use crate::inference::Network;
+use skein_inference::Network;
 
 /// Longest time between two looks for a learner, and between two looks whether to end meanwhile.
 const SEEK_INTERVAL: Duration = Duration::from_millis(100);

@@ -3,15 +3,17 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
+use skein_protocol::config::{Config, Precision};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 
-use crate::inference::Network;
+use skein_inference::Network;
 
 /// The newest snapshots.
 #[derive(Debug)]
 pub struct Weights {
     layout: SnapshotLayout,
+    precision: Precision,
     most: usize,
     /// In order of arrival, the newest last.
     held: VecDeque<Held>,
@@ -36,18 +38,20 @@ impl Held {
 
 impl Weights {
     /// No snapshot yet, and never more than the `most` that came last.
-    pub fn new(layout: SnapshotLayout, most: usize) -> Self {
+    fn new(layout: SnapshotLayout, precision: Precision, most: usize) -> Self {
         Self {
             layout,
+            precision,
             most,
             held: VecDeque::with_capacity(most),
         }
     }
 
-    /// For a run with `policy_lag`. Tickets name the newest snapshot, an evaluation's too, and with policy lag 1 the one before it: no other is published
+    /// For a run. Tickets name the newest snapshot, an evaluation's too, and with policy lag 1 the one before it: no other is published
     /// before their flights are committed. One more is there for what comes before its ticket.
-    pub fn for_lag(layout: SnapshotLayout, policy_lag: u64) -> Self {
-        Self::new(layout, policy_lag as usize + 2)
+    pub fn of_run(config: &Config) -> Self {
+        let most = config.learning.policy_lag as usize + 2;
+        Self::new(SnapshotLayout::of(config), config.vae.encoder_precision, most)
     }
 
     /// Takes in a snapshot; the one that came first goes when there are too many.
@@ -73,7 +77,7 @@ impl Weights {
     pub fn network(&mut self, version: PolicyVersion) -> Option<Arc<Network>> {
         let held = self.held.iter_mut().find(|held| held.version() == version)?;
         if let Held::Raw(snapshot) = held {
-            *held = Held::Network(Arc::new(Network::new(snapshot, &self.layout)));
+            *held = Held::Network(Arc::new(Network::new(snapshot, &self.layout, self.precision)));
         }
         match held {
             Held::Network(network) => Some(Arc::clone(network)),
@@ -89,7 +93,7 @@ mod tests {
     fn weights(versions: impl IntoIterator<Item = u64>) -> Weights {
         let layout = SnapshotLayout::new(32, 1);
         let values = layout.values();
-        let mut weights = Weights::new(layout, 4);
+        let mut weights = Weights::new(layout, Precision::F32, 4);
         for version in versions {
             weights.insert(Snapshot {
                 version: PolicyVersion(version),

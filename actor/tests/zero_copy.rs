@@ -7,8 +7,8 @@ use std::sync::Arc;
 use skein_actor::agent::Agent;
 use skein_actor::courses::{Courses, Simulators};
 use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
-use skein_actor::inference::Network;
-use skein_protocol::config::Config;
+use skein_inference::Network;
+use skein_protocol::config::{Config, Precision};
 use skein_protocol::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion};
 use skein_protocol::run::{LearnerSeat, RunDirectory};
 use skein_protocol::services::{ActorPorts, LearnerPorts, LoanedTransition, ServiceError};
@@ -113,7 +113,7 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
         loaned: Vec::new(),
         sent: Vec::new(),
     };
-    let flown = pilot.fly(&ticket, &Network::new(&snapshot, &layout), &mut watched);
+    let flown = pilot.fly(&ticket, &Network::new(&snapshot, &layout, Precision::F32), &mut watched);
 
     let mut received = Vec::new();
     while let Some(record) = learner.receive_transition().unwrap() {

@@ -5,6 +5,7 @@
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
+use skein_inference::{Encoder, encoder};
 use skein_kernels::{Isa, Team};
 use skein_protocol::config::{Config, Engine};
 use skein_protocol::ids::{Epoch, PolicyVersion};
@@ -168,7 +169,8 @@ impl Trainer {
         if self.vae_is_frozen()
             && let Some(depth) = flight.depth.take()
         {
-            for (observation, latent) in flight.observations.iter_mut().zip(self.vae.encode(&depth)) {
+            let codes = self.encoder().encode_all(&mut self.team, &depth);
+            for (observation, latent) in flight.observations.iter_mut().zip(codes) {
                 observation.latent = latent;
             }
         }
@@ -214,10 +216,17 @@ impl Trainer {
 
     fn freeze_vae(&mut self) {
         tracing::info!(steps = self.steps, vae_updates = self.vae.updates(), "VAE frozen");
-        let Self { vae, replay, .. } = self;
+        let encoder = self.encoder();
+        let Self { team, replay, .. } = self;
         let frozen: Result<(), std::convert::Infallible> =
-            replay.freeze_latents(ENCODE_CHUNK, |images| Ok(vae.encode(images)));
+            replay.freeze_latents(ENCODE_CHUNK, |images| Ok(encoder.encode_all(team, images)));
         let Ok(()) = frozen;
+    }
+
+    /// The encoder as actors have it, so that codes made here are those that actors send, to the last bit.
+    fn encoder(&self) -> Encoder {
+        let snapshot = self.snapshot(PolicyVersion(0));
+        encoder(&snapshot, &self.layout, self.config.vae.encoder_precision)
     }
 
     /// Does the SAC updates that the steps flown since the warm-up ask for; returns the means of their metrics. `after_each` may do something

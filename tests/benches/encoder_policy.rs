@@ -3,11 +3,11 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput};
-use skein_actor::inference::{Network, Scratch};
+use skein_inference::{Network, Scratch};
 use skein_learner::device::use_threads;
 use skein_learner::sac::TorchSac;
 use skein_learner::vae::{TorchVae, images_from_bytes};
-use skein_protocol::config::{Config, Observation};
+use skein_protocol::config::{Config, Observation, Precision};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout};
 use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LATENT};
@@ -29,7 +29,7 @@ fn main() {
     vae.publish(&mut values[layout.encoder()]);
     sac.publish(&mut values[layout.policy()]);
     let version = PolicyVersion(0);
-    let network = Network::new(&Snapshot { version, values }, &layout);
+    let snapshot = Snapshot { version, values };
 
     let image: [u8; IMAGE_PIXELS] = std::array::from_fn(|pixel| (pixel * 7) as u8);
     let mut observation = vec![0.0; OBSERVATION.len()];
@@ -39,13 +39,16 @@ fn main() {
     };
     let mut group = criterion.benchmark_group("encoder_policy");
     group.throughput(Throughput::Elements(operations(config.sac.hidden_width)));
-    group.bench_function("native", |bencher| {
-        let mut scratch = Scratch::default();
-        bencher.iter(|| {
-            let latent = network.encode(black_box(&image), &mut scratch);
-            black_box(network.distribution(&observe(latent), &mut scratch).mode())
+    for (name, precision) in [("native", Precision::F32), ("native-bf16", Precision::Bf16)] {
+        let network = Network::new(&snapshot, &layout, precision);
+        group.bench_function(name, |bencher| {
+            let mut scratch = Scratch::default();
+            bencher.iter(|| {
+                let latent = network.encode(black_box(&image), &mut scratch);
+                black_box(network.distribution(&observe(latent), &mut scratch).mode())
+            });
         });
-    });
+    }
     group.bench_function("libtorch", |bencher| {
         bencher.iter(|| {
             let mut latent = [0.0; LATENT];

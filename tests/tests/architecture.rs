@@ -66,11 +66,20 @@ fn every_package_keeps_to_its_side_of_the_fence() {
         ("skein-protocol", &[], [torch, physics].concat()),
         (
             "skein-actor",
-            &["skein-kernels", "skein-protocol", "skein-simulator"],
+            &["skein-inference", "skein-kernels", "skein-protocol", "skein-simulator"],
             torch.to_vec(),
         ),
+        (
+            "skein-inference",
+            &["skein-kernels", "skein-protocol"],
+            [torch, physics].concat(),
+        ),
         ("skein-kernels", &[], [torch, physics].concat()),
-        ("skein-learner", &["skein-kernels", "skein-protocol"], physics.to_vec()),
+        (
+            "skein-learner",
+            &["skein-inference", "skein-kernels", "skein-protocol"],
+            physics.to_vec(),
+        ),
         (
             "skein-launch",
             &["skein-kernels", "skein-protocol", "skein-simulator"],

@@ -4,7 +4,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use skein_actor::inference::{Network, Scratch};
+use skein_inference::{Network, Scratch};
 use skein_learner::networks::{Layout, Parameters, Policy};
 use skein_learner::sac::Sac;
 use skein_learner::vae::{NativeVae, TorchVae as Vae, images_from_bytes};
@@ -42,6 +42,7 @@ fn network(config: &Config, vae: &Vae, policy: impl Fn(&mut [f32])) -> Network {
             values,
         },
         &layout,
+        config.vae.encoder_precision,
     )
 }
 

@@ -2,15 +2,15 @@ use std::sync::Arc;
 
 use bytemuck::Zeroable;
 use skein_protocol::IMAGE_PIXELS;
-use skein_protocol::config::Observation;
+use skein_protocol::config::{Observation, Precision};
 use skein_protocol::ids::{Attempt, FlightId, RunId};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::ticket::{CourseChoice, Exploration};
 
 use super::*;
 use crate::courses::Courses;
-use crate::inference::Scratch;
 use crate::testing::{config, random_snapshot};
+use skein_inference::Scratch;
 
 const ACTOR: ActorId = ActorId(3);
 const LIFE: Incarnation = Incarnation(8);
@@ -80,7 +80,7 @@ fn network(change: impl Fn(&mut [f32])) -> Network {
     let layout = SnapshotLayout::new(Observation::LatentVelocityAction.len(), 16);
     let mut snapshot = random_snapshot(&layout, NETWORK.0);
     change(&mut snapshot.values[layout.policy()]);
-    Network::new(&snapshot, &layout)
+    Network::new(&snapshot, &layout, Precision::F32)
 }
 
 fn flown(pilot: &mut Pilot, ticket: &Ticket) -> (FlightScore, Tape) {

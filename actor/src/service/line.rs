@@ -9,7 +9,6 @@ use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::run::RunIdentity;
 use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
-use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, Ticket};
@@ -18,8 +17,8 @@ use tracing::{debug, warn};
 
 use super::{Ending, Parting, Service};
 use crate::environment_loop::{Directive, RecordLink};
-use crate::inference::Network;
 use crate::weights::Weights;
+use skein_inference::Network;
 
 /// The actor's end of the line to the learner: hears tickets, snapshots and the stop, sends records and signs of life.
 pub(super) struct LearnerLine<'a> {
@@ -65,7 +64,7 @@ impl<'a> LearnerLine<'a> {
             identity: service.identity,
             actor: service.actor,
             incarnation: service.incarnation,
-            weights: Weights::for_lag(SnapshotLayout::of(service.config), service.config.learning.policy_lag),
+            weights: Weights::of_run(service.config),
             tickets: VecDeque::new(),
             limits: Limits {
                 heartbeat: transport.heartbeat(),

@@ -1,10 +1,13 @@
 //! A trainer restored from a checkpoint goes on bit for bit.
 
+use skein_inference::{Network, Scratch};
+use skein_protocol::config::Precision;
 use skein_protocol::transition::Outcome;
+use skein_protocol::{IMAGE_PIXELS, LATENT};
 
 use super::*;
 use crate::checkpoint::{CheckpointState, CheckpointStore};
-use crate::flight::samples::{flight, with_images};
+use crate::flight::samples::{flight, shade, with_images};
 
 /// Flights of an epoch, each of 10 steps.
 const FLIGHTS: u64 = 2;
@@ -131,4 +134,32 @@ fn a_state_that_lacks_a_tensor_or_miscounts_is_refused_by_name() {
     );
     let images = refusal(|state| _ = state.replay.images.as_mut().unwrap().pop());
     assert!(images.contains("depth images"), "{images}");
+}
+
+#[test]
+fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
+    for (engine, precision) in [(Engine::Native, Precision::Bf16), (Engine::Libtorch, Precision::F32)] {
+        let mut config = config();
+        (config.run.engine, config.vae.encoder_precision) = (Some(engine), precision);
+        let mut trainer = Trainer::new(&config).unwrap();
+        // The last epoch comes in late: its images were ordered before.
+        (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+        assert_eq!(trainer.keep(), Keep::Latents, "the VAE was never frozen");
+        let network = Network::new(&trainer.snapshot(PolicyVersion(4)), &trainer.layout, precision);
+        let code = |(flight, step)| network.encode(&[shade(flight, step); IMAGE_PIXELS], &mut Scratch::default());
+        let codes: Vec<_> = (0..4 * FLIGHTS)
+            .flat_map(|flight| (0..=STEPS / FLIGHTS as usize).map(move |step| (flight, step)))
+            .map(code)
+            .collect();
+        let mut drawn = Minibatch::default();
+        let mut rng = trainer.rng(Purpose::SacBatches, Epoch(9));
+        trainer.replay().sample(&mut rng, 200, &mut drawn);
+        let rows = drawn.observations.chunks(drawn.observations.len() / 200);
+        for observation in rows {
+            assert!(
+                codes.iter().any(|code| code == &observation[..LATENT]),
+                "{engine}, {precision}"
+            );
+        }
+    }
 }

@@ -7,7 +7,6 @@ mod native;
 mod torch;
 
 use skein_protocol::config::{Engine, RunSection, VaeSection};
-use skein_protocol::{IMAGE_PIXELS, LATENT};
 use tch::{Device, Tensor};
 
 use crate::error::UpdateError;
@@ -55,18 +54,6 @@ impl Vae {
         match self {
             Self::Native(vae) => vae.update(images, noise),
             Self::Libtorch(vae) => vae.update(&images_from_bytes(images), noise),
-        }
-    }
-
-    /// The code's mean for each image. `images`: `[n, 72, 128]`, any number of them.
-    pub fn encode(&mut self, images: &[u8]) -> Vec<[f32; LATENT]> {
-        match self {
-            Self::Native(vae) => vae.encode(images),
-            Self::Libtorch(vae) => {
-                let mut codes = vec![[0.0; LATENT]; images.len() / IMAGE_PIXELS];
-                copy(&vae.encode(&images_from_bytes(images)), codes.as_flattened_mut());
-                codes
-            }
         }
     }
 

@@ -1,6 +1,7 @@
 //! The native engine against libtorch's automatic gradients, and against itself on other instructions and threads.
 
 use skein_kernels::Isa;
+use skein_protocol::{IMAGE_PIXELS, LATENT};
 
 use super::*;
 
@@ -253,18 +254,11 @@ fn engines_agree_behind_their_common_face() {
         let metrics = vae.update(&images, &mut Noise::new(1)).unwrap();
         let mut published = vec![0.0; vae.published_len()];
         vae.publish(&mut published);
-        (
-            metrics,
-            vae.encode(&images),
-            vae.reconstruct(&images),
-            published,
-            vae.updates(),
-        )
+        (metrics, vae.reconstruct(&images), published, vae.updates())
     };
     let (native, torch) = (of(Engine::Native), of(Engine::Libtorch));
     assert!((native.0.loss - torch.0.loss).abs() < 1e-5 * torch.0.loss);
-    assert!(relative_distance(native.1.as_flattened(), torch.1.as_flattened()) < 1e-2);
+    assert!(relative_distance(&native.1, &torch.1) < 1e-3);
     assert!(relative_distance(&native.2, &torch.2) < 1e-3);
-    assert!(relative_distance(&native.3, &torch.3) < 1e-3);
-    assert_eq!((native.4, torch.4), (1, 1));
+    assert_eq!((native.3, torch.3), (1, 1));
 }

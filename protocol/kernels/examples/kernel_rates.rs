@@ -89,6 +89,23 @@ fn main() {
             flops,
             best(|| product(Rows::Windows(&w, &img), &panels, Start::Zero, Finish::Rectified, &mut c)),
         );
+        if ch % 2 == 0 {
+            let w = Windows::new(size, ch / 2, kernel, 2);
+            let half = |numbers: &[f32]| {
+                let mut pairs = Vec::new();
+                Pair::all_of(isa, numbers, &mut pairs);
+                pairs
+            };
+            let (img, b) = (half(&img), half(&b));
+            let panels = Panels::of(isa, Matrix::of_rows(&b, w.window_len()).transposed());
+            report(
+                "  in bfloat16",
+                flops,
+                best(|| product(Rows::Windows(&w, &img), &panels, Start::Zero, Finish::Rectified, &mut c)),
+            );
+            let mut pairs = Vec::new();
+            report("  to pairs", flops, best(|| Pair::all_of(isa, &c, &mut pairs)));
+        }
         let mut team = Team::new(1);
         let mut g = vec![0.0; b.len()];
         let imgs = vec![0.5; 8 * img.len()];

@@ -122,8 +122,8 @@ struct Job<'a> {
 /// Memory of one thread, kept from product to product.
 #[derive(Default)]
 struct Scratch {
-    left: Aligned,
-    right: Aligned,
+    left: Aligned<f32>,
+    right: Aligned<f32>,
     /// Where each term's row of the right operand begins.
     starts: Vec<usize>,
 }
@@ -166,7 +166,7 @@ unsafe fn do_block(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, be
     unsafe {
         match job.isa {
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx512 => avx512(job, terms, scratch, begin),
+            Isa::Avx512 | Isa::Avx512Bf16 => avx512(job, terms, scratch, begin),
             #[cfg(target_arch = "x86_64")]
             Isa::Avx2 => avx2(job, terms, scratch, begin),
             _ => block::<Scalar8>(job, terms, scratch, begin),
@@ -189,7 +189,7 @@ unsafe fn avx2(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin:
 }
 
 #[inline(always)]
-unsafe fn block<S: Simd>(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
+unsafe fn block<S: Simd<Term = f32>>(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
     let (count, rows) = (terms.len(), job.left.columns());
     let apart = count * S::ROWS + PADDING;
     let left = scratch.left.of_len(rows.div_ceil(S::ROWS) * apart);
@@ -231,7 +231,7 @@ struct Tile {
 }
 
 #[inline(always)]
-unsafe fn tile_of<S: Simd, const M: usize>(tile: Tile) {
+unsafe fn tile_of<S: Simd<Term = f32>, const M: usize>(tile: Tile) {
     // SAFETY: as the caller says.
     unsafe {
         panel_tile::<S, _, M>(

@@ -15,11 +15,13 @@ pub enum Isa {
     Avx2,
     /// 512 bits: AVX-512 F, VL, BW and DQ.
     Avx512,
+    /// The same, and products of pairs of bfloat16.
+    Avx512Bf16,
 }
 
 impl Isa {
     /// All of them, the widest last.
-    pub const ALL: [Self; 3] = [Self::Portable, Self::Avx2, Self::Avx512];
+    pub const ALL: [Self; 4] = [Self::Portable, Self::Avx2, Self::Avx512, Self::Avx512Bf16];
 
     /// The widest that this machine has.
     pub fn best() -> Self {
@@ -44,6 +46,8 @@ impl Isa {
                     && is_x86_feature_detected!("avx512bw")
                     && is_x86_feature_detected!("avx512dq")
             }
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512Bf16 => Self::Avx512.is_available() && is_x86_feature_detected!("avx512bf16"),
             #[cfg(not(target_arch = "x86_64"))]
             _ => false,
         }
@@ -53,7 +57,7 @@ impl Isa {
     pub(crate) fn panel_width(self) -> usize {
         match self {
             Self::Portable | Self::Avx2 => 16,
-            Self::Avx512 => 32,
+            Self::Avx512 | Self::Avx512Bf16 => 32,
         }
     }
 }
@@ -64,6 +68,7 @@ impl fmt::Display for Isa {
             Self::Portable => "portable",
             Self::Avx2 => "AVX2",
             Self::Avx512 => "AVX-512",
+            Self::Avx512Bf16 => "AVX-512 with BF16",
         })
     }
 }
@@ -71,19 +76,23 @@ impl fmt::Display for Isa {
 /// Registers of one kind, as the inner loops need them.
 ///
 /// # Safety
-/// Every function asks for the processor to have the instructions, and `load` and `store` for [`Simd::LANES`] numbers at the pointer.
-pub(crate) trait Simd {
-    /// A register.
+/// Every function asks for the processor to have the instructions, and those with a pointer for [`Simd::LANES`] numbers or terms there.
+pub trait Simd {
+    /// What is multiplied: a number, or a pair of halves.
+    type Term: Copy;
+    /// A register, of numbers or of terms.
     type Vector: Copy;
     /// Numbers in it.
     const LANES: usize;
     /// Rows of the largest tile.
     const ROWS: usize;
 
-    unsafe fn splat(value: f32) -> Self::Vector;
+    unsafe fn zero() -> Self::Vector;
+    unsafe fn splat(term: Self::Term) -> Self::Vector;
+    unsafe fn load_terms(from: *const Self::Term) -> Self::Vector;
     unsafe fn load(from: *const f32) -> Self::Vector;
     unsafe fn store(to: *mut f32, vector: Self::Vector);
-    /// a · b + c, rounded once.
+    /// a · b + c for terms a and b: rounded once if they are numbers, after each product if they are pairs.
     unsafe fn fused(a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
     /// Zero for what is below zero. Not a number stays what it is.
     unsafe fn rectified(vector: Self::Vector) -> Self::Vector;
@@ -92,16 +101,28 @@ pub(crate) trait Simd {
 }
 
 /// Eight numbers without any instruction of their own.
-pub(crate) struct Scalar8;
+pub struct Scalar8;
 
 impl Simd for Scalar8 {
+    type Term = f32;
     type Vector = [f32; 8];
     const LANES: usize = 8;
     const ROWS: usize = 4;
 
     #[inline(always)]
-    unsafe fn splat(value: f32) -> Self::Vector {
-        [value; 8]
+    unsafe fn zero() -> Self::Vector {
+        [0.0; 8]
+    }
+
+    #[inline(always)]
+    unsafe fn splat(term: f32) -> Self::Vector {
+        [term; 8]
+    }
+
+    #[inline(always)]
+    unsafe fn load_terms(from: *const f32) -> Self::Vector {
+        // SAFETY: as for `load`.
+        unsafe { Self::load(from) }
     }
 
     #[inline(always)]
@@ -139,19 +160,33 @@ pub(crate) mod x86 {
     use std::arch::x86_64::*;
 
     use super::Simd;
+    use crate::pair::{Halves, Pair};
 
-    pub(crate) struct Avx2;
+    pub struct Avx2;
 
     // 6 x 2 accumulators, 2 registers for the panel's row, 1 for a broadcast: 15 of 16.
     impl Simd for Avx2 {
+        type Term = f32;
         type Vector = __m256;
         const LANES: usize = 8;
         const ROWS: usize = 6;
 
         #[inline(always)]
-        unsafe fn splat(value: f32) -> __m256 {
+        unsafe fn zero() -> __m256 {
             // SAFETY: the processor has the instruction, the caller says.
-            unsafe { _mm256_set1_ps(value) }
+            unsafe { _mm256_setzero_ps() }
+        }
+
+        #[inline(always)]
+        unsafe fn splat(term: f32) -> __m256 {
+            // SAFETY: as for `zero`.
+            unsafe { _mm256_set1_ps(term) }
+        }
+
+        #[inline(always)]
+        unsafe fn load_terms(from: *const f32) -> __m256 {
+            // SAFETY: as for `load`.
+            unsafe { Self::load(from) }
         }
 
         #[inline(always)]
@@ -185,18 +220,31 @@ pub(crate) mod x86 {
         }
     }
 
-    pub(crate) struct Avx512;
+    pub struct Avx512;
 
     // 12 x 2 accumulators, 2 registers for the panel's row; broadcasts are operands in memory: 26 of 32.
     impl Simd for Avx512 {
+        type Term = f32;
         type Vector = __m512;
         const LANES: usize = 16;
         const ROWS: usize = 12;
 
         #[inline(always)]
-        unsafe fn splat(value: f32) -> __m512 {
+        unsafe fn zero() -> __m512 {
             // SAFETY: the processor has the instruction, the caller says.
-            unsafe { _mm512_set1_ps(value) }
+            unsafe { _mm512_setzero_ps() }
+        }
+
+        #[inline(always)]
+        unsafe fn splat(term: f32) -> __m512 {
+            // SAFETY: as for `zero`.
+            unsafe { _mm512_set1_ps(term) }
+        }
+
+        #[inline(always)]
+        unsafe fn load_terms(from: *const f32) -> __m512 {
+            // SAFETY: as for `load`.
+            unsafe { Self::load(from) }
         }
 
         #[inline(always)]
@@ -227,6 +275,91 @@ pub(crate) mod x86 {
         unsafe fn gated(vector: __m512, by: __m512) -> __m512 {
             // SAFETY: as for `splat`.
             unsafe { _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(by, _mm512_setzero_ps()), vector) }
+        }
+    }
+
+    impl Halves for Avx2 {
+        #[inline(always)]
+        unsafe fn halves(pairs: __m256) -> [__m256; 2] {
+            // SAFETY: as for `splat`.
+            unsafe {
+                let bits = _mm256_castps_si256(pairs);
+                let second = _mm256_and_si256(bits, _mm256_set1_epi32(0xffff_0000_u32 as i32));
+                [_mm256_slli_epi32::<16>(bits), second].map(|half| _mm256_castsi256_ps(half))
+            }
+        }
+    }
+
+    impl Halves for Avx512 {
+        #[inline(always)]
+        unsafe fn halves(pairs: __m512) -> [__m512; 2] {
+            // SAFETY: as for `splat`.
+            unsafe {
+                let bits = _mm512_castps_si512(pairs);
+                let second = _mm512_and_si512(bits, _mm512_set1_epi32(0xffff_0000_u32 as i32));
+                [_mm512_slli_epi32::<16>(bits), second].map(|half| _mm512_castsi512_ps(half))
+            }
+        }
+    }
+
+    /// [`Avx512`] for pairs, by the instruction made for them.
+    pub struct Avx512Bf16;
+
+    impl Simd for Avx512Bf16 {
+        type Term = Pair;
+        type Vector = __m512;
+        const LANES: usize = Avx512::LANES;
+        const ROWS: usize = Avx512::ROWS;
+
+        #[inline(always)]
+        unsafe fn zero() -> __m512 {
+            // SAFETY: the caller vouches for the instructions, here and below.
+            unsafe { Avx512::zero() }
+        }
+
+        #[inline(always)]
+        unsafe fn splat(term: Pair) -> __m512 {
+            // SAFETY: as for `zero`.
+            unsafe { Avx512::splat(term.as_bits_of_a_number()) }
+        }
+
+        #[inline(always)]
+        unsafe fn load_terms(from: *const Pair) -> __m512 {
+            // SAFETY: the caller vouches for instruction and memory, here and below.
+            unsafe { Avx512::load(from.cast()) }
+        }
+
+        #[inline(always)]
+        unsafe fn load(from: *const f32) -> __m512 {
+            // SAFETY: as for `load_terms`.
+            unsafe { Avx512::load(from) }
+        }
+
+        #[inline(always)]
+        unsafe fn store(to: *mut f32, vector: __m512) {
+            // SAFETY: as for `load_terms`.
+            unsafe { Avx512::store(to, vector) }
+        }
+
+        #[inline(always)]
+        unsafe fn fused(a: __m512, b: __m512, c: __m512) -> __m512 {
+            // SAFETY: as for `zero`; the vectors are the same 512 bits under another name.
+            unsafe {
+                let pairs = |bits: __m512| std::mem::transmute::<__m512, __m512bh>(bits);
+                _mm512_dpbf16_ps(c, pairs(a), pairs(b))
+            }
+        }
+
+        #[inline(always)]
+        unsafe fn rectified(vector: __m512) -> __m512 {
+            // SAFETY: as for `zero`.
+            unsafe { Avx512::rectified(vector) }
+        }
+
+        #[inline(always)]
+        unsafe fn gated(vector: __m512, by: __m512) -> __m512 {
+            // SAFETY: as for `zero`.
+            unsafe { Avx512::gated(vector, by) }
         }
     }
 

@@ -53,7 +53,7 @@ impl Isa {
         match self {
             // SAFETY: the instructions are there, as just asked.
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512 => unsafe { avx512(work) },
+            Self::Avx512 | Self::Avx512Bf16 => unsafe { avx512(work) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Self::Avx2 => unsafe { avx2(work) },

@@ -6,23 +6,24 @@
 use std::ops::Range;
 
 use crate::isa::Isa;
+use crate::pair::Term;
 
 /// A matrix seen in either direction: element (row, column) lies at `row · row_stride + column · column_stride`.
 #[derive(Debug, Clone, Copy)]
-pub struct Matrix<'a> {
-    data: &'a [f32],
+pub struct Matrix<'a, T = f32> {
+    data: &'a [T],
     rows: usize,
     columns: usize,
     row_stride: usize,
     column_stride: usize,
 }
 
-impl<'a> Matrix<'a> {
+impl<'a, T> Matrix<'a, T> {
     /// `data` as rows of `columns` numbers.
     ///
     /// # Panics
     /// When there are no whole rows.
-    pub fn of_rows(data: &'a [f32], columns: usize) -> Self {
+    pub fn of_rows(data: &'a [T], columns: usize) -> Self {
         assert!(
             columns > 0 && data.len().is_multiple_of(columns),
             "{} numbers are no rows of {columns}",
@@ -52,7 +53,7 @@ impl<'a> Matrix<'a> {
     ///
     /// # Panics
     /// When they do not, or there is no such row.
-    pub(crate) fn row(&self, row: usize) -> &'a [f32] {
+    pub(crate) fn row(&self, row: usize) -> &'a [T] {
         assert_eq!(self.column_stride, 1, "a matrix seen along its rows");
         &self.data[row * self.row_stride..][..self.columns]
     }
@@ -74,37 +75,37 @@ const LINE: usize = 16;
 /// Numbers that begin where a cache line does.
 #[derive(Debug, Clone, Copy)]
 #[repr(C, align(64))]
-struct Line([f32; LINE]);
+struct Line<T>([T; LINE]);
 
-/// Memory for numbers, from the beginning of a cache line; kept from use to use.
+/// Memory for numbers or pairs, from the beginning of a cache line; kept from use to use.
 #[derive(Debug, Default)]
-pub(crate) struct Aligned {
-    lines: Vec<Line>,
+pub(crate) struct Aligned<T> {
+    lines: Vec<Line<T>>,
 }
 
-impl Aligned {
+impl<T: Term> Aligned<T> {
     /// `len` numbers, whatever they are.
-    pub(crate) fn of_len(&mut self, len: usize) -> &mut [f32] {
+    pub(crate) fn of_len(&mut self, len: usize) -> &mut [T] {
         let lines = len.div_ceil(LINE);
         if self.lines.len() < lines {
-            self.lines.resize(lines, Line([0.0; LINE]));
+            self.lines.resize(lines, Line([T::default(); LINE]));
         }
         // SAFETY: a line is sixteen numbers and nothing else, so `lines` of them are at least `len` numbers side by side, borrowed from `self`.
         unsafe { std::slice::from_raw_parts_mut(self.lines.as_mut_ptr().cast(), len) }
     }
 
-    fn as_ptr(&self) -> *const f32 {
+    fn as_ptr(&self) -> *const T {
         self.lines.as_ptr().cast()
     }
 }
 
 /// A packed right operand: [`Panels::terms`] rows, [`Panels::columns`] columns.
 #[derive(Debug)]
-pub struct Panels {
+pub struct Panels<T = f32> {
     isa: Isa,
     terms: usize,
     columns: usize,
-    data: Aligned,
+    data: Aligned<T>,
 }
 
 /// One panel.
@@ -118,7 +119,7 @@ pub(crate) struct Panel {
     pub(crate) width: usize,
 }
 
-impl Panels {
+impl<T: Term> Panels<T> {
     /// Nothing yet, for products with these instructions.
     pub fn new(isa: Isa) -> Self {
         Self {
@@ -130,7 +131,7 @@ impl Panels {
     }
 
     /// Takes over a matrix of terms by columns; memory is used again.
-    pub fn pack(&mut self, matrix: Matrix<'_>) {
+    pub fn pack(&mut self, matrix: Matrix<'_, T>) {
         (self.terms, self.columns) = (matrix.rows, matrix.columns);
         let (isa, terms) = (self.isa, self.terms);
         let data = self.data.of_len(padded(isa, matrix.columns) * terms);
@@ -141,7 +142,7 @@ impl Panels {
     }
 
     /// [`Panels::new`] and [`Panels::pack`].
-    pub fn of(isa: Isa, matrix: Matrix<'_>) -> Self {
+    pub fn of(isa: Isa, matrix: Matrix<'_, T>) -> Self {
         let mut panels = Self::new(isa);
         panels.pack(matrix);
         panels
@@ -162,7 +163,7 @@ impl Panels {
     }
 
     /// The panels, as many full ones at a time as asked for while there are.
-    pub(crate) fn groups(&self, size: usize) -> impl Iterator<Item = Panel> + use<> {
+    pub(crate) fn groups(&self, size: usize) -> impl Iterator<Item = Panel> + use<T> {
         let group = size * self.isa.panel_width();
         let grouped = self.columns / group * group;
         let groups = (0..grouped).step_by(group).map(move |first| Panel {
@@ -184,7 +185,7 @@ impl Panels {
     }
 
     /// Where `panel` begins at `term`.
-    pub(crate) fn at(&self, panel: Panel, term: usize) -> *const f32 {
+    pub(crate) fn at(&self, panel: Panel, term: usize) -> *const T {
         debug_assert!(term < self.terms.max(1));
         // Inside the allocation: `pack` has laid out all terms of all panels. Of several panels at once all terms are taken.
         self.data
@@ -212,7 +213,7 @@ fn padded(isa: Isa, columns: usize) -> usize {
     panels(isa, columns).last().map_or(0, |last| last.first + last.width)
 }
 
-fn pack_panel(isa: Isa, matrix: Matrix<'_>, panel: Panel, into: &mut [f32]) {
+fn pack_panel<T: Term>(isa: Isa, matrix: Matrix<'_, T>, panel: Panel, into: &mut [T]) {
     let Matrix {
         data,
         row_stride,
@@ -223,7 +224,7 @@ fn pack_panel(isa: Isa, matrix: Matrix<'_>, panel: Panel, into: &mut [f32]) {
         for (term, row) in into.chunks_exact_mut(panel.width).enumerate() {
             let from = &data[term * row_stride + panel.first..][..panel.columns];
             row[..panel.columns].copy_from_slice(from);
-            row[panel.columns..].fill(0.0);
+            row[panel.columns..].fill(T::default());
         }
         return;
     }
@@ -232,7 +233,7 @@ fn pack_panel(isa: Isa, matrix: Matrix<'_>, panel: Panel, into: &mut [f32]) {
         let columns = panel.columns.saturating_sub(first).min(EIGHT);
         let column = |index: usize| &data[(panel.first + first + index) * column_stride..];
         if columns == EIGHT && row_stride == 1 {
-            let columns: [&[f32]; EIGHT] = std::array::from_fn(|index| &column(index)[..matrix.rows]);
+            let columns: [&[T]; EIGHT] = std::array::from_fn(|index| &column(index)[..matrix.rows]);
             interleave(isa, columns, into, first, panel.width);
             continue;
         }
@@ -242,7 +243,7 @@ fn pack_panel(isa: Isa, matrix: Matrix<'_>, panel: Panel, into: &mut [f32]) {
                 *number = if index < columns {
                     column(index)[term * row_stride]
                 } else {
-                    0.0
+                    T::default()
                 };
             }
         }
@@ -253,7 +254,8 @@ fn pack_panel(isa: Isa, matrix: Matrix<'_>, panel: Panel, into: &mut [f32]) {
 const EIGHT: usize = 8;
 
 /// Writes the numbers of eight columns, all of one length, side by side into the rows of `into`, from its column `first` on.
-fn interleave(isa: Isa, columns: [&[f32]; EIGHT], into: &mut [f32], first: usize, width: usize) {
+fn interleave<T: Term>(isa: Isa, columns: [&[T]; EIGHT], into: &mut [T], first: usize, width: usize) {
+    const { assert!(size_of::<T>() == 4, "pairs are moved as numbers are") };
     let terms = columns[0].len();
     assert!(
         columns.iter().all(|column| column.len() == terms),
@@ -269,7 +271,8 @@ fn interleave(isa: Isa, columns: [&[f32]; EIGHT], into: &mut [f32], first: usize
         done = terms / EIGHT * EIGHT;
         // SAFETY: the instructions are there, as just asked; so are `terms` numbers of each column and as many rows, as asserted above.
         unsafe {
-            crate::isa::x86::interleave(columns.map(<[f32]>::as_ptr), done, into[first..].as_mut_ptr(), width);
+            let columns = columns.map(|column| column.as_ptr().cast());
+            crate::isa::x86::interleave(columns, done, into[first..].as_mut_ptr().cast(), width);
         }
     }
     let _ = isa;

@@ -22,7 +22,7 @@ pub fn peak_flops(isa: Isa) -> f64 {
         let lanes = unsafe {
             match isa {
                 #[cfg(target_arch = "x86_64")]
-                Isa::Avx512 => avx512(),
+                Isa::Avx512 | Isa::Avx512Bf16 => avx512(),
                 #[cfg(target_arch = "x86_64")]
                 Isa::Avx2 => avx2(),
                 _ => multiply_add::<Scalar8>(),
@@ -49,7 +49,7 @@ unsafe fn avx2() -> usize {
 
 /// Returns the numbers in a register.
 #[inline(always)]
-unsafe fn multiply_add<S: Simd>() -> usize {
+unsafe fn multiply_add<S: Simd<Term = f32>>() -> usize {
     // SAFETY: as the caller says; `store` is given room for a register.
     unsafe {
         let (factor, mut sums) = (S::splat(black_box(0.5)), [S::splat(black_box(1.0)); SUMS]);

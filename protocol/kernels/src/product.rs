@@ -2,7 +2,8 @@
 
 use std::ops::Range;
 
-use crate::isa::{Isa, Scalar8, Simd};
+use crate::isa::{Isa, Simd};
+use crate::pair::Term;
 use crate::panels::{Panel, Panels};
 use crate::tile::{Begin, End, InPlace, MOST_ROWS, Output, ROW_PANELS, Run, of_height, panel_tile, row_of_panels};
 use crate::windows::Windows;
@@ -15,11 +16,11 @@ const NUMBERS_AT_ONCE: usize = 80 << 10;
 
 /// The left operand: rows of numbers, read where they lie.
 #[derive(Debug, Clone, Copy)]
-pub enum Rows<'a> {
+pub enum Rows<'a, T = f32> {
     /// A matrix, row by row; as many numbers in a row as the product has terms.
-    Matrix(&'a [f32]),
+    Matrix(&'a [T]),
     /// What windows on an image see, a row each.
-    Windows(&'a Windows, &'a [f32]),
+    Windows(&'a Windows, &'a [T]),
 }
 
 /// What an element's sum begins with.
@@ -44,18 +45,25 @@ pub enum Finish<'a> {
 
 /// `output = finish(start + rows · panels)`, `[rows, columns]`; everything row-major.
 ///
-/// Each element is the sum of its terms in order, one fused multiply-add each: the same bits for every instruction set, and however the rows are parted.
+/// Each element is the sum of its terms in order, one fused multiply-add each: the same bits for every instruction set, and however the rows are parted. Of pairs
+/// ([`Pair`](crate::Pair)) the second product is added before the first.
 ///
 /// # Panics
 /// When lengths do not belong together.
-pub fn product(rows: Rows<'_>, panels: &Panels, start: Start<'_>, finish: Finish<'_>, output: &mut [f32]) {
+pub fn product<T: Term>(
+    rows: Rows<'_, T>,
+    panels: &Panels<T>,
+    start: Start<'_>,
+    finish: Finish<'_>,
+    output: &mut [f32],
+) {
     product_part(rows, panels, 0..panels.columns(), start, finish, output);
 }
 
 /// [`product`] for some columns only, from the first of a panel to the last of one: `output` and a gate hold these alone, a bias is that of all.
-pub(crate) fn product_part(
-    rows: Rows<'_>,
-    panels: &Panels,
+pub(crate) fn product_part<T: Term>(
+    rows: Rows<'_, T>,
+    panels: &Panels<T>,
     part: Range<usize>,
     start: Start<'_>,
     finish: Finish<'_>,
@@ -127,9 +135,9 @@ pub(crate) fn product_part(
 }
 
 /// Looks at all lengths; returns the number of rows.
-fn check(
-    rows: Rows<'_>,
-    panels: &Panels,
+fn check<T: Term>(
+    rows: Rows<'_, T>,
+    panels: &Panels<T>,
     part: &Range<usize>,
     start: Start<'_>,
     finish: Finish<'_>,
@@ -214,13 +222,13 @@ enum Starts<'a> {
 }
 
 /// Some rows, some terms, one panel or several.
-struct Work<'a> {
-    left: *const f32,
+struct Work<'a, T> {
+    left: *const T,
     starts: Starts<'a>,
     first: usize,
     rows: usize,
     runs: &'a [Run],
-    right: *const f32,
+    right: *const T,
     /// All terms of the product: so far apart are the columns of one panel and the next.
     terms: usize,
     /// One panel, or as many full ones side by side as a single row meets at once.
@@ -231,10 +239,10 @@ struct Work<'a> {
     output: Output,
 }
 
-impl Work<'_> {
+impl<T> Work<'_, T> {
     /// Where a row begins.
     #[inline(always)]
-    fn row(&self, row: usize) -> *const f32 {
+    fn row(&self, row: usize) -> *const T {
         let row = self.first + row;
         self.left.wrapping_add(match self.starts {
             Starts::Even(stride) => row * stride,
@@ -245,35 +253,44 @@ impl Work<'_> {
 
 /// # Safety
 /// The instructions are there; pointers and numbers of `work` belong together.
-unsafe fn do_work(isa: Isa, work: &Work<'_>) {
+unsafe fn do_work<T: Term>(isa: Isa, work: &Work<'_, T>) {
     // SAFETY: as the caller says.
     unsafe {
         match isa {
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx512 => avx512(work),
+            Isa::Avx512Bf16 => avx512_bf16::<T::Avx512Bf16>(work),
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx2 => avx2(work),
-            _ => all_tiles::<Scalar8>(work),
+            Isa::Avx512 => avx512::<T::Avx512>(work),
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx2 => avx2::<T::Avx2>(work),
+            _ => all_tiles::<T::Portable>(work),
         }
     }
 }
 
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq")]
-unsafe fn avx512(work: &Work<'_>) {
+#[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq,avx512bf16")]
+unsafe fn avx512_bf16<S: Simd>(work: &Work<'_, S::Term>) {
     // SAFETY: as the caller says.
-    unsafe { all_tiles::<crate::isa::x86::Avx512>(work) }
+    unsafe { all_tiles::<S>(work) }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq")]
+unsafe fn avx512<S: Simd>(work: &Work<'_, S::Term>) {
+    // SAFETY: as the caller says.
+    unsafe { all_tiles::<S>(work) }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-unsafe fn avx2(work: &Work<'_>) {
+unsafe fn avx2<S: Simd>(work: &Work<'_, S::Term>) {
     // SAFETY: as the caller says.
-    unsafe { all_tiles::<crate::isa::x86::Avx2>(work) }
+    unsafe { all_tiles::<S>(work) }
 }
 
 #[inline(always)]
-unsafe fn all_tiles<S: Simd>(work: &Work<'_>) {
+unsafe fn all_tiles<S: Simd>(work: &Work<'_, S::Term>) {
     if work.panel.width == ROW_PANELS * 2 * S::LANES {
         let panels = std::array::from_fn(|panel| work.right.wrapping_add(panel * work.terms * 2 * S::LANES));
         // SAFETY: as the caller says: the panels lie one behind the other.
@@ -289,8 +306,8 @@ unsafe fn all_tiles<S: Simd>(work: &Work<'_>) {
 }
 
 #[inline(always)]
-unsafe fn tile_of<S: Simd, const M: usize>(work: &Work<'_>, row: usize) {
-    let left = InPlace::<M>(std::array::from_fn(|index| work.row(row + index)));
+unsafe fn tile_of<S: Simd, const M: usize>(work: &Work<'_, S::Term>, row: usize) {
+    let left = InPlace::<S::Term, M>(std::array::from_fn(|index| work.row(row + index)));
     let down = row * work.output.stride;
     // SAFETY: as the caller says.
     unsafe {

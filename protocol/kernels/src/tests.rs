@@ -17,6 +17,11 @@ fn numbers(len: usize, seed: u64) -> Vec<f32> {
         .collect()
 }
 
+fn pairs(len: usize, seed: u64) -> Vec<Pair> {
+    let numbers = numbers(2 * len, seed);
+    numbers.chunks(2).map(|two| Pair::of(two[0], two[1])).collect()
+}
+
 fn available() -> impl Iterator<Item = Isa> {
     Isa::ALL.into_iter().filter(|isa| isa.is_available())
 }
@@ -70,6 +75,39 @@ proptest! {
             let mut output = vec![f32::NAN; count * columns];
             product(Rows::Matrix(&left), &Panels::of(isa, matrix), start, finish, &mut output);
             prop_assert_eq!(&output, &expected, "{}", isa);
+        }
+    }
+
+    #[test]
+    fn a_product_of_pairs_is_its_definition_to_the_last_bit(
+        count in 0_usize..30, terms in 1_usize..400, columns in 1_usize..300, seed in 1_u64..1000,
+    ) {
+        let (left, right) = (pairs(count * terms, seed), pairs(terms * columns, seed + 1));
+        let bias = numbers(columns, seed + 2);
+        let expected: Vec<f32> = (0..count * columns)
+            .map(|element| {
+                let (row, column) = (element / columns, element % columns);
+                let sum = (0..terms).fold(bias[column], |sum, term| {
+                    let ([a, c], [b, d]) = (left[row * terms + term].numbers(), right[term * columns + column].numbers());
+                    a.mul_add(b, c.mul_add(d, sum))
+                });
+                sum.max(0.0)
+            })
+            .collect();
+        for isa in available() {
+            let panels = Panels::of(isa, Matrix::of_rows(&right, columns));
+            let mut output = vec![f32::NAN; count * columns];
+            product(Rows::Matrix(&left), &panels, Start::Bias(&bias), Finish::Rectified, &mut output);
+            prop_assert_eq!(&output, &expected, "{}", isa);
+            // Seen the other way, as weights lie; and a window that is the whole image.
+            let across: Vec<Pair> = (0..columns * terms).map(|at| right[at % terms * columns + at / terms]).collect();
+            let panels = Panels::of(isa, Matrix::of_rows(&across, terms).transposed());
+            let windows = Windows::new([1, terms], 1, [1, terms], 1);
+            for (row, expected) in left.chunks(terms).zip(expected.chunks(columns)) {
+                let mut output = vec![f32::NAN; columns];
+                product(Rows::Windows(&windows, row), &panels, Start::Bias(&bias), Finish::Rectified, &mut output);
+                prop_assert_eq!(&output[..], expected, "{}", isa);
+            }
         }
     }
 

@@ -38,21 +38,21 @@ pub(crate) enum End {
 }
 
 /// How a tile reads the left operand.
-pub(crate) trait LeftTile: Copy {
+pub(crate) trait LeftTile<T>: Copy {
     /// Term `k` of the run that begins at `offset`, in this row.
     ///
     /// # Safety
     /// The term exists.
-    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const f32;
+    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const T;
 }
 
 /// Rows where they lie, each at a place of its own, terms of a run side by side.
 #[derive(Clone, Copy)]
-pub(crate) struct InPlace<const M: usize>(pub(crate) [*const f32; M]);
+pub(crate) struct InPlace<T, const M: usize>(pub(crate) [*const T; M]);
 
-impl<const M: usize> LeftTile for InPlace<M> {
+impl<T: Copy, const M: usize> LeftTile<T> for InPlace<T, M> {
     #[inline(always)]
-    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const f32 {
+    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const T {
         // SAFETY: as the caller says.
         unsafe { self.0[row].add(offset + k) }
     }
@@ -65,7 +65,7 @@ pub(crate) struct Packed {
     pub(crate) stride: usize,
 }
 
-impl LeftTile for Packed {
+impl LeftTile<f32> for Packed {
     #[inline(always)]
     unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const f32 {
         // SAFETY: as the caller says.
@@ -130,10 +130,10 @@ pub(crate) use of_height;
 /// # Safety
 /// As for [`tile`], but that output, bias and gate need only have the columns that there are.
 #[inline(always)]
-pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile, const M: usize>(
+pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile<S::Term>, const M: usize>(
     left: L,
     runs: &[Run],
-    right: *const f32,
+    right: *const S::Term,
     panel: Panel,
     begin: Begin,
     end: End,
@@ -197,10 +197,10 @@ pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile, const M: usize>(
 /// `S`'s instructions are there. The left tile has `M` rows with all terms of `runs`; `panel` has as many rows of `panel_width` numbers as the runs have terms;
 /// `output`, a bias and a gate have `M` rows (a bias one) of `N · LANES` numbers. Nothing else touches the output meanwhile.
 #[inline(always)]
-pub(crate) unsafe fn tile<S: Simd, L: LeftTile, const M: usize, const N: usize>(
+pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N: usize>(
     left: L,
     runs: &[Run],
-    panel: *const f32,
+    panel: *const S::Term,
     panel_width: usize,
     begin: Begin,
     end: End,
@@ -208,7 +208,7 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile, const M: usize, const N: usize>(
 ) {
     // SAFETY: all pointers are offset within what the caller vouches for.
     unsafe {
-        let mut sums = [[S::splat(0.0); N]; M];
+        let mut sums = [[S::zero(); N]; M];
         match begin {
             Begin::Zero => {}
             Begin::Output => {
@@ -229,9 +229,9 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile, const M: usize, const N: usize>(
         let mut right = panel;
         for run in runs {
             for k in 0..run.len {
-                let mut parts = [S::splat(0.0); N];
+                let mut parts = [S::zero(); N];
                 for (part, value) in parts.iter_mut().enumerate() {
-                    *value = S::load(right.add(part * S::LANES));
+                    *value = S::load_terms(right.add(part * S::LANES));
                 }
                 for (row, sums) in sums.iter_mut().enumerate() {
                     let term = S::splat(*left.term(row, run.offset, k));
@@ -242,16 +242,43 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile, const M: usize, const N: usize>(
                 right = right.add(panel_width);
             }
         }
-        for (row, sums) in sums.iter().enumerate() {
-            for (part, sum) in sums.iter().enumerate() {
-                let at = row * output.stride + part * S::LANES;
-                let value = match end {
-                    End::Plain => *sum,
-                    End::Rectified => S::rectified(*sum),
-                    End::Gated(by) => S::gated(*sum, S::load(by.add(at))),
-                };
-                S::store(output.data.add(at), value);
-            }
+        match end {
+            End::Plain => put::<S, M, N>(
+                sums,
+                output,
+                #[inline(always)]
+                |sum, _| sum,
+            ),
+            End::Rectified => put::<S, M, N>(
+                sums,
+                output,
+                #[inline(always)]
+                |sum, _| S::rectified(sum),
+            ),
+            End::Gated(by) => put::<S, M, N>(
+                sums,
+                output,
+                #[inline(always)]
+                |sum, at| S::gated(sum, S::load(by.add(at))),
+            ),
+        }
+    }
+}
+
+/// Stores finished sums, each as `finish` makes it of the sum and its place.
+///
+/// One short loop for each way to finish: in a long one, which the compiler does not unroll, the sums would be indexed, and so live in memory from the first term on.
+#[inline(always)]
+unsafe fn put<S: Simd, const M: usize, const N: usize>(
+    sums: [[S::Vector; N]; M],
+    output: Output,
+    finish: impl Fn(S::Vector, usize) -> S::Vector,
+) {
+    for (row, sums) in sums.into_iter().enumerate() {
+        for (part, sum) in sums.into_iter().enumerate() {
+            let at = row * output.stride + part * S::LANES;
+            // SAFETY: the output has a place for each sum.
+            unsafe { S::store(output.data.add(at), finish(sum, at)) };
         }
     }
 }
@@ -262,16 +289,16 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile, const M: usize, const N: usize>(
 /// As for [`tile`].
 #[inline(always)]
 pub(crate) unsafe fn row_of_panels<S: Simd>(
-    left: *const f32,
+    left: *const S::Term,
     runs: &[Run],
-    panels: [*const f32; ROW_PANELS],
+    panels: [*const S::Term; ROW_PANELS],
     begin: Begin,
     end: End,
     output: Output,
 ) {
     // SAFETY: all pointers are offset within what the caller vouches for.
     unsafe {
-        let mut sums = [[S::splat(0.0); 2]; ROW_PANELS];
+        let mut sums = [[S::zero(); 2]; ROW_PANELS];
         let at = |panel: usize, part: usize| (2 * panel + part) * S::LANES;
         for (panel, sums) in sums.iter_mut().enumerate() {
             for (part, sum) in sums.iter_mut().enumerate() {
@@ -288,7 +315,7 @@ pub(crate) unsafe fn row_of_panels<S: Simd>(
                 let term = S::splat(*left.add(run.offset + k));
                 for (panel, sums) in panels.iter().zip(&mut sums) {
                     for (part, sum) in sums.iter_mut().enumerate() {
-                        *sum = S::fused(term, S::load(panel.add(passed + part * S::LANES)), *sum);
+                        *sum = S::fused(term, S::load_terms(panel.add(passed + part * S::LANES)), *sum);
                     }
                 }
                 passed += 2 * S::LANES;

@@ -24,7 +24,7 @@ pub use replay::{ReplaySection, SuccessRule};
 pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};
 pub use transport::TransportSection;
-pub use vae::VaeSection;
+pub use vae::{Precision, VaeSection};
 
 /// Everything that determines a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]

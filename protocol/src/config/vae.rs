@@ -1,5 +1,7 @@
 //! `[vae]`.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require};
@@ -18,6 +20,9 @@ pub struct VaeSection {
     pub learning_rate: f64,
     /// Weight of the Kullback-Leibler term against the squared error summed over the image's pixels. Default 1, the plain VAE.
     pub kl_weight: f64,
+    /// In what precision depth images are encoded: `f32` or `bf16`. Part of the result. Processors with instructions for bfloat16 (Zen 4, Sapphire Rapids) encode
+    /// twice as fast in it; others get the same numbers, at the speed of `f32` or below. The VAE is trained in `f32` either way. Default `f32`.
+    pub encoder_precision: Precision,
 }
 
 impl Default for VaeSection {
@@ -28,6 +33,7 @@ impl Default for VaeSection {
             batch_size: 32,
             learning_rate: 1e-3,
             kl_weight: 1.0,
+            encoder_precision: Precision::F32,
         }
     }
 }
@@ -70,5 +76,24 @@ impl VaeSection {
             self.kl_weight,
             "is negative or not finite: the latent code would be pushed apart without bound",
         )
+    }
+}
+
+/// Precision of what is multiplied; sums are f32.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// 24 bits.
+    F32,
+    /// bfloat16, 8 bits.
+    Bf16,
+}
+
+impl fmt::Display for Precision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::F32 => "f32",
+            Self::Bf16 => "bf16",
+        })
     }
 }

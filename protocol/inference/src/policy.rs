@@ -8,7 +8,7 @@ use skein_kernels::{Finish, Isa};
 use skein_protocol::snapshot::POLICY_LAYERS;
 use skein_protocol::{ACTION, LOG_STD};
 
-use super::linear::Linear;
+use crate::linear::Linear;
 
 /// The policy's parameters, arranged for [`Policy::distribution`].
 #[derive(Debug)]
