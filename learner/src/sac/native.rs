@@ -12,7 +12,7 @@ use skein_protocol::ACTION;
 use skein_protocol::config::{Observation, SacSection};
 use skein_protocol::seeds::{Purpose, derive};
 
-use self::dense::{Dense, Input, Layers, output, output_mut, pack, rows_of};
+use self::dense::{Dense, Layers, output, output_mut};
 use self::learned::{Learned, squared_norm};
 use self::sample::Sample;
 use super::{Columns, SacMetrics};
@@ -33,11 +33,8 @@ pub struct NativeSac {
     policy: Dense,
     policy_parameters: Learned,
     critic: Dense,
-    /// The way from the critic's value back to the action.
-    critic_action: Input,
     critic_parameters: Learned,
-    /// A critic that follows the learned one slowly, and steadies the targets.
-    target: Dense,
+    /// Of a critic that follows the learned one slowly, and steadies the targets.
     target_parameters: Vec<f32>,
     /// log α, `[1]`.
     log_temperature: Learned,
@@ -51,20 +48,23 @@ pub struct NativeSac {
 #[derive(Debug, Default)]
 struct Work {
     rows: usize,
-    /// States after the actions, then states: `[2 rows, observation]`.
-    policy_input: Vec<f32>,
-    policy: Layers,
+    /// The policy's, of states after the actions, then of states: `[2 rows, 4]`.
+    outputs: Vec<f32>,
     sample: Sample,
-    /// States after the actions with actions drawn there: `[rows, observation + 2]`.
-    target_input: Vec<f32>,
-    target: Layers,
-    /// States with the actions replayed, then with actions drawn: `[2 rows, observation + 2]`.
-    critic_input: Vec<f32>,
+    /// Observations and actions side by side, `[rows, observation + 2]`.
+    joined: Vec<f32>,
+    /// The target's, `[rows, 2]`.
+    target_values: Vec<f32>,
+    /// Of the actions replayed, then of those drawn.
     critic: Layers,
+    /// Of the actions replayed.
     critic_flowing: Layers,
+    /// Of the values of the actions drawn, `[rows, 2]`.
+    drawn_flowing: Vec<f32>,
     /// `[rows, 2]`.
     action_gradient: Vec<f32>,
     /// Of the states alone.
+    policy: Layers,
     policy_flowing: Layers,
 }
 
@@ -90,7 +90,6 @@ impl NativeSac {
         let mut critic_layout = Layout::default();
         Critic::describe(&mut critic_layout, inputs, width);
         let critic_values = critic_layout.initial_values(derive(run_seed, Purpose::SacParameters, 1));
-        let critic = Dense::new(isa, &critic_layout);
         let log_temperature = vec![section.initial_temperature.ln() as f32];
         Self {
             isa,
@@ -98,9 +97,7 @@ impl NativeSac {
             policy: Dense::new(isa, &policy_layout),
             policy_layout,
             policy_parameters: Learned::new(policy_values, section.policy_learning_rate),
-            critic_action: Input::new(&critic, observation.len()..observation.len() + ACTION),
-            critic,
-            target: Dense::new(isa, &critic_layout),
+            critic: Dense::new(isa, &critic_layout),
             target_parameters: critic_values.clone(),
             critic_parameters: Learned::new(critic_values, section.critic_learning_rate),
             log_temperature: Learned::new(log_temperature, section.temperature_learning_rate),
@@ -134,17 +131,16 @@ impl NativeSac {
         }
         let share = 1.0 / rows as f32;
         let temperature = exp(self.log_temperature.values[0]);
-        self.pack(team);
         let Work {
-            policy_input,
-            policy: policy_given,
+            outputs,
             sample,
-            target_input,
-            target: target_given,
-            critic_input,
+            joined,
+            target_values,
             critic: critic_given,
             critic_flowing,
+            drawn_flowing,
             action_gradient,
+            policy: policy_given,
             policy_flowing,
             ..
         } = &mut self.work;
@@ -154,72 +150,66 @@ impl NativeSac {
             next_observations,
             ..
         } = columns;
+        let (policy, critic) = (&self.policy_parameters.values, &self.critic_parameters.values);
 
         // Actions drawn from the present policy: in the states after the replayed actions, and in the states themselves.
-        policy_input[..next_observations.len()].copy_from_slice(next_observations);
-        policy_input[next_observations.len()..].copy_from_slice(observations);
+        let (next_outputs, state_outputs) = outputs.split_at_mut(rows * 2 * ACTION);
         self.policy
-            .forward(team, &self.policy_parameters.values, policy_input, policy_given);
+            .forward_through(team, policy, next_observations, next_outputs);
+        self.policy.forward(team, policy, observations, policy_given);
+        state_outputs.copy_from_slice(output(policy_given));
         noise.fill_normal(&mut sample.noise);
-        sample.draw(self.isa, output(policy_given));
-
-        // What the state after the action is worth, by the slow critic (eq. 3).
+        sample.draw(self.isa, outputs);
         let (next_actions, drawn_actions) = sample.actions.split_at(rows * ACTION);
-        join(next_observations, next_actions, target_input);
-        self.target
-            .forward(team, &self.target_parameters, target_input, target_given);
+        let (next_log_prob, drawn_log_prob) = sample.log_prob.split_at(rows);
 
-        // What the critic says of the actions replayed, and of those drawn.
-        let (replayed_input, drawn_input) = critic_input.split_at_mut(target_input.len());
-        join(observations, actions, replayed_input);
-        join(observations, drawn_actions, drawn_input);
-        self.critic
-            .forward(team, &self.critic_parameters.values, critic_input, critic_given);
-
-        // Both estimates are drawn towards r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')) (eq. 5). The policy moves towards actions of higher value, as far as
-        // its entropy is worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7).
+        // What the state after the action is worth, by the slow critic (eq. 3): both estimates are drawn towards r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s'))
+        // (eq. 5).
+        join(next_observations, next_actions, joined);
+        let target = &self.target_parameters;
+        self.critic.forward_through(team, target, joined, target_values);
+        join(observations, actions, joined);
+        self.critic.forward(team, critic, joined, critic_given);
         let mut sums = Sums::default();
-        let target_values = output(target_given);
-        let (values, drawn_values) = output(critic_given).split_at(rows * ESTIMATES);
-        let (flowing, drawn_flowing) = output_mut(critic_flowing).split_at_mut(rows * ESTIMATES);
+        let flowing = output_mut(critic_flowing);
         for row in 0..rows {
-            let pair = |values: &[f32]| [values[row * ESTIMATES], values[row * ESTIMATES + 1]];
-            let soft_value = smaller(pair(target_values)) - temperature * sample.log_prob[row];
+            let soft_value = smaller(pair(target_values, row)) - temperature * next_log_prob[row];
             let target = columns.rewards[row] + (1.0 - columns.terminated[row]) * soft_value * self.discount;
-            for (value, flowing) in pair(values).iter().zip(&mut flowing[row * ESTIMATES..]) {
+            let values = pair(output(critic_given), row);
+            for (value, flowing) in values.iter().zip(&mut flowing[row * ESTIMATES..]) {
                 let error = value - target;
                 sums.critic_loss += 0.5 * f64::from(error * error);
                 *flowing = error * share;
             }
-            sums.value += f64::from(smaller(pair(values)));
-            let log_prob = sample.log_prob[rows + row];
-            sums.log_prob += f64::from(log_prob);
-            sums.policy_loss += f64::from(temperature * log_prob - smaller(pair(drawn_values)));
-            drawn_flowing[row * ESTIMATES..][..ESTIMATES]
-                .copy_from_slice(&share_of_smaller(pair(drawn_values)).map(|part| -share * part));
+            sums.value += f64::from(smaller(values));
         }
+        self.critic.backward(team, critic, critic_given, critic_flowing);
+        let into = &mut self.critic_parameters.gradient;
+        self.critic.gradient(team, joined, critic_given, critic_flowing, into);
+
+        // The policy moves towards actions of higher value, as far as its entropy is worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7).
+        join(observations, drawn_actions, joined);
+        self.critic.forward(team, critic, joined, critic_given);
+        for (row, &log_prob) in drawn_log_prob.iter().enumerate() {
+            let values = pair(output(critic_given), row);
+            sums.log_prob += f64::from(log_prob);
+            sums.policy_loss += f64::from(temperature * log_prob - smaller(values));
+            drawn_flowing[row * ESTIMATES..][..ESTIMATES]
+                .copy_from_slice(&share_of_smaller(values).map(|part| -share * part));
+        }
+        let action = self.observation..self.observation + ACTION;
+        self.critic
+            .backward_through(team, critic, critic_given, drawn_flowing, action, action_gradient);
+        // Back through the drawing and the policy.
+        sample.backward(rows, temperature * share, action_gradient, output_mut(policy_flowing));
+        self.policy.backward(team, policy, policy_given, policy_flowing);
+        let into = &mut self.policy_parameters.gradient;
+        self.policy
+            .gradient(team, observations, policy_given, policy_flowing, into);
+
         // The temperature rises while the policy is more certain than asked for, and falls otherwise: the gradient of -α (log π + H̄) by log α is itself (eq. 18).
         let mean = |sum: f64| (sum / rows as f64) as f32;
         self.log_temperature.gradient[0] = -temperature * (mean(sums.log_prob) + self.target_entropy);
-
-        // Back through the critic: to its parameters from the actions replayed, to the actions from those drawn.
-        let given = rows_of(critic_given, 0..2 * rows, 2 * rows);
-        self.critic.backward(team, &given, critic_flowing);
-        let given = rows_of(critic_given, 0..rows, 2 * rows);
-        let flowing = rows_of(critic_flowing, 0..rows, 2 * rows);
-        let into = &mut self.critic_parameters.gradient;
-        let replayed_input = &critic_input[..target_input.len()];
-        self.critic.gradient(team, replayed_input, &given, &flowing, into);
-        let flowing = rows_of(critic_flowing, rows..2 * rows, 2 * rows);
-        self.critic_action.backward(team, flowing[0], action_gradient);
-
-        // Back through the drawing and the policy.
-        sample.backward(rows, temperature * share, action_gradient, output_mut(policy_flowing));
-        let given = rows_of(policy_given, rows..2 * rows, 2 * rows);
-        self.policy.backward(team, &given, policy_flowing);
-        let flowing = rows_of(policy_flowing, 0..rows, rows);
-        let into = &mut self.policy_parameters.gradient;
-        self.policy.gradient(team, observations, &given, &flowing, into);
 
         let metrics = SacMetrics {
             critic_loss: mean(sums.critic_loss),
@@ -242,27 +232,17 @@ impl NativeSac {
         let numbers = |rows: usize, width: usize| vec![0.0; rows * width];
         Work {
             rows,
-            policy_input: numbers(2 * rows, self.observation),
-            policy: self.policy.places(2 * rows),
+            outputs: numbers(2 * rows, 2 * ACTION),
             sample: Sample::places(2 * rows),
-            target_input: numbers(rows, self.observation + ACTION),
-            target: self.target.places(rows),
-            critic_input: numbers(2 * rows, self.observation + ACTION),
-            critic: self.critic.places(2 * rows),
-            critic_flowing: self.critic.places(2 * rows),
+            joined: numbers(rows, self.observation + ACTION),
+            target_values: numbers(rows, ESTIMATES),
+            critic: self.critic.places(rows),
+            critic_flowing: self.critic.places(rows),
+            drawn_flowing: numbers(rows, ESTIMATES),
             action_gradient: numbers(rows, ACTION),
+            policy: self.policy.places(rows),
             policy_flowing: self.policy.places(rows),
         }
-    }
-
-    /// Packs all weights for the products of one update, once for each direction.
-    fn pack(&mut self, team: &mut Team) {
-        let critic = &self.critic_parameters.values;
-        let policy = self.policy.packings(&self.policy_parameters.values);
-        let critics = self.critic.packings(critic);
-        let targets = self.target.forward_packings(&self.target_parameters);
-        let action = std::iter::once(self.critic_action.packing(critic));
-        pack(team, policy.chain(critics).chain(targets).chain(action).collect());
     }
 
     fn must_be_finite(&self, metrics: &SacMetrics) -> Result<(), UpdateError> {
@@ -305,12 +285,11 @@ impl NativeSac {
 
     /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
     pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
-        let mut policy = Dense::new(self.isa, &self.policy_layout);
-        let (mut team, parameters) = (Team::new(1), &self.policy_parameters.values);
-        pack(&mut team, policy.forward_packings(parameters).collect());
-        let mut given = policy.places(observations.len() / self.observation);
-        policy.forward(&mut team, parameters, observations, &mut given);
-        let means = output(&given).chunks_exact(2 * ACTION).flat_map(|row| &row[..ACTION]);
+        let mut outputs = vec![0.0; observations.len() / self.observation * 2 * ACTION];
+        let policy = &self.policy_parameters.values;
+        self.policy
+            .forward_through(&mut Team::new(1), policy, observations, &mut outputs);
+        let means = outputs.chunks_exact(2 * ACTION).flat_map(|row| &row[..ACTION]);
         means.map(|mean| mean.tanh()).collect()
     }
 
@@ -355,6 +334,11 @@ fn join(observations: &[f32], actions: &[f32], into: &mut [f32]) {
         into[..observation].copy_from_slice(&observations[row * observation..][..observation]);
         into[observation..].copy_from_slice(&actions[row * ACTION..][..ACTION]);
     }
+}
+
+/// A row's two estimates.
+fn pair(values: &[f32], row: usize) -> [f32; ESTIMATES] {
+    [values[row * ESTIMATES], values[row * ESTIMATES + 1]]
 }
 
 /// The smaller estimate; not a number if one of them is none.

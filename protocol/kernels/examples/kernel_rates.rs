@@ -16,6 +16,18 @@ fn best(mut work: impl FnMut()) -> f64 {
     best
 }
 
+/// Numbers of no pattern, in [-1, 1): a processor that multiplies the same number again and again draws less power, and may run faster than it ever will in earnest.
+fn noise(len: usize) -> Vec<f32> {
+    let mut state = 0x9e37_79b9_7f4a_7c15_u64;
+    let next = || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        (state >> 40) as f32 / (1 << 23) as f32 - 1.0
+    };
+    std::iter::repeat_with(next).take(len).collect()
+}
+
 fn main() {
     let isa = Isa::best();
     let peak = peak_flops(isa);
@@ -40,7 +52,7 @@ fn main() {
         (2046, 32, 48),
         (392, 64, 1792),
     ] {
-        let (a, b) = (vec![0.5; m * k], vec![0.25; k * n]);
+        let (a, b) = (noise(m * k), noise(k * n));
         let mut c = vec![0.0; m * n];
         let panels = Panels::of(isa, Matrix::of_rows(&b, n));
         let bias = vec![0.1; n];
@@ -61,7 +73,7 @@ fn main() {
             best(|| panels.pack(Matrix::of_rows(&b, k).transposed())),
         );
         let mut team = Team::new(1);
-        let d = vec![0.5; m * n];
+        let d = noise(m * n);
         let mut g = vec![0.0; n * k];
         report(
             "  gradient",
@@ -79,10 +91,10 @@ fn main() {
         ([72, 128], 1, [8, 6], 32),
     ] {
         let w = Windows::new(size, ch, kernel, 2);
-        let img = vec![0.5; w.image_len()];
-        let b = vec![0.25; w.window_len() * out];
+        let img = noise(w.image_len());
+        let b = noise(w.window_len() * out);
         let panels = Panels::of(isa, Matrix::of_rows(&b, w.window_len()).transposed());
-        let mut c = vec![0.5; w.count() * out];
+        let mut c = noise(w.count() * out);
         let flops = (2 * w.count() * w.window_len() * out) as f64;
         report(
             &format!("convolution {size:?}x{ch} {kernel:?} to {out}"),
@@ -108,8 +120,8 @@ fn main() {
         }
         let mut team = Team::new(1);
         let mut g = vec![0.0; b.len()];
-        let imgs = vec![0.5; 8 * img.len()];
-        let d = vec![0.5; 8 * c.len()];
+        let imgs = noise(8 * img.len());
+        let d = noise(8 * c.len());
         report(
             "  gradient of 8",
             8.0 * flops,
@@ -123,7 +135,7 @@ fn main() {
                 )
             }),
         );
-        let cols = vec![0.5; w.count() * w.window_len()];
+        let cols = noise(w.count() * w.window_len());
         let mut into = vec![0.0; w.image_len()];
         report("  add back", flops, best(|| w.add_back(isa, &cols, &mut into)));
         let panels = Panels::of(isa, Matrix::of_rows(&b, w.window_len()));

@@ -10,7 +10,7 @@ use crate::tile::{Begin, End, Output, Packed, Run, of_height, panel_tile};
 use crate::windows::Windows;
 
 /// Terms done before all elements are put back: both operands' parts then stay in the caches.
-const TERMS_AT_ONCE: usize = 256;
+const TERMS_AT_ONCE: usize = 512;
 /// Numbers between two tiles of the left operand: without them, all tiles would begin in the same few sets of the cache.
 const PADDING: usize = 16;
 

@@ -92,6 +92,8 @@ pub trait Simd {
     unsafe fn load_terms(from: *const Self::Term) -> Self::Vector;
     unsafe fn load(from: *const f32) -> Self::Vector;
     unsafe fn store(to: *mut f32, vector: Self::Vector);
+    /// Asks for the cache line at an address, which need not be valid; does nothing else.
+    unsafe fn fetch(from: *const f32);
     /// a · b + c for terms a and b: rounded once if they are numbers, after each product if they are pairs.
     unsafe fn fused(a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
     /// Zero for what is below zero. Not a number stays what it is.
@@ -136,6 +138,9 @@ impl Simd for Scalar8 {
         // SAFETY: as for `load`.
         unsafe { to.cast::<Self::Vector>().write(vector) }
     }
+
+    #[inline(always)]
+    unsafe fn fetch(_: *const f32) {}
 
     #[inline(always)]
     unsafe fn fused(a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector {
@@ -202,6 +207,12 @@ pub(crate) mod x86 {
         }
 
         #[inline(always)]
+        unsafe fn fetch(from: *const f32) {
+            // SAFETY: as for `zero`.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(from.cast()) }
+        }
+
+        #[inline(always)]
         unsafe fn fused(a: __m256, b: __m256, c: __m256) -> __m256 {
             // SAFETY: as for `splat`.
             unsafe { _mm256_fmadd_ps(a, b, c) }
@@ -257,6 +268,12 @@ pub(crate) mod x86 {
         unsafe fn store(to: *mut f32, vector: __m512) {
             // SAFETY: as for `load`.
             unsafe { _mm512_storeu_ps(to, vector) }
+        }
+
+        #[inline(always)]
+        unsafe fn fetch(from: *const f32) {
+            // SAFETY: as for `zero`.
+            unsafe { Avx2::fetch(from) }
         }
 
         #[inline(always)]
@@ -339,6 +356,12 @@ pub(crate) mod x86 {
         unsafe fn store(to: *mut f32, vector: __m512) {
             // SAFETY: as for `load_terms`.
             unsafe { Avx512::store(to, vector) }
+        }
+
+        #[inline(always)]
+        unsafe fn fetch(from: *const f32) {
+            // SAFETY: as for `zero`.
+            unsafe { Avx512::fetch(from) }
         }
 
         #[inline(always)]

@@ -26,7 +26,7 @@ pub use math::{exp, sigmoid};
 pub use pair::{Pair, Term};
 pub use panels::{Matrix, Panels};
 pub use peak::peak_flops;
-pub use product::{Finish, Rows, Start, product};
+pub use product::{Finish, Rows, Start, product, product_once};
 pub use team::Team;
 pub use windows::{Windows, spread};
 

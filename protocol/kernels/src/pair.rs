@@ -119,6 +119,12 @@ impl<S: Halves> Simd for Apart<S> {
     }
 
     #[inline(always)]
+    unsafe fn fetch(from: *const f32) {
+        // SAFETY: as for `zero`.
+        unsafe { S::fetch(from) }
+    }
+
+    #[inline(always)]
     unsafe fn fused(a: S::Vector, b: S::Vector, c: S::Vector) -> S::Vector {
         // SAFETY: as for `zero`.
         unsafe {

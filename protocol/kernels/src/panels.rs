@@ -49,6 +49,19 @@ impl<'a, T> Matrix<'a, T> {
         }
     }
 
+    /// These columns alone.
+    ///
+    /// # Panics
+    /// When there are not so many.
+    pub fn columns_of(self, columns: Range<usize>) -> Self {
+        assert!(columns.end <= self.columns, "columns {columns:?} of {}", self.columns);
+        Self {
+            data: &self.data[columns.start * self.column_stride..],
+            columns: columns.len(),
+            ..self
+        }
+    }
+
     /// A row, whose columns lie side by side.
     ///
     /// # Panics
@@ -139,6 +152,12 @@ impl<T: Term> Panels<T> {
             let into = &mut data[panel.first * terms..][..panel.width * terms];
             pack_panel(isa, matrix, panel, into);
         }
+    }
+
+    /// [`Panels::pack`] for products with other instructions.
+    pub(crate) fn repack(&mut self, isa: Isa, matrix: Matrix<'_, T>) {
+        self.isa = isa;
+        self.pack(matrix);
     }
 
     /// [`Panels::new`] and [`Panels::pack`].

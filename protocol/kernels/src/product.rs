@@ -1,10 +1,11 @@
 //! Rows times packed panels: every forward pass, and what flows back to a layer's input.
 
+use std::cell::RefCell;
 use std::ops::Range;
 
 use crate::isa::{Isa, Simd};
 use crate::pair::Term;
-use crate::panels::{Panel, Panels};
+use crate::panels::{Matrix, Panel, Panels};
 use crate::tile::{Begin, End, InPlace, MOST_ROWS, Output, ROW_PANELS, Run, of_height, panel_tile, row_of_panels};
 use crate::windows::Windows;
 
@@ -60,6 +61,38 @@ pub fn product<T: Term>(
     product_part(rows, panels, 0..panels.columns(), start, finish, output);
 }
 
+thread_local! {
+    static PANEL: RefCell<Panels> = RefCell::new(Panels::new(Isa::Portable));
+}
+
+/// [`product`] with a right operand that is packed panel by panel, each just before its turn. For weights that change between any two products: packed at once
+/// and kept, they would be written to memory and read back from there.
+///
+/// # Panics
+/// When lengths do not belong together.
+pub fn product_once(
+    isa: Isa,
+    rows: &[f32],
+    right: Matrix<'_>,
+    start: Start<'_>,
+    finish: Finish<'_>,
+    output: &mut [f32],
+) {
+    let (rows, columns) = (Rows::Matrix(rows), right.columns());
+    check_lens(rows, right.rows(), columns, columns, start, finish, output.len());
+    PANEL.with_borrow_mut(|panels| {
+        for panel in crate::panels::panels(isa, columns) {
+            let own = panel.first..panel.first + panel.columns;
+            panels.repack(isa, right.columns_of(own.clone()));
+            let place = Place {
+                stride: columns,
+                first: own.start,
+            };
+            multiply(rows, panels, 0..own.len(), place, start, finish, output);
+        }
+    });
+}
+
 /// [`product`] for some columns only, from the first of a panel to the last of one: `output` and a gate hold these alone, a bias is that of all.
 pub(crate) fn product_part<T: Term>(
     rows: Rows<'_, T>,
@@ -69,8 +102,39 @@ pub(crate) fn product_part<T: Term>(
     finish: Finish<'_>,
     output: &mut [f32],
 ) {
-    let columns = part.len();
-    let count = check(rows, panels, &part, start, finish, output.len());
+    let terms = panels.terms();
+    assert!(
+        part.end <= panels.columns() && (part == (0..panels.columns()) || panels.are_whole(&part)),
+        "columns {part:?} are not those of whole panels"
+    );
+    check_lens(rows, terms, part.len(), panels.columns(), start, finish, output.len());
+    let place = Place {
+        stride: part.len(),
+        first: 0,
+    };
+    multiply(rows, panels, part, place, start, finish, output);
+}
+
+/// Where the first column of a product lies in its output.
+#[derive(Clone, Copy)]
+struct Place {
+    /// Columns of the output.
+    stride: usize,
+    first: usize,
+}
+
+/// The product for these columns of `panels`, all lengths looked at. A bias begins with that of the column at `place`, but for a part of the panels with that of their first.
+fn multiply<T: Term>(
+    rows: Rows<'_, T>,
+    panels: &Panels<T>,
+    part: Range<usize>,
+    place: Place,
+    start: Start<'_>,
+    finish: Finish<'_>,
+    output: &mut [f32],
+) {
+    assert!(panels.isa().is_available(), "{} is not to be had here", panels.isa());
+    let (columns, count) = (part.len(), rows.count(panels.terms()));
     let single;
     let (data, starts, runs) = match rows {
         Rows::Matrix(data) => {
@@ -99,7 +163,7 @@ pub(crate) fn product_part<T: Term>(
             .groups(panels_at_once)
             .filter(|panel| part.contains(&panel.first))
         {
-            let corner = first * columns + panel.first - part.start;
+            let corner = first * place.stride + place.first + panel.first - part.start;
             for (index, block) in blocks.iter().enumerate() {
                 let work = Work {
                     left: data.as_ptr(),
@@ -113,7 +177,7 @@ pub(crate) fn product_part<T: Term>(
                     begin: match start {
                         _ if index > 0 => Begin::Output,
                         Start::Zero => Begin::Zero,
-                        Start::Bias(bias) => Begin::Bias(bias[panel.first..].as_ptr()),
+                        Start::Bias(bias) => Begin::Bias(bias[place.first + panel.first..].as_ptr()),
                     },
                     end: match finish {
                         _ if index < last_block => End::Plain,
@@ -123,7 +187,7 @@ pub(crate) fn product_part<T: Term>(
                     },
                     output: Output {
                         data: output[corner..].as_mut_ptr(),
-                        stride: columns,
+                        stride: place.stride,
                     },
                 };
                 // SAFETY: `check` has seen to it that every row has all terms, bias, gate and output all columns of all rows; `panels` was packed for
@@ -134,49 +198,50 @@ pub(crate) fn product_part<T: Term>(
     }
 }
 
-/// Looks at all lengths; returns the number of rows.
-fn check<T: Term>(
+/// Looks at all lengths: those of an output of `columns` columns, and of a bias for each of `all`.
+fn check_lens<T: Term>(
     rows: Rows<'_, T>,
-    panels: &Panels<T>,
-    part: &Range<usize>,
+    terms: usize,
+    columns: usize,
+    all: usize,
     start: Start<'_>,
     finish: Finish<'_>,
     output: usize,
-) -> usize {
-    let (terms, columns) = (panels.terms(), part.len());
-    assert!(
-        part.end <= panels.columns() && (*part == (0..panels.columns()) || panels.are_whole(part)),
-        "columns {part:?} are not those of whole panels"
-    );
-    assert!(panels.isa().is_available(), "{} is not to be had here", panels.isa());
+) {
     assert!(terms > 0 && columns > 0, "an empty product");
-    let count = match rows {
-        Rows::Matrix(data) => {
-            assert!(
-                data.len().is_multiple_of(terms),
-                "{} numbers are no rows of {terms}",
-                data.len()
-            );
-            data.len() / terms
-        }
+    match rows {
+        Rows::Matrix(data) => assert!(
+            data.len().is_multiple_of(terms),
+            "{} numbers are no rows of {terms}",
+            data.len()
+        ),
         Rows::Windows(windows, image) => {
             assert_eq!(image.len(), windows.image_len(), "the image the windows are of");
             assert_eq!(windows.window_len(), terms, "a window has all terms");
-            windows.count()
         }
-    };
+    }
+    let count = rows.count(terms);
     assert_eq!(
         output,
         count * columns,
         "a place for each of {count} x {columns} elements"
     );
     if let Start::Bias(bias) = start {
-        assert_eq!(bias.len(), panels.columns(), "a bias for each column");
+        assert_eq!(bias.len(), all, "a bias for each column");
     }
     if let Finish::Gated(by) = finish {
         assert_eq!(by.len(), output, "a gate for each element");
     }
-    count
+}
+
+impl<T> Rows<'_, T> {
+    /// Rows of so many terms.
+    fn count(&self, terms: usize) -> usize {
+        match self {
+            Self::Matrix(data) => data.len() / terms,
+            Self::Windows(windows, _) => windows.count(),
+        }
+    }
 }
 
 /// Some of a product's terms.

@@ -75,6 +75,9 @@ proptest! {
             let mut output = vec![f32::NAN; count * columns];
             product(Rows::Matrix(&left), &Panels::of(isa, matrix), start, finish, &mut output);
             prop_assert_eq!(&output, &expected, "{}", isa);
+            output.fill(f32::NAN);
+            product_once(isa, &left, matrix, start, finish, &mut output);
+            prop_assert_eq!(&output, &expected, "{}", isa);
         }
     }
 

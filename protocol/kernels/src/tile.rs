@@ -208,6 +208,7 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N
 ) {
     // SAFETY: all pointers are offset within what the caller vouches for.
     unsafe {
+        fetch_ahead::<S, M, N>(end, output);
         let mut sums = [[S::zero(); N]; M];
         match begin {
             Begin::Zero => {}
@@ -261,6 +262,27 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N
                 #[inline(always)]
                 |sum, at| S::gated(sum, S::load(by.add(at))),
             ),
+        }
+    }
+}
+
+/// Asks for the memory that a tile ends at, when it begins: it has often left the nearer caches, and would be waited for when the sums are done.
+#[inline(always)]
+unsafe fn fetch_ahead<S: Simd, const M: usize, const N: usize>(end: End, output: Output) {
+    let places = |from: *const f32| {
+        (0..M * N).map(move |place| from.wrapping_add(place / N * output.stride + place % N * S::LANES))
+    };
+    // SAFETY: any address may be asked for.
+    unsafe {
+        places(output.data).for_each(
+            #[inline(always)]
+            |place| S::fetch(place),
+        );
+        if let End::Gated(by) = end {
+            places(by).for_each(
+                #[inline(always)]
+                |place| S::fetch(place),
+            );
         }
     }
 }

@@ -1,16 +1,18 @@
 //! Fully connected networks with ReLU between their layers, forward and backward, on the kernels.
 //!
-//! Rows go through all layers a hundred or two at a time: what a layer gives is still in the cache when the next one takes it. Which rows go together, and which
-//! member of the team takes them, changes no bit.
+//! An update's numbers are more than the nearer caches hold, and what has to be fetched from memory is what it waits for. So rows go through all layers some hundred at
+//! a time: what a layer gives is still there when the next one takes it; what nobody needs later is written over by the next rows; and weights are packed when their turn
+//! comes, not beforehand. Which rows go together, and which member of the team takes them, changes no bit.
 
+use std::cell::RefCell;
 use std::ops::Range;
 
-use skein_kernels::{Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, gradient, product};
+use skein_kernels::{Finish, Isa, Matrix, Start, Team, Terms, gradient, product_once};
 
 use crate::networks::Layout;
 
-/// Rows that go through all layers together: their numbers in a layer of 256 are 192 KB.
-const ROWS_AT_ONCE: usize = 192;
+/// Rows that go through all layers together: all that one member has of a minibatch of 256.
+const ROWS_AT_ONCE: usize = 264;
 /// What parts of rows are multiples of: the height of every instruction set's tiles divides it.
 const ROW_GRAIN: usize = 12;
 /// Columns of a bias's gradient that stay with one member.
@@ -19,7 +21,12 @@ const COLUMN_GRAIN: usize = 64;
 /// What there is of each layer for so many rows, `[rows, outputs]` each: what it gave, or what flows back to its sums.
 pub(super) type Layers = Vec<Vec<f32>>;
 
-/// A network's layers, with its weights packed for products.
+thread_local! {
+    /// Two layers' numbers for rows that are under way, when nobody needs them later.
+    static PASSING: RefCell<[Vec<f32>; 2]> = RefCell::default();
+}
+
+/// A network's layers.
 #[derive(Debug)]
 pub(super) struct Dense {
     isa: Isa,
@@ -33,25 +40,13 @@ struct Layer {
     /// Places in the network's flat vector: `[outputs, inputs]` and `[outputs]`.
     weight: Range<usize>,
     bias: Range<usize>,
-    /// Wᵀ: from inputs to outputs.
-    forward: Panels,
-    /// W: back from outputs to inputs.
-    backward: Panels,
 }
 
-/// Weights to be packed.
-pub(super) struct Packing<'a> {
-    panels: &'a mut Panels,
-    weights: Matrix<'a>,
-}
-
-/// Packs all of them, each member of the team some.
-pub(super) fn pack(team: &mut Team, mut packings: Vec<Packing<'_>>) {
-    team.split_rows(&mut packings, 1, 1, |_, packings| {
-        for Packing { panels, weights } in packings {
-            panels.pack(*weights);
-        }
-    });
+impl Layer {
+    /// `[outputs, inputs]`.
+    fn weights<'a>(&self, parameters: &'a [f32]) -> Matrix<'a> {
+        Matrix::of_rows(&parameters[self.weight.clone()], self.inputs)
+    }
 }
 
 impl Dense {
@@ -69,8 +64,6 @@ impl Dense {
                 inputs: weight.shape[1] as usize,
                 weight: place(weight.len()),
                 bias: place(bias.len()),
-                forward: Panels::new(isa),
-                backward: Panels::new(isa),
             }
         });
         let layers = layers.collect();
@@ -83,54 +76,76 @@ impl Dense {
         places.collect()
     }
 
-    /// What [`Dense::forward`] needs packed.
-    pub(super) fn forward_packings<'a>(&'a mut self, parameters: &'a [f32]) -> impl Iterator<Item = Packing<'a>> {
-        self.layers.iter_mut().map(|layer| Packing {
-            panels: &mut layer.forward,
-            weights: Matrix::of_rows(&parameters[layer.weight.clone()], layer.inputs).transposed(),
-        })
+    fn inputs(&self) -> usize {
+        self.layers[0].inputs
     }
 
-    /// What [`Dense::forward`] and [`Dense::backward`] need packed.
-    pub(super) fn packings<'a>(&'a mut self, parameters: &'a [f32]) -> impl Iterator<Item = Packing<'a>> {
-        self.layers.iter_mut().enumerate().flat_map(|(index, layer)| {
-            let weights = Matrix::of_rows(&parameters[layer.weight.clone()], layer.inputs);
-            let forward = Packing {
-                panels: &mut layer.forward,
-                weights: weights.transposed(),
-            };
-            let backward = Packing {
-                panels: &mut layer.backward,
-                weights,
-            };
-            // Nothing flows back to the input but through `Input`.
-            std::iter::once(forward).chain((index > 0).then_some(backward))
-        })
+    fn outputs(&self) -> usize {
+        self.layers.last().expect("a network has layers").outputs
     }
 
-    /// h₀ = `input`, hᵢ = relu(hᵢ₋₁ Wᵢᵀ + bᵢ), the last layer's without relu; fills `given` with all hᵢ. `input`: `[rows, inputs]`.
+    /// hᵢ = relu(hᵢ₋₁ Wᵢᵀ + bᵢ), the last layer's without relu.
+    fn layer_forward(&self, index: usize, parameters: &[f32], input: &[f32], output: &mut [f32]) {
+        let layer = &self.layers[index];
+        let last = index + 1 == self.layers.len();
+        let finish = if last { Finish::Plain } else { Finish::Rectified };
+        let bias = Start::Bias(&parameters[layer.bias.clone()]);
+        product_once(
+            self.isa,
+            input,
+            layer.weights(parameters).transposed(),
+            bias,
+            finish,
+            output,
+        );
+    }
+
+    /// ∂zᵢ₋₁ = ∂zᵢ Wᵢ where hᵢ₋₁ > 0.
+    fn layer_backward(&self, index: usize, parameters: &[f32], flowing: &[f32], before: &[f32], into: &mut [f32]) {
+        let weights = self.layers[index].weights(parameters);
+        product_once(self.isa, flowing, weights, Start::Zero, Finish::Gated(before), into);
+    }
+
+    /// h₀ = `input`, `[rows, inputs]`; fills `given` with all hᵢ.
     pub(super) fn forward(&self, team: &mut Team, parameters: &[f32], input: &[f32], given: &mut Layers) {
-        let last = self.layers.len() - 1;
-        let rows = input.len() / self.layers[0].inputs;
-        let mut parts = self.parts(rows, team.size(), given);
+        let mut parts = self.parts(input.len() / self.inputs(), team.size(), given);
         team.split_rows(&mut parts, 1, 1, |_, parts| {
             for Part { first, layers } in parts {
-                let inputs = self.layers[0].inputs;
                 let rows = layers[0].len() / self.layers[0].outputs;
-                let mut input = &input[*first * inputs..][..rows * inputs];
-                for (index, (layer, given)) in self.layers.iter().zip(layers).enumerate() {
-                    let finish = if index < last { Finish::Rectified } else { Finish::Plain };
-                    let bias = Start::Bias(&parameters[layer.bias.clone()]);
-                    product(Rows::Matrix(input), &layer.forward, bias, finish, given);
+                let mut input = &input[*first * self.inputs()..][..rows * self.inputs()];
+                for (index, given) in layers.iter_mut().enumerate() {
+                    self.layer_forward(index, parameters, input, given);
                     input = given;
                 }
             }
         });
     }
 
-    /// What flows back to each layer's sums zᵢ = hᵢ₋₁ Wᵢᵀ + bᵢ: ∂zᵢ₋₁ = (∂zᵢ Wᵢ) where hᵢ₋₁ > 0. The last of `flowing` is given, the others are filled.
-    /// `given`: what the layers gave for the same rows.
-    pub(super) fn backward(&self, team: &mut Team, given: &[&[f32]], flowing: &mut Layers) {
+    /// [`Dense::forward`] of which only the last layer's is kept, in `output`.
+    pub(super) fn forward_through(&self, team: &mut Team, parameters: &[f32], input: &[f32], output: &mut [f32]) {
+        let rows_each = rows_each(output.len() / self.outputs(), team.size());
+        let mut parts: Vec<_> = output.chunks_mut(rows_each * self.outputs()).collect();
+        team.split_rows(&mut parts, 1, 1, |first, parts| {
+            let inputs = input[first * rows_each * self.inputs()..].chunks(rows_each * self.inputs());
+            for (output, input) in parts.iter_mut().zip(inputs) {
+                let rows = output.len() / self.outputs();
+                PASSING.with_borrow_mut(|[before, after]| {
+                    let [hidden @ .., _] = &self.layers[..] else { return };
+                    for (index, layer) in hidden.iter().enumerate() {
+                        let from: &[f32] = if index == 0 { input } else { &*before };
+                        after.resize(rows * layer.outputs, 0.0);
+                        self.layer_forward(index, parameters, from, after);
+                        std::mem::swap(before, after);
+                    }
+                    let from: &[f32] = if hidden.is_empty() { input } else { &*before };
+                    self.layer_forward(hidden.len(), parameters, from, output);
+                });
+            }
+        });
+    }
+
+    /// What flows back to each layer's sums zᵢ = hᵢ₋₁ Wᵢᵀ + bᵢ. The last of `flowing` is given, the others are filled. `given`: what the layers gave for the same rows.
+    pub(super) fn backward(&self, team: &mut Team, parameters: &[f32], given: &Layers, flowing: &mut Layers) {
         let rows = flowing[0].len() / self.layers[0].outputs;
         let mut parts = self.parts(rows, team.size(), flowing);
         team.split_rows(&mut parts, 1, 1, |_, parts| {
@@ -139,26 +154,50 @@ impl Dense {
                     let [into, from] = &mut layers[index - 1..=index] else {
                         unreachable!("two layers side by side")
                     };
-                    let gate = &given[index - 1][*first * self.layers[index - 1].outputs..][..into.len()];
-                    let panels = &self.layers[index].backward;
-                    product(Rows::Matrix(from), panels, Start::Zero, Finish::Gated(gate), into);
+                    let before = &given[index - 1][*first * self.layers[index - 1].outputs..][..into.len()];
+                    self.layer_backward(index, parameters, from, before, into);
                 }
             }
         });
     }
 
-    /// The gradient of all parameters, summed over rows: ∂Wᵢ = ∂zᵢᵀ hᵢ₋₁, ∂bᵢ = Σ ∂zᵢ. `given` and `flowing`: of as many rows as `input`.
-    pub(super) fn gradient(
+    /// What flows back to some columns of the input, `[rows, columns]`, from what flows to the last layer's sums, `[rows, outputs]`. `given`: as for [`Dense::backward`].
+    pub(super) fn backward_through(
         &self,
         team: &mut Team,
-        input: &[f32],
-        given: &[&[f32]],
-        flowing: &[&[f32]],
+        parameters: &[f32],
+        given: &Layers,
+        flowing: &[f32],
+        columns: Range<usize>,
         into: &mut [f32],
     ) {
+        let rows_each = rows_each(into.len() / columns.len(), team.size());
+        let mut parts: Vec<_> = into.chunks_mut(rows_each * columns.len()).collect();
+        team.split_rows(&mut parts, 1, 1, |first, parts| {
+            for (part, into) in parts.iter_mut().enumerate() {
+                let (start, rows) = ((first + part) * rows_each, into.len() / columns.len());
+                PASSING.with_borrow_mut(|[from, to]| {
+                    from.clear();
+                    from.extend_from_slice(&flowing[start * self.outputs()..][..rows * self.outputs()]);
+                    for index in (1..self.layers.len()).rev() {
+                        let width = self.layers[index - 1].outputs;
+                        to.resize(rows * width, 0.0);
+                        let before = &given[index - 1][start * width..][..rows * width];
+                        self.layer_backward(index, parameters, from, before, to);
+                        std::mem::swap(from, to);
+                    }
+                    let weights = self.layers[0].weights(parameters).columns_of(columns.clone());
+                    product_once(self.isa, from, weights, Start::Zero, Finish::Plain, into);
+                });
+            }
+        });
+    }
+
+    /// The gradient of all parameters, summed over rows: ∂Wᵢ = ∂zᵢᵀ hᵢ₋₁, ∂bᵢ = Σ ∂zᵢ. `given` and `flowing`: of as many rows as `input`.
+    pub(super) fn gradient(&self, team: &mut Team, input: &[f32], given: &Layers, flowing: &Layers, into: &mut [f32]) {
         for (index, layer) in self.layers.iter().enumerate() {
-            let (flowing, inputs) = (flowing[index], layer.inputs);
-            let input = if index == 0 { input } else { given[index - 1] };
+            let (flowing, inputs) = (&flowing[index], layer.inputs);
+            let input = if index == 0 { input } else { &given[index - 1] };
             let left = Matrix::of_rows(flowing, layer.outputs);
             let right = Terms::Matrix(input, inputs);
             gradient(team, self.isa, left, right, &mut into[layer.weight.clone()]);
@@ -181,8 +220,7 @@ impl Dense {
 
     /// Cuts rows into parts that go through all layers, as many for each member.
     fn parts<'a>(&self, rows: usize, members: usize, layers: &'a mut Layers) -> Vec<Part<'a>> {
-        let count = members * rows.div_ceil(members * ROWS_AT_ONCE);
-        let rows_each = rows.div_ceil(count).next_multiple_of(ROW_GRAIN);
+        let rows_each = rows_each(rows, members);
         let part = |first| Part {
             first,
             layers: Vec::with_capacity(layers.len()),
@@ -198,65 +236,16 @@ impl Dense {
     }
 }
 
+/// Rows of a part, so that each member has as many parts.
+fn rows_each(rows: usize, members: usize) -> usize {
+    let parts = members * rows.div_ceil(members * ROWS_AT_ONCE);
+    rows.div_ceil(parts).next_multiple_of(ROW_GRAIN)
+}
+
 /// Some rows of all layers.
 struct Part<'a> {
     first: usize,
     layers: Vec<&'a mut [f32]>,
-}
-
-/// Some columns of a first layer's weights: the way back to a part of the input.
-#[derive(Debug)]
-pub(super) struct Input {
-    columns: Range<usize>,
-    inputs: usize,
-    outputs: usize,
-    /// `[outputs, columns]`.
-    weights: Vec<f32>,
-    panels: Panels,
-}
-
-impl Input {
-    /// These columns of the network's input.
-    pub(super) fn new(network: &Dense, columns: Range<usize>) -> Self {
-        let Layer { inputs, outputs, .. } = network.layers[0];
-        Self {
-            columns,
-            inputs,
-            outputs,
-            weights: Vec::new(),
-            panels: Panels::new(network.isa),
-        }
-    }
-
-    /// What [`Input::backward`] needs packed.
-    pub(super) fn packing<'a>(&'a mut self, parameters: &[f32]) -> Packing<'a> {
-        self.weights.clear();
-        for row in parameters[..self.outputs * self.inputs].chunks_exact(self.inputs) {
-            self.weights.extend_from_slice(&row[self.columns.clone()]);
-        }
-        Packing {
-            panels: &mut self.panels,
-            weights: Matrix::of_rows(&self.weights, self.columns.len()),
-        }
-    }
-
-    /// What flows back from the first layer's sums to these columns, `[rows, columns]`.
-    pub(super) fn backward(&self, team: &mut Team, flowing: &[f32], into: &mut [f32]) {
-        team.split_rows(into, self.columns.len(), ROW_GRAIN, |first, into| {
-            let rows = into.len() / self.columns.len();
-            let flowing = &flowing[first * self.outputs..][..rows * self.outputs];
-            product(Rows::Matrix(flowing), &self.panels, Start::Zero, Finish::Plain, into);
-        });
-    }
-}
-
-/// These rows of each layer.
-pub(super) fn rows_of<'a>(layers: &'a Layers, rows: Range<usize>, of: usize) -> Vec<&'a [f32]> {
-    let part = |numbers: &'a Vec<f32>| {
-        let len = numbers.len() / of;
-        &numbers[rows.start * len..rows.end * len]
-    };
-    layers.iter().map(part).collect()
 }
 
 /// What the last layer gave.
