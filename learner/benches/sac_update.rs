@@ -2,9 +2,10 @@
 
 use criterion::{BenchmarkId, Criterion, Throughput};
 use skein_kernels::Team;
+use skein_learner::algorithm::Columns;
 use skein_learner::device::use_threads;
 use skein_learner::noise::Noise;
-use skein_learner::sac::{Columns, Sac};
+use skein_learner::sac::Sac;
 use skein_protocol::ACTION;
 use skein_protocol::config::{Engine, Observation, SacSection};
 use tch::Device;

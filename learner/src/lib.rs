@@ -3,6 +3,7 @@
 //! Training is a function of configuration and seed: flights are taken in flight order, every random draw has a seed of its own, and nothing here
 //! depends on who flew a flight, or when.
 
+pub mod algorithm;
 pub mod best;
 pub mod checkpoint;
 pub mod curriculum;
@@ -22,6 +23,7 @@ pub mod report;
 pub mod sac;
 pub mod spent;
 pub mod state;
+pub mod td3;
 pub mod threads;
 pub mod trainer;
 pub mod training;

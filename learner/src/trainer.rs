@@ -14,14 +14,15 @@ use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::Exploration;
 
+use crate::algorithm::{self, Algorithm, Columns};
 use crate::checkpoint::Progress;
 use crate::device::{self, DeviceError};
 use crate::error::UpdateError;
 use crate::flight::CommittedFlight;
 use crate::flights::assembly::Keep;
+use crate::metrics::Scalar;
 use crate::noise::Noise;
 use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
-use crate::sac::{Columns, Sac, SacMetrics};
 use crate::state::{self, NamedTensor, Stateful};
 use crate::vae::{Vae, VaeMetrics};
 
@@ -57,7 +58,7 @@ pub struct Trainer {
     /// Threads of the native engine.
     team: Team,
     vae: Vae,
-    sac: Sac,
+    algorithm: Box<dyn Algorithm>,
     replay: Replay,
     steps: u64,
 }
@@ -80,13 +81,7 @@ impl Trainer {
                 Engine::Libtorch => 1,
             }),
             vae: Vae::new(&config.vae, &config.run, device),
-            sac: Sac::new(
-                &config.sac,
-                config.learning.observation,
-                config.run.seed,
-                engine,
-                device,
-            ),
+            algorithm: algorithm::new(config, device),
             replay: Replay::new(config),
             steps: 0,
             config: config.clone(),
@@ -104,12 +99,12 @@ impl Trainer {
         replay: ReplayState,
     ) -> Result<(), TrainerRestoreError> {
         self.vae.load_named(tensors)?;
-        self.sac.load_named(tensors)?;
+        self.algorithm.load_named(tensors)?;
         self.replay = Replay::restore(&self.config, replay)?;
         self.steps = progress.environment_steps;
         for (what, found, expected) in [
             ("VAE steps", self.vae.updates(), progress.vae_steps),
-            ("SAC updates", self.sac.updates(), progress.sac_updates),
+            ("policy updates", self.algorithm.updates(), progress.policy_updates),
         ] {
             if found != expected {
                 return Err(TrainerRestoreError::Count { what, found, expected });
@@ -123,9 +118,9 @@ impl Trainer {
         self.steps
     }
 
-    /// SAC updates done.
+    /// Policy updates done.
     pub fn updates(&self) -> u64 {
-        self.sac.updates()
+        self.algorithm.updates()
     }
 
     /// VAE steps done.
@@ -229,7 +224,7 @@ impl Trainer {
         encoder(&snapshot, &self.layout, self.config.vae.encoder_precision)
     }
 
-    /// Does the SAC updates that the steps flown since the warm-up ask for; returns the means of their metrics. `after_each` may do something
+    /// Does the policy updates that the steps flown since the warm-up ask for; returns the means of their metrics. `after_each` may do something
     /// between updates, and give up; `timer` is told what the time went into.
     ///
     /// # Errors
@@ -238,20 +233,20 @@ impl Trainer {
         &mut self,
         epoch: Epoch,
         timer: &mut LapTimer,
-        mut after_each: impl FnMut(&SacMetrics) -> Result<(), E>,
-    ) -> Result<Option<SacMetrics>, E> {
+        mut after_each: impl FnMut(&[(Scalar, f32)]) -> Result<(), E>,
+    ) -> Result<Vec<(Scalar, f64)>, E> {
         let learning = &self.config.learning;
         let counted = self.steps.saturating_sub(learning.warmup_steps as u64);
         let due = (counted as f64 * learning.updates_per_step) as u64;
-        let mut rng = self.rng(Purpose::SacBatches, epoch);
-        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::SacNoise, epoch.0));
+        let mut rng = self.rng(Purpose::PolicyBatches, epoch);
+        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::PolicyNoise, epoch.0));
         let mut minibatch = Minibatch::default();
         let mut means = Means::default();
-        while self.sac.updates() < due {
-            self.replay.sample(&mut rng, self.config.sac.batch_size, &mut minibatch);
+        while self.algorithm.updates() < due {
+            self.replay.sample(&mut rng, self.config.batch_size(), &mut minibatch);
             timer.lap(Stage::Sample, 1);
-            let metrics = self.sac.update(&mut self.team, columns(&minibatch), &mut noise)?;
-            timer.lap(Stage::SacUpdate, 1);
+            let metrics = self.algorithm.update(&mut self.team, columns(&minibatch), &mut noise)?;
+            timer.lap(Stage::PolicyUpdate, 1);
             means.add(&metrics);
             after_each(&metrics)?;
         }
@@ -266,7 +261,7 @@ impl Trainer {
     pub fn snapshot(&self, version: PolicyVersion) -> Snapshot {
         let mut values = vec![0.0; self.layout.values()];
         self.vae.publish(&mut values[self.layout.encoder()]);
-        self.sac.publish(&mut values[self.layout.policy()]);
+        self.algorithm.publish(&mut values[self.layout.policy()]);
         Snapshot { version, values }
     }
 
@@ -279,7 +274,7 @@ impl Trainer {
     /// Copies of all tensors that updates change.
     pub fn tensors(&mut self) -> Vec<NamedTensor> {
         let mut all = self.vae.named_tensors();
-        all.extend(self.sac.named_tensors());
+        all.extend(self.algorithm.named_tensors());
         all
     }
 }
@@ -297,39 +292,25 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
 /// Means of the metrics of an epoch's updates.
 #[derive(Default)]
 struct Means {
-    sums: [f64; 5],
+    sums: Vec<(Scalar, f64)>,
     count: usize,
 }
 
 impl Means {
-    fn add(&mut self, metrics: &SacMetrics) {
-        let SacMetrics {
-            critic_loss,
-            policy_loss,
-            temperature,
-            entropy,
-            mean_value,
-        } = *metrics;
-        for (sum, value) in self
-            .sums
-            .iter_mut()
-            .zip([critic_loss, policy_loss, temperature, entropy, mean_value])
-        {
-            *sum += f64::from(value);
+    fn add(&mut self, metrics: &[(Scalar, f32)]) {
+        if self.sums.is_empty() {
+            self.sums = metrics.iter().map(|(scalar, _)| (*scalar, 0.0)).collect();
+        }
+        for ((_, sum), (_, value)) in self.sums.iter_mut().zip(metrics) {
+            *sum += f64::from(*value);
         }
         self.count += 1;
     }
 
-    fn finish(self) -> Option<SacMetrics> {
-        let [critic_loss, policy_loss, temperature, entropy, mean_value] =
-            self.sums.map(|sum| (sum / self.count.max(1) as f64) as f32);
-        (self.count > 0).then_some(SacMetrics {
-            critic_loss,
-            policy_loss,
-            temperature,
-            entropy,
-            mean_value,
-        })
+    /// None if there was no update.
+    fn finish(self) -> Vec<(Scalar, f64)> {
+        let mean = |(scalar, sum)| (scalar, sum / self.count as f64);
+        self.sums.into_iter().map(mean).collect()
     }
 }
 

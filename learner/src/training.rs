@@ -30,7 +30,6 @@ use crate::flight::CommittedFlight;
 use crate::flights::reception::{Batch, Reception, ReceptionError};
 use crate::metrics::{Metrics, Scalar};
 use crate::report::Reporter;
-use crate::sac::SacMetrics;
 use crate::trainer::Trainer;
 
 pub use error::TrainingError;
@@ -262,10 +261,11 @@ impl Training<'_> {
         let started = Instant::now();
         let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
         let updates_before = self.trainer.updates();
-        let trained = self.trainer.train_policy(epoch, &mut self.timer, |metrics| {
+        let mut curves = self.trainer.train_policy(epoch, &mut self.timer, |metrics| {
+            let temperature = metrics.iter().find(|(scalar, _)| *scalar == Scalar::Temperature);
             reporter.update(|progress| {
                 progress.updates += 1;
-                progress.temperature = Some(metrics.temperature.into());
+                progress.temperature = temperature.map(|(_, value)| f64::from(*value));
             });
             pass(FaultPoint::LearnerMidUpdates);
             watch.after_update()
@@ -273,24 +273,9 @@ impl Training<'_> {
         pass(FaultPoint::LearnerUpdated);
         let done = self.trainer.updates() - updates_before;
         let updates_per_sec = done as f64 / started.elapsed().as_secs_f64();
-        let Some(SacMetrics {
-            critic_loss,
-            policy_loss,
-            temperature,
-            entropy,
-            mean_value,
-        }) = trained
-        else {
-            return Ok(());
-        };
-        let curves = [
-            (Scalar::CriticLoss, critic_loss.into()),
-            (Scalar::PolicyLoss, policy_loss.into()),
-            (Scalar::Temperature, temperature.into()),
-            (Scalar::Entropy, entropy.into()),
-            (Scalar::MeanValue, mean_value.into()),
-            (Scalar::UpdatesPerSec, updates_per_sec),
-        ];
+        if !curves.is_empty() {
+            curves.push((Scalar::UpdatesPerSec, updates_per_sec));
+        }
         Ok(self.metrics.scalars(self.last_flight(), &curves)?)
     }
 }

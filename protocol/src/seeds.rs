@@ -18,11 +18,11 @@ pub enum Purpose {
     /// Initial parameters of the VAE.
     VaeParameters = 4,
     /// Initial parameters of policy and critic.
-    SacParameters = 5,
-    /// Minibatches drawn for the SAC updates of one epoch; indexed by epoch.
-    SacBatches = 6,
-    /// Action noise inside the SAC updates of one epoch; indexed by epoch.
-    SacNoise = 7,
+    PolicyParameters = 5,
+    /// Minibatches drawn for the policy updates of one epoch; indexed by epoch.
+    PolicyBatches = 6,
+    /// Action noise inside the policy updates of one epoch; indexed by epoch.
+    PolicyNoise = 7,
     /// Minibatches drawn for the VAE steps of one epoch; indexed by epoch.
     VaeBatches = 8,
     /// Reparameterisation noise of the VAE steps of one epoch; indexed by epoch.

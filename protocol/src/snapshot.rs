@@ -14,7 +14,7 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use sha2::{Digest, Sha256};
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
-use crate::config::Config;
+use crate::config::{AlgorithmName, Config};
 use crate::ids::{PolicyVersion, RunId};
 use crate::{ACTION, LATENT, durable};
 
@@ -38,19 +38,45 @@ pub struct TensorSpec {
     pub range: Range<usize>,
 }
 
+/// What the numbers are that a policy gives, and so how actions are drawn.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum PolicyHead {
+    /// Mean and log standard deviation of a Gaussian that tanh squashes, `[2]` each.
+    SquashedGaussian,
+    /// The action before tanh, `[2]`. To explore, noise of this standard deviation is added after it, and the sum kept in [-1, 1].
+    Noisy(f32),
+}
+
+impl PolicyHead {
+    /// Numbers that the policy gives.
+    pub fn outputs(self) -> usize {
+        match self {
+            Self::SquashedGaussian => 2 * ACTION,
+            Self::Noisy(_) => ACTION,
+        }
+    }
+}
+
 /// Which tensors a snapshot holds, and where.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct SnapshotLayout {
     tensors: Vec<TensorSpec>,
     encoder_values: usize,
+    head: PolicyHead,
 }
 
 impl SnapshotLayout {
-    /// The layout for policies that see `observation` values and have hidden layers of `hidden_width`.
+    /// The layout for policies that see `observation` values, have hidden layers of `hidden_width`, and give a squashed Gaussian.
     pub fn new(observation: usize, hidden_width: usize) -> Self {
+        Self::with_head(observation, hidden_width, PolicyHead::SquashedGaussian)
+    }
+
+    /// The same for policies that give what `head` says.
+    pub fn with_head(observation: usize, hidden_width: usize, head: PolicyHead) -> Self {
         let mut layout = Self {
             tensors: Vec::new(),
             encoder_values: 0,
+            head,
         };
         for (index, pair) in ENCODER_CHANNELS.windows(2).enumerate() {
             let shape = [pair[1], pair[0], ENCODER_KERNEL, ENCODER_KERNEL];
@@ -58,7 +84,7 @@ impl SnapshotLayout {
         }
         layout.push_layer("encoder.mean", &[LATENT, ENCODER_FEATURES]);
         layout.encoder_values = layout.values();
-        let widths = [observation, hidden_width, hidden_width, hidden_width, 2 * ACTION];
+        let widths = [observation, hidden_width, hidden_width, hidden_width, head.outputs()];
         for (index, pair) in widths.windows(2).enumerate() {
             layout.push_layer(&format!("policy.layer{}", index + 1), &[pair[1], pair[0]]);
         }
@@ -67,7 +93,19 @@ impl SnapshotLayout {
 
     /// The layout a configuration asks for.
     pub fn of(config: &Config) -> Self {
-        Self::new(config.learning.observation.len(), config.sac.hidden_width)
+        let (hidden_width, head) = match config.learning.algorithm {
+            AlgorithmName::Sac => (config.sac.hidden_width, PolicyHead::SquashedGaussian),
+            AlgorithmName::Td3 => (
+                config.td3.hidden_width,
+                PolicyHead::Noisy(config.td3.exploration_noise as f32),
+            ),
+        };
+        Self::with_head(config.learning.observation.len(), hidden_width, head)
+    }
+
+    /// What the policy's numbers are.
+    pub fn head(&self) -> PolicyHead {
+        self.head
     }
 
     fn push_layer(&mut self, name: &str, weight: &[usize]) {
@@ -159,7 +197,7 @@ pub enum SnapshotError {
         expected: u64,
     },
     /// Its tensors are not ours.
-    #[error("the snapshot has another layout: sac.hidden_width or learning.observation differ")]
+    #[error("the snapshot has another layout: learning.algorithm, its hidden_width or learning.observation differ")]
     OtherLayout,
     /// Its length is not that of the layout.
     #[error("the snapshot has {found} bytes where its layout has {expected}")]

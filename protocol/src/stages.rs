@@ -105,8 +105,8 @@ stages! {
         Recode => "recode",
         /// A minibatch of transitions is gathered. Minibatches.
         Sample => "sample",
-        /// An update of critic, policy and temperature. Updates.
-        SacUpdate => "SAC update",
+        /// An update of critic and policy. Updates.
+        PolicyUpdate => "policy update",
         /// The parameters are copied into a snapshot and handed over. Snapshots.
         Publish => "publish",
         /// Evaluation flights are waited for. Flights.

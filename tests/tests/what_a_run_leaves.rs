@@ -116,7 +116,7 @@ fn the_stages_agree_with_the_counts(run: &Ended) {
     assert!(count(Stage::Assemble) >= summary.steps + summary.flights);
     assert_eq!(count(Stage::TakeIn), summary.flights);
     assert_eq!(count(Stage::Evaluate), summary.evaluation_flights);
-    assert_eq!([Stage::Sample, Stage::SacUpdate].map(count), [summary.updates; 2]);
+    assert_eq!([Stage::Sample, Stage::PolicyUpdate].map(count), [summary.updates; 2]);
     assert_eq!(
         [Stage::SampleImages, Stage::VaeStep].map(count),
         [summary.vae_updates; 2]
@@ -196,8 +196,8 @@ fn the_curves_are_in_an_event_file(run: &Ended) {
     for (curve, least) in [
         ("flight/return", 40),
         ("window/walls_passed", 40),
-        ("sac/critic_loss", 1),
-        ("sac/temperature", 1),
+        ("policy/critic_loss", 1),
+        ("policy/temperature", 1),
         ("vae/loss", 1),
         ("replay/success_transitions", 4),
     ] {

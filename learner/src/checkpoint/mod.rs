@@ -65,8 +65,8 @@ pub struct Progress {
     pub environment_steps: u64,
     /// Steps the VAE was trained.
     pub vae_steps: u64,
-    /// SAC updates done.
-    pub sac_updates: u64,
+    /// Policy updates done.
+    pub policy_updates: u64,
     /// Epochs whose flights were ordered and not learned from, in order.
     pub in_the_air: Vec<EpochOrder>,
     /// Evaluations flown to confirm a candidate for the best snapshot; numbers their flights.
@@ -94,7 +94,7 @@ impl Progress {
             policy_sha256: String::new(),
             environment_steps: 0,
             vae_steps: 0,
-            sac_updates: 0,
+            policy_updates: 0,
             in_the_air: Vec::new(),
             evaluations: 0,
             evaluation_flights: 0,

@@ -46,7 +46,7 @@ fn state(flights: u64) -> CheckpointState {
             policy_sha256: "0123".into(),
             environment_steps: 12,
             vae_steps: 3,
-            sac_updates: u64::MAX,
+            policy_updates: u64::MAX,
             in_the_air: vec![EpochOrder {
                 epoch: 7,
                 policy_version: 6,

@@ -37,16 +37,16 @@ scalars! {
     WindowReturn => "window/return",
     /// Walls passed, averaged over the window. The paper's Fig. 10.
     WindowWallsPassed => "window/walls_passed",
-    /// Half the squared distance of the two Q outputs from the soft Bellman target. It rises with the returns: watch it for explosions, not for progress.
-    CriticLoss => "sac/critic_loss",
-    /// What the policy minimises: temperature times log-probability, minus Q.
-    PolicyLoss => "sac/policy_loss",
-    /// Weight of the entropy against the reward: the price of certainty.
-    Temperature => "sac/temperature",
-    /// The policy's entropy in nats, estimated on the minibatches. Steered towards the target entropy by the temperature.
-    Entropy => "sac/entropy",
-    /// The smaller Q output on the minibatches, on average: the discounted return, entropy bonus included, that the critic expects.
-    MeanValue => "sac/mean_value",
+    /// Half the squared distance of the two Q outputs from their target. It rises with the returns: watch it for explosions, not for progress.
+    CriticLoss => "policy/critic_loss",
+    /// What the policy minimises: minus Q, and with SAC temperature times log-probability.
+    PolicyLoss => "policy/policy_loss",
+    /// SAC: weight of the entropy against the reward, the price of certainty.
+    Temperature => "policy/temperature",
+    /// SAC: the policy's entropy in nats, estimated on the minibatches. Steered towards the target entropy by the temperature.
+    Entropy => "policy/entropy",
+    /// The smaller Q output on the minibatches, on average: the discounted return that the critic expects, with SAC the entropy bonus included.
+    MeanValue => "policy/mean_value",
     /// What the VAE minimises: squared error summed over an image's pixels, plus the weighted divergence.
     VaeLoss => "vae/loss",
     /// Squared error of a reconstructed pixel, depth in [0, 1].
@@ -59,7 +59,7 @@ scalars! {
     ReplaySuccess => "replay/success_transitions",
     /// Environment steps committed per second of wall time.
     StepsPerSec => "rate/steps_per_sec",
-    /// SAC updates per second of wall time spent updating.
+    /// Policy updates per second of wall time spent updating.
     UpdatesPerSec => "rate/updates_per_sec",
     /// Walls passed in the flights that confirmed a candidate for the best snapshot, on average.
     EvaluationWallsPassed => "evaluation/walls_passed",

@@ -9,6 +9,7 @@ mod decoder;
 mod encoder;
 mod flat;
 mod layers;
+pub mod native;
 mod policy;
 
 pub use critic::Critic;

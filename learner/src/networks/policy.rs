@@ -26,6 +26,11 @@ pub struct PolicySample {
 impl Policy {
     /// Describes the layers.
     pub fn describe(layout: &mut Layout, observation: i64, hidden_width: i64) -> Self {
+        Self::with_outputs(layout, observation, hidden_width, 2 * ACTION as i64)
+    }
+
+    /// Describes the layers of a policy that gives so many numbers: the action alone, say.
+    pub fn with_outputs(layout: &mut Layout, observation: i64, hidden_width: i64, outputs: i64) -> Self {
         let mut layer = |number: usize, inputs: i64, outputs: i64| {
             Linear::describe(layout, &format!("policy.layer{number}"), inputs, outputs)
         };
@@ -34,19 +39,24 @@ impl Policy {
                 layer(1, observation, hidden_width),
                 layer(2, hidden_width, hidden_width),
                 layer(3, hidden_width, hidden_width),
-                layer(4, hidden_width, 2 * ACTION as i64),
+                layer(4, hidden_width, outputs),
             ],
         }
     }
 
-    /// Mean and log standard deviation before tanh, `[n, 2]` each.
-    pub fn distribution(&self, parameters: &Parameters, observations: &Tensor) -> (Tensor, Tensor) {
+    /// What the last layer gives, `[n, outputs]`.
+    pub fn output(&self, parameters: &Parameters, observations: &Tensor) -> Tensor {
         let [hidden @ .., last] = &self.layers;
         let mut features = observations.shallow_clone();
         for layer in hidden {
             features = layer.forward(parameters, &features).relu_();
         }
-        let output = last.forward(parameters, &features);
+        last.forward(parameters, &features)
+    }
+
+    /// Mean and log standard deviation before tanh, `[n, 2]` each.
+    pub fn distribution(&self, parameters: &Parameters, observations: &Tensor) -> (Tensor, Tensor) {
+        let output = self.output(parameters, observations);
         let (mean, log_std) = (
             output.narrow(1, 0, ACTION as i64),
             output.narrow(1, ACTION as i64, ACTION as i64),

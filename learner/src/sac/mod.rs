@@ -12,12 +12,13 @@ use skein_kernels::{Isa, Team};
 use skein_protocol::config::{Engine, Observation, SacSection};
 use tch::Device;
 
+use crate::algorithm::{Algorithm, Columns};
 use crate::error::UpdateError;
+use crate::metrics::Scalar;
 use crate::networks::Layout;
 use crate::noise::Noise;
 use crate::state::{Part, Stateful};
 
-pub use batch::Columns;
 pub use native::NativeSac;
 pub use torch::TorchSac;
 
@@ -117,6 +118,36 @@ impl Sac {
     }
 }
 
+impl Algorithm for Sac {
+    fn update(
+        &mut self,
+        team: &mut Team,
+        columns: Columns<'_>,
+        noise: &mut Noise,
+    ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
+        let metrics = Sac::update(self, team, columns, noise)?;
+        Ok(vec![
+            (Scalar::CriticLoss, metrics.critic_loss),
+            (Scalar::PolicyLoss, metrics.policy_loss),
+            (Scalar::Temperature, metrics.temperature),
+            (Scalar::Entropy, metrics.entropy),
+            (Scalar::MeanValue, metrics.mean_value),
+        ])
+    }
+
+    fn updates(&self) -> u64 {
+        Sac::updates(self)
+    }
+
+    fn policy_layout(&self) -> &Layout {
+        Sac::policy_layout(self)
+    }
+
+    fn publish(&self, into: &mut [f32]) {
+        Sac::publish(self, into);
+    }
+}
+
 impl Stateful for Sac {
     fn parts(&mut self) -> Vec<(String, Part<'_>)> {
         match self {
@@ -126,5 +157,7 @@ impl Stateful for Sac {
     }
 }
 
+#[cfg(test)]
+pub(crate) mod samples;
 #[cfg(test)]
 mod tests;

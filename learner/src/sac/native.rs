@@ -3,8 +3,6 @@
 //! The same update as that of [`super::TorchSac`], which stays beside it as the reference: same parameters in the same order, same noise, same metrics. Every sum has one
 //! order, so the bits depend neither on the processor nor on how many threads there are. Memory is set aside once for a batch size and used again.
 
-mod dense;
-mod learned;
 mod sample;
 
 use skein_kernels::{Isa, Team, exp};
@@ -12,17 +10,16 @@ use skein_protocol::ACTION;
 use skein_protocol::config::{Observation, SacSection};
 use skein_protocol::seeds::{Purpose, derive};
 
-use self::dense::{Dense, Layers, output, output_mut};
-use self::learned::{Learned, squared_norm};
 use self::sample::Sample;
-use super::{Columns, SacMetrics};
+use super::SacMetrics;
+use crate::algorithm::Columns;
 use crate::error::UpdateError;
+use crate::networks::native::{
+    Dense, ESTIMATES, Layers, Learned, follow, join, output, output_mut, pair, smaller, squared_norm,
+};
 use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
 use crate::state::{Part, Stateful};
-
-/// Q estimates of a critic.
-const ESTIMATES: usize = 2;
 
 /// Policy, critic, target critic and temperature, each with its optimizer.
 #[derive(Debug)]
@@ -86,10 +83,10 @@ impl NativeSac {
         let (inputs, width) = (observation.len() as i64, section.hidden_width as i64);
         let mut policy_layout = Layout::default();
         Policy::describe(&mut policy_layout, inputs, width);
-        let policy_values = policy_layout.initial_values(derive(run_seed, Purpose::SacParameters, 0));
+        let policy_values = policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         let mut critic_layout = Layout::default();
         Critic::describe(&mut critic_layout, inputs, width);
-        let critic_values = critic_layout.initial_values(derive(run_seed, Purpose::SacParameters, 1));
+        let critic_values = critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
         let log_temperature = vec![section.initial_temperature.ln() as f32];
         Self {
             isa,
@@ -223,7 +220,8 @@ impl NativeSac {
         self.critic_parameters.step(team, isa);
         self.policy_parameters.step(team, isa);
         self.log_temperature.step(team, isa);
-        self.follow(team);
+        let (target, critic) = (&mut self.target_parameters, &self.critic_parameters.values);
+        follow(team, isa, target, critic, self.target_rate);
         Ok(metrics)
     }
 
@@ -264,23 +262,6 @@ impl NativeSac {
             }
         }
         Ok(())
-    }
-
-    /// Moves the target a little towards the critic.
-    fn follow(&mut self, team: &mut Team) {
-        /// Numbers that stay together: whole cache lines.
-        const GRAIN: usize = 1024;
-        let (leader, rate, isa) = (&self.critic_parameters.values, self.target_rate, self.isa);
-        team.split_rows(&mut self.target_parameters, 1, GRAIN, |first, own| {
-            isa.vectorised(
-                #[inline(always)]
-                || {
-                    for (own, leader) in own.iter_mut().zip(&leader[first..]) {
-                        *own = (leader - *own).mul_add(rate, *own);
-                    }
-                },
-            );
-        });
     }
 
     /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
@@ -324,26 +305,6 @@ impl Stateful for NativeSac {
         parts.push(("sac.target.parameters".to_owned(), target));
         parts
     }
-}
-
-/// Rows of observations and actions side by side.
-fn join(observations: &[f32], actions: &[f32], into: &mut [f32]) {
-    let rows = actions.len() / ACTION;
-    let (observation, width) = (observations.len() / rows, into.len() / rows);
-    for (row, into) in into.chunks_exact_mut(width).enumerate() {
-        into[..observation].copy_from_slice(&observations[row * observation..][..observation]);
-        into[observation..].copy_from_slice(&actions[row * ACTION..][..ACTION]);
-    }
-}
-
-/// A row's two estimates.
-fn pair(values: &[f32], row: usize) -> [f32; ESTIMATES] {
-    [values[row * ESTIMATES], values[row * ESTIMATES + 1]]
-}
-
-/// The smaller estimate; not a number if one of them is none.
-fn smaller([one, other]: [f32; ESTIMATES]) -> f32 {
-    if one < other || one.is_nan() { one } else { other }
 }
 
 /// Derivative of the smaller estimate by both: equal ones share it.

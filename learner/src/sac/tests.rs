@@ -5,7 +5,8 @@ use skein_protocol::config::{Engine, Observation, SacSection};
 use skein_protocol::snapshot::SnapshotLayout;
 use tch::Device;
 
-use super::{Columns, Sac, SacMetrics};
+use super::samples::Transitions;
+use super::{Sac, SacMetrics};
 use crate::UpdateError;
 use crate::noise::Noise;
 use crate::state::{NamedTensor, Stateful, TensorValues};
@@ -26,58 +27,6 @@ fn sac(engine: Engine, section: &SacSection, seed: u64) -> Sac {
     Sac::new(section, OBSERVATION, seed, engine, Device::Cpu)
 }
 
-/// Transitions that own their columns.
-#[derive(Clone)]
-pub(super) struct Transitions {
-    pub(super) observations: Vec<f32>,
-    pub(super) actions: Vec<f32>,
-    pub(super) rewards: Vec<f32>,
-    pub(super) next_observations: Vec<f32>,
-    pub(super) terminated: Vec<f32>,
-}
-
-impl Transitions {
-    /// Numbers without a meaning; every third transition is the last of its task.
-    pub(super) fn random(observation: Observation, rows: usize, noise: &mut Noise) -> Self {
-        let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(1.0)).collect() };
-        Self {
-            observations: draw(rows * observation.len()),
-            actions: draw(rows * 2),
-            rewards: draw(rows),
-            next_observations: draw(rows * observation.len()),
-            terminated: (0..rows).map(|row| f32::from(row % 3 == 1)).collect(),
-        }
-    }
-
-    /// A one-step task: the observation's first two numbers are the action that would have been right.
-    fn guessing(rows: usize, noise: &mut Noise) -> Self {
-        let width = OBSERVATION.len();
-        let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(0.8)).collect() };
-        let (observations, actions) = (draw(rows * width), draw(rows * 2));
-        let rewards = (0..rows).map(|row| {
-            let (wanted, done) = (&observations[row * width..][..2], &actions[row * 2..][..2]);
-            -((wanted[0] - done[0]).powi(2) + (wanted[1] - done[1]).powi(2))
-        });
-        Self {
-            rewards: rewards.collect(),
-            next_observations: observations.clone(),
-            terminated: vec![1.0; rows],
-            observations,
-            actions,
-        }
-    }
-
-    pub(super) fn columns(&self) -> Columns<'_> {
-        Columns {
-            observations: &self.observations,
-            actions: &self.actions,
-            rewards: &self.rewards,
-            next_observations: &self.next_observations,
-            terminated: &self.terminated,
-        }
-    }
-}
-
 fn update(sac: &mut Sac, transitions: &Transitions, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {
     sac.update(&mut Team::new(1), transitions.columns(), noise)
 }
@@ -85,7 +34,7 @@ fn update(sac: &mut Sac, transitions: &Transitions, noise: &mut Noise) -> Result
 fn train(sac: &mut Sac, updates: usize, seed: u64) -> Vec<SacMetrics> {
     let (mut data, mut noise) = (Noise::new(seed), Noise::new(seed + 1));
     (0..updates)
-        .map(|_| update(sac, &Transitions::guessing(32, &mut data), &mut noise).unwrap())
+        .map(|_| update(sac, &Transitions::guessing(OBSERVATION, 32, &mut data), &mut noise).unwrap())
         .collect()
 }
 
@@ -136,7 +85,7 @@ fn an_update_that_is_not_finite_changes_nothing() {
         let mut sac = sac(engine, &small(), 1);
         train(&mut sac, 3, 5);
         let before = state(&mut sac);
-        let sound = Transitions::guessing(32, &mut Noise::new(1));
+        let sound = Transitions::guessing(OBSERVATION, 32, &mut Noise::new(1));
         let mut refused = |damage: fn(&mut Transitions)| {
             let mut damaged = sound.clone();
             damage(&mut damaged);
@@ -160,7 +109,7 @@ fn truncated_flight_still_bootstraps() {
         // What the critic learns of one transition, the last of its flight, when the state after it is another.
         let learned = |terminated: f32, next: f32| {
             let mut sac = sac(engine, &small(), 1);
-            let mut last = Transitions::guessing(1, &mut Noise::new(1));
+            let mut last = Transitions::guessing(OBSERVATION, 1, &mut Noise::new(1));
             last.terminated[0] = terminated;
             last.next_observations.fill(next);
             update(&mut sac, &last, &mut Noise::new(2)).unwrap().critic_loss
@@ -215,7 +164,7 @@ fn the_right_action_is_learned_in_a_one_step_task() {
         for seed in 1..=3 {
             let mut sac = sac(engine, &section, seed);
             train(&mut sac, 600, seed);
-            let test = Transitions::guessing(256, &mut Noise::new(seed + 100));
+            let test = Transitions::guessing(OBSERVATION, 256, &mut Noise::new(seed + 100));
             let actions = sac.mode(&test.observations);
             let observations = test.observations.chunks_exact(OBSERVATION.len());
             let squared = observations

@@ -5,9 +5,10 @@ use skein_protocol::config::{Observation, SacSection};
 use skein_protocol::seeds::{Purpose, derive};
 use tch::{Device, Tensor, no_grad_guard};
 
+use super::SacMetrics;
 use super::batch::Batch;
 use super::losses::{critic_loss, policy_loss, soft_targets, temperature_loss};
-use super::{Columns, SacMetrics};
+use crate::algorithm::Columns;
 use crate::error::{UpdateError, finite};
 use crate::networks::{Critic, Layout, Parameters, Policy};
 use crate::noise::Noise;
@@ -40,10 +41,10 @@ impl TorchSac {
         let (inputs, width) = (observation.len() as i64, section.hidden_width as i64);
         let mut layout = Layout::default();
         let policy = Policy::describe(&mut layout, inputs, width);
-        let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::SacParameters, 0), device);
+        let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 0), device);
         let mut layout = Layout::default();
         let critic = Critic::describe(&mut layout, inputs, width);
-        let critic_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::SacParameters, 1), device);
+        let critic_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 1), device);
         let log_temperature = Tensor::from_slice(&[section.initial_temperature.ln() as f32])
             .to_device(device)
             .set_requires_grad(true);

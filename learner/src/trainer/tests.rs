@@ -52,7 +52,7 @@ fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
     let done = (trainer.vae_updates() - before.0, trainer.updates() - before.1);
     let booked = |stage| timer.times().of(stage).count;
     assert_eq!((booked(Stage::SampleImages), booked(Stage::Sample)), done);
-    assert_eq!((booked(Stage::VaeStep), booked(Stage::SacUpdate)), done);
+    assert_eq!((booked(Stage::VaeStep), booked(Stage::PolicyUpdate)), done);
 }
 
 fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
@@ -62,7 +62,7 @@ fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
             epochs,
             environment_steps: trainer.steps(),
             vae_steps: trainer.vae_updates(),
-            sac_updates: trainer.updates(),
+            policy_updates: trainer.updates(),
             ..Progress::start(config().evaluation.window_flights as usize)
         },
         tensors: trainer.tensors(),
@@ -104,7 +104,7 @@ fn train(lag: u64, resumed_after: &[u64]) -> CheckpointState {
 fn a_resumed_trainer_goes_on_bit_for_bit_whenever_it_is_resumed() {
     for lag in [0, 1] {
         let undisturbed = train(lag, &[]);
-        assert!(undisturbed.progress.vae_steps > 3 && undisturbed.progress.sac_updates > 10);
+        assert!(undisturbed.progress.vae_steps > 3 && undisturbed.progress.policy_updates > 10);
         assert!(undisturbed.replay.images.is_none(), "the VAE was never frozen");
         // While the VAE is trained, as it is frozen after the third epoch, and later.
         for after in [&[2][..], &[1, 2, 3, 4, 5]] {
@@ -152,7 +152,7 @@ fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
             .map(code)
             .collect();
         let mut drawn = Minibatch::default();
-        let mut rng = trainer.rng(Purpose::SacBatches, Epoch(9));
+        let mut rng = trainer.rng(Purpose::PolicyBatches, Epoch(9));
         trainer.replay().sample(&mut rng, 200, &mut drawn);
         let rows = drawn.observations.chunks(drawn.observations.len() / 200);
         for observation in rows {

@@ -202,7 +202,7 @@ impl<'a> Training<'a> {
             policy_sha256: newest.map(Snapshot::sha256).unwrap_or_default(),
             environment_steps: self.trainer.steps(),
             vae_steps: self.trainer.vae_updates(),
-            sac_updates: self.trainer.updates(),
+            policy_updates: self.trainer.updates(),
             in_the_air: self.in_the_air.iter().map(|epoch| epoch.order).collect(),
             metrics: self.metrics.state(),
             spent: self
@@ -346,7 +346,7 @@ fn first_line(config: &Config, saved: &Progress) -> progress::Progress {
     progress::Progress {
         flights: saved.flights,
         steps: saved.environment_steps,
-        updates: saved.sac_updates,
+        updates: saved.policy_updates,
         vae_updates: saved.vae_steps,
         walls_passed: windows.walls_passed.mean(),
         mean_return: windows.total_reward.mean(),
@@ -369,7 +369,7 @@ fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &P
         trained: progress.trained,
         flights: progress.flights,
         steps: progress.environment_steps,
-        updates: progress.sac_updates,
+        updates: progress.policy_updates,
         vae_updates: progress.vae_steps,
         evaluation_flights: progress.evaluation_flights,
         tickets_reissued: progress.spent.tickets_reissued.values().sum(),

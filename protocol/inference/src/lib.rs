@@ -59,7 +59,7 @@ impl Network {
         Self {
             version: snapshot.version,
             encoder: encoder(snapshot, layout, precision),
-            policy: Policy::new(Isa::best(), tensors(snapshot, layout)),
+            policy: Policy::new(Isa::best(), layout.head(), tensors(snapshot, layout)),
         }
     }
 

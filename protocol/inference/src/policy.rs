@@ -1,11 +1,11 @@
-//! The policy: observation to action by a squashed Gaussian (arXiv:1812.05905, appendix C).
+//! The policy: observation to action, by a squashed Gaussian (arXiv:1812.05905, appendix C) or with noise added (arXiv:1802.09477).
 //!
-//! Three hidden layers with ReLU, then mean and logarithm of the standard deviation of each of the two commands.
+//! Three hidden layers with ReLU, then what [`PolicyHead`] says.
 
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use skein_kernels::{Finish, Isa};
-use skein_protocol::snapshot::POLICY_LAYERS;
+use skein_protocol::snapshot::{POLICY_LAYERS, PolicyHead};
 use skein_protocol::{ACTION, LOG_STD};
 
 use crate::linear::Linear;
@@ -14,6 +14,7 @@ use crate::linear::Linear;
 #[derive(Debug)]
 pub struct Policy {
     layers: [Linear; POLICY_LAYERS],
+    head: PolicyHead,
 }
 
 /// Working memory of one thread.
@@ -23,13 +24,23 @@ pub struct PolicyScratch {
     values: [Vec<f32>; 2],
 }
 
-/// The Gaussian that is squashed into an action, by its parameters before the squashing.
+/// What a policy would do.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ActionDistribution {
-    /// `[2]`.
-    pub mean: [f32; ACTION],
-    /// Natural logarithm of the standard deviation, `[2]`, within [-20, 2].
-    pub log_std: [f32; ACTION],
+pub enum ActionDistribution {
+    /// A Gaussian that is squashed into an action, by its parameters before the squashing.
+    SquashedGaussian {
+        /// `[2]`.
+        mean: [f32; ACTION],
+        /// Natural logarithm of the standard deviation, `[2]`, within [-20, 2].
+        log_std: [f32; ACTION],
+    },
+    /// An action, and noise about it.
+    Noisy {
+        /// `[2]`, inside (-1, 1).
+        action: [f32; ACTION],
+        /// Standard deviation.
+        std: f32,
+    },
 }
 
 impl Policy {
@@ -37,12 +48,12 @@ impl Policy {
     ///
     /// # Panics
     /// When a tensor has not the length its shape asks for.
-    pub fn new<'a>(isa: Isa, tensor: impl Fn(&str) -> &'a [f32]) -> Self {
+    pub fn new<'a>(isa: Isa, head: PolicyHead, tensor: impl Fn(&str) -> &'a [f32]) -> Self {
         let layers = std::array::from_fn(|index| {
             let name = format!("policy.layer{}", index + 1);
             Linear::new(isa, tensor(&format!("{name}.weight")), tensor(&format!("{name}.bias")))
         });
-        Self { layers }
+        Self { layers, head }
     }
 
     /// The distribution of actions for an observation, `[Observation::len]`.
@@ -60,10 +71,16 @@ impl Policy {
             std::mem::swap(input, output);
         }
         let mut outputs = [0.0; 2 * ACTION];
-        last.apply(input, Finish::Plain, &mut outputs);
-        ActionDistribution {
-            mean: std::array::from_fn(|axis| outputs[axis]),
-            log_std: std::array::from_fn(|axis| outputs[ACTION + axis].clamp(LOG_STD.0, LOG_STD.1)),
+        last.apply(input, Finish::Plain, &mut outputs[..self.head.outputs()]);
+        match self.head {
+            PolicyHead::SquashedGaussian => ActionDistribution::SquashedGaussian {
+                mean: std::array::from_fn(|axis| outputs[axis]),
+                log_std: std::array::from_fn(|axis| outputs[ACTION + axis].clamp(LOG_STD.0, LOG_STD.1)),
+            },
+            PolicyHead::Noisy(std) => ActionDistribution::Noisy {
+                action: std::array::from_fn(|axis| outputs[axis].tanh()),
+                std,
+            },
         }
     }
 }
@@ -71,14 +88,20 @@ impl Policy {
 impl ActionDistribution {
     /// The action without noise, each command in [-1, 1].
     pub fn mode(&self) -> [f32; ACTION] {
-        self.mean.map(f32::tanh)
+        match self {
+            Self::SquashedGaussian { mean, .. } => mean.map(f32::tanh),
+            Self::Noisy { action, .. } => *action,
+        }
     }
 
     /// An action drawn at random, each command in [-1, 1].
     pub fn sample(&self, rng: &mut impl Rng) -> [f32; ACTION] {
         std::array::from_fn(|axis| {
             let noise: f32 = StandardNormal.sample(rng);
-            (self.mean[axis] + self.log_std[axis].exp() * noise).tanh()
+            match self {
+                Self::SquashedGaussian { mean, log_std } => (mean[axis] + log_std[axis].exp() * noise).tanh(),
+                Self::Noisy { action, std } => (action[axis] + std * noise).clamp(-1.0, 1.0),
+            }
         })
     }
 }
@@ -107,7 +130,16 @@ mod tests {
     }
 
     fn policy() -> Policy {
-        Policy::new(Isa::best(), |name| parameters(name).leak())
+        Policy::new(Isa::best(), PolicyHead::SquashedGaussian, |name| {
+            parameters(name).leak()
+        })
+    }
+
+    fn gaussian(policy: &Policy, observation: &[f32]) -> ([f32; ACTION], [f32; ACTION]) {
+        match policy.distribution(observation, &mut PolicyScratch::default()) {
+            ActionDistribution::SquashedGaussian { mean, log_std } => (mean, log_std),
+            other => panic!("{other:?}"),
+        }
     }
 
     #[test]
@@ -125,19 +157,19 @@ mod tests {
                 })
                 .collect();
         }
-        let found = policy().distribution(&observation, &mut PolicyScratch::default());
+        let (mean, log_std) = gaussian(&policy(), &observation);
         for axis in 0..ACTION {
-            assert!((found.mean[axis] - values[axis]).abs() < 1e-6, "{found:?} {values:?}");
+            assert!((mean[axis] - values[axis]).abs() < 1e-6, "{mean:?} {values:?}");
             assert!(
-                (found.log_std[axis] - values[ACTION + axis]).abs() < 1e-6,
-                "{found:?} {values:?}"
+                (log_std[axis] - values[ACTION + axis]).abs() < 1e-6,
+                "{log_std:?} {values:?}"
             );
         }
     }
 
     #[test]
     fn samples_have_the_stated_mean_and_spread_and_stay_within_bounds() {
-        let distribution = ActionDistribution {
+        let distribution = ActionDistribution::SquashedGaussian {
             mean: [0.5, -3.0],
             log_std: [-1.0, 2.0],
         };
@@ -153,7 +185,7 @@ mod tests {
 
     #[test]
     fn the_mode_is_the_squashed_mean() {
-        let distribution = ActionDistribution {
+        let distribution = ActionDistribution::SquashedGaussian {
             mean: [0.5, -40.0],
             log_std: [0.0, 0.0],
         };
@@ -162,14 +194,37 @@ mod tests {
 
     #[test]
     fn an_extreme_spread_is_bounded() {
-        let wild = Policy::new(Isa::best(), |name| {
+        let wild = Policy::new(Isa::best(), PolicyHead::SquashedGaussian, |name| {
             let mut values = parameters(name);
             if name == "policy.layer4.bias" {
                 values[ACTION..].copy_from_slice(&[1e3, -1e3]);
             }
             values.leak()
         });
-        let found = wild.distribution(&[0.0; OBSERVATION], &mut PolicyScratch::default());
-        assert_eq!(found.log_std, [2.0, -20.0]);
+        let (_, log_std) = gaussian(&wild, &[0.0; OBSERVATION]);
+        assert_eq!(log_std, [2.0, -20.0]);
+    }
+
+    #[test]
+    fn noise_is_added_to_an_action_and_the_sum_stays_within_bounds() {
+        let distribution = ActionDistribution::Noisy {
+            action: [0.2, 0.95],
+            std: 0.1,
+        };
+        assert_eq!(distribution.mode(), [0.2, 0.95]);
+        let mut rng = Pcg64Mcg::seed_from_u64(1);
+        let draws: Vec<_> = (0..20_000).map(|_| distribution.sample(&mut rng)).collect();
+        let (mean, count) = (draws.iter().map(|draw| draw[0]).sum::<f32>() / 2e4, draws.len() as f32);
+        let variance = draws.iter().map(|draw| (draw[0] - mean).powi(2)).sum::<f32>() / count;
+        assert!(
+            (mean - 0.2).abs() < 3e-3 && (variance.sqrt() - 0.1).abs() < 3e-3,
+            "{mean} {variance}"
+        );
+        let at_the_bound = draws.iter().filter(|draw| draw[1] == 1.0).count() as f32 / count;
+        // Half a standard deviation away: 31 % of a Gaussian lie beyond.
+        assert!(
+            draws.iter().all(|draw| draw[1] <= 1.0) && (at_the_bound - 0.309).abs() < 0.02,
+            "{at_the_bound}"
+        );
     }
 }

@@ -1,5 +1,7 @@
 //! `[learning]`.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require};
@@ -9,11 +11,13 @@ use crate::{ACTION, LATENT};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearningSection {
+    /// What learns the policy: `sac` or `td3`, each with a section of its own. Default `sac`, as in the paper.
+    pub algorithm: AlgorithmName,
     /// Flights flown with one frozen snapshot before the networks are updated. 1 is the paper's delayed learning. Default 10.
     pub flights_per_epoch: u64,
     /// Epochs a snapshot is behind when it is flown: 0 flies the newest; 1 lets actors fly while the learner updates. Default 0.
     pub policy_lag: u64,
-    /// SAC updates per environment step, done at the end of the epoch. Default 0.5.
+    /// Policy updates per environment step, done at the end of the epoch. Default 0.5.
     pub updates_per_step: f64,
     /// Environment steps flown at random before the first update (paper: 2000). Default 2000.
     pub warmup_steps: usize,
@@ -28,6 +32,7 @@ pub struct LearningSection {
 impl Default for LearningSection {
     fn default() -> Self {
         Self {
+            algorithm: AlgorithmName::Sac,
             flights_per_epoch: 10,
             policy_lag: 0,
             updates_per_step: 0.5,
@@ -71,6 +76,25 @@ impl LearningSection {
             self.levels,
             "is below 1: no flight could start",
         )
+    }
+}
+
+/// A learning algorithm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum AlgorithmName {
+    /// Soft actor-critic.
+    Sac,
+    /// Twin delayed deep deterministic policy gradient.
+    Td3,
+}
+
+impl fmt::Display for AlgorithmName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Sac => "sac",
+            Self::Td3 => "td3",
+        })
     }
 }
 

@@ -11,6 +11,7 @@ mod portable;
 mod replay;
 mod run;
 mod sac;
+mod td3;
 mod transport;
 mod vae;
 
@@ -19,10 +20,11 @@ use serde::{Deserialize, Serialize};
 pub use courses::CoursesSection;
 pub use evaluation::EvaluationSection;
 pub use file::{ConfigError, culprit};
-pub use learning::{LearningSection, Observation};
+pub use learning::{AlgorithmName, LearningSection, Observation};
 pub use replay::{ReplaySection, SuccessRule};
 pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};
+pub use td3::Td3Section;
 pub use transport::TransportSection;
 pub use vae::{Precision, VaeSection};
 
@@ -38,6 +40,8 @@ pub struct Config {
     pub learning: LearningSection,
     /// Soft actor-critic.
     pub sac: SacSection,
+    /// Twin delayed deep deterministic policy gradient.
+    pub td3: Td3Section,
     /// Variational auto-encoder.
     pub vae: VaeSection,
     /// Split replay buffer.
@@ -53,6 +57,14 @@ pub struct Config {
 }
 
 impl Config {
+    /// Transitions in a minibatch of the algorithm that is used.
+    pub fn batch_size(&self) -> usize {
+        match self.learning.algorithm {
+            AlgorithmName::Sac => self.sac.batch_size,
+            AlgorithmName::Td3 => self.td3.batch_size,
+        }
+    }
+
     /// Checks every key, and keys against each other.
     ///
     /// # Errors
@@ -62,6 +74,7 @@ impl Config {
         self.courses.validate()?;
         self.learning.validate()?;
         self.sac.validate()?;
+        self.td3.validate()?;
         self.vae.validate()?;
         self.replay.validate()?;
         self.evaluation.validate()?;
@@ -84,9 +97,22 @@ impl Config {
             ),
         )?;
         require(
-            self.sac.batch_size <= self.learning.warmup_steps.max(1),
-            "sac.batch_size",
-            self.sac.batch_size,
+            self.learning.algorithm == AlgorithmName::Sac || self.run.engine() == Engine::Native,
+            "run.engine",
+            self.run.engine(),
+            format!(
+                "does not compute learning.algorithm = \"{}\", which is written for the native engine alone: set run.engine to \"native\" and run.device to \"cpu\"",
+                self.learning.algorithm
+            ),
+        )?;
+        let batch_size = match self.learning.algorithm {
+            AlgorithmName::Sac => "sac.batch_size",
+            AlgorithmName::Td3 => "td3.batch_size",
+        };
+        require(
+            self.batch_size() <= self.learning.warmup_steps.max(1),
+            batch_size,
+            self.batch_size(),
             format!(
                 "exceeds learning.warmup_steps = {}: the first update would have too few transitions to draw from",
                 self.learning.warmup_steps

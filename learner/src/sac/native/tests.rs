@@ -4,7 +4,7 @@ use skein_protocol::config::Observation;
 use tch::Device;
 
 use super::super::TorchSac;
-use super::super::tests::Transitions;
+use super::super::samples::Transitions;
 use super::*;
 use crate::state::{NamedTensor, TensorValues};
 

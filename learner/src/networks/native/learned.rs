@@ -6,9 +6,11 @@ use crate::state::Part;
 
 /// A network's parameters, or log α.
 #[derive(Debug)]
-pub(super) struct Learned {
-    pub(super) values: Vec<f32>,
-    pub(super) gradient: Vec<f32>,
+pub struct Learned {
+    /// Its numbers.
+    pub values: Vec<f32>,
+    /// What the next step goes against.
+    pub gradient: Vec<f32>,
     first_moment: Vec<f32>,
     second_moment: Vec<f32>,
     steps: u64,
@@ -17,7 +19,7 @@ pub(super) struct Learned {
 
 impl Learned {
     /// Before its first step.
-    pub(super) fn new(values: Vec<f32>, learning_rate: f64) -> Self {
+    pub fn new(values: Vec<f32>, learning_rate: f64) -> Self {
         let zeros = || vec![0.0; values.len()];
         Self {
             gradient: zeros(),
@@ -30,12 +32,12 @@ impl Learned {
     }
 
     /// Steps done so far.
-    pub(super) fn steps(&self) -> u64 {
+    pub fn steps(&self) -> u64 {
         self.steps
     }
 
     /// One step of Adam against the gradient.
-    pub(super) fn step(&mut self, team: &mut Team, isa: Isa) {
+    pub fn step(&mut self, team: &mut Team, isa: Isa) {
         self.steps += 1;
         let step = AdamStep {
             learning_rate: self.learning_rate,
@@ -46,7 +48,7 @@ impl Learned {
     }
 
     /// The values under `name`, and Adam's state under names that begin with `adam`.
-    pub(super) fn parts(&mut self, name: &str, adam: &str) -> Vec<(String, Part<'_>)> {
+    pub fn parts(&mut self, name: &str, adam: &str) -> Vec<(String, Part<'_>)> {
         vec![
             (name.to_owned(), Part::Numbers(&mut self.values)),
             (format!("{adam}.first_moment"), Part::Numbers(&mut self.first_moment)),
@@ -57,7 +59,7 @@ impl Learned {
 }
 
 /// Squared length of a gradient: infinite or not a number if one of its numbers is, or if it overflows. Sixteen sums side by side, the same on every processor.
-pub(super) fn squared_norm(isa: Isa, gradient: &[f32]) -> f32 {
+pub fn squared_norm(isa: Isa, gradient: &[f32]) -> f32 {
     isa.vectorised(
         #[inline(always)]
         || {

@@ -19,7 +19,7 @@ const ROW_GRAIN: usize = 12;
 const COLUMN_GRAIN: usize = 64;
 
 /// What there is of each layer for so many rows, `[rows, outputs]` each: what it gave, or what flows back to its sums.
-pub(super) type Layers = Vec<Vec<f32>>;
+pub type Layers = Vec<Vec<f32>>;
 
 thread_local! {
     /// Two layers' numbers for rows that are under way, when nobody needs them later.
@@ -28,7 +28,7 @@ thread_local! {
 
 /// A network's layers.
 #[derive(Debug)]
-pub(super) struct Dense {
+pub struct Dense {
     isa: Isa,
     layers: Vec<Layer>,
 }
@@ -51,7 +51,7 @@ impl Layer {
 
 impl Dense {
     /// The layers of a layout: a weight, `[outputs, inputs]`, and a bias for each.
-    pub(super) fn new(isa: Isa, layout: &Layout) -> Self {
+    pub fn new(isa: Isa, layout: &Layout) -> Self {
         let mut start = 0;
         let mut place = |len: usize| {
             start += len;
@@ -71,7 +71,7 @@ impl Dense {
     }
 
     /// Places for what each layer gives for so many rows.
-    pub(super) fn places(&self, rows: usize) -> Layers {
+    pub fn places(&self, rows: usize) -> Layers {
         let places = self.layers.iter().map(|layer| vec![0.0; rows * layer.outputs]);
         places.collect()
     }
@@ -107,7 +107,7 @@ impl Dense {
     }
 
     /// h₀ = `input`, `[rows, inputs]`; fills `given` with all hᵢ.
-    pub(super) fn forward(&self, team: &mut Team, parameters: &[f32], input: &[f32], given: &mut Layers) {
+    pub fn forward(&self, team: &mut Team, parameters: &[f32], input: &[f32], given: &mut Layers) {
         let mut parts = self.parts(input.len() / self.inputs(), team.size(), given);
         team.split_rows(&mut parts, 1, 1, |_, parts| {
             for Part { first, layers } in parts {
@@ -122,7 +122,7 @@ impl Dense {
     }
 
     /// [`Dense::forward`] of which only the last layer's is kept, in `output`.
-    pub(super) fn forward_through(&self, team: &mut Team, parameters: &[f32], input: &[f32], output: &mut [f32]) {
+    pub fn forward_through(&self, team: &mut Team, parameters: &[f32], input: &[f32], output: &mut [f32]) {
         let rows_each = rows_each(output.len() / self.outputs(), team.size());
         let mut parts: Vec<_> = output.chunks_mut(rows_each * self.outputs()).collect();
         team.split_rows(&mut parts, 1, 1, |first, parts| {
@@ -145,7 +145,7 @@ impl Dense {
     }
 
     /// What flows back to each layer's sums zᵢ = hᵢ₋₁ Wᵢᵀ + bᵢ. The last of `flowing` is given, the others are filled. `given`: what the layers gave for the same rows.
-    pub(super) fn backward(&self, team: &mut Team, parameters: &[f32], given: &Layers, flowing: &mut Layers) {
+    pub fn backward(&self, team: &mut Team, parameters: &[f32], given: &Layers, flowing: &mut Layers) {
         let rows = flowing[0].len() / self.layers[0].outputs;
         let mut parts = self.parts(rows, team.size(), flowing);
         team.split_rows(&mut parts, 1, 1, |_, parts| {
@@ -162,7 +162,7 @@ impl Dense {
     }
 
     /// What flows back to some columns of the input, `[rows, columns]`, from what flows to the last layer's sums, `[rows, outputs]`. `given`: as for [`Dense::backward`].
-    pub(super) fn backward_through(
+    pub fn backward_through(
         &self,
         team: &mut Team,
         parameters: &[f32],
@@ -194,7 +194,7 @@ impl Dense {
     }
 
     /// The gradient of all parameters, summed over rows: ∂Wᵢ = ∂zᵢᵀ hᵢ₋₁, ∂bᵢ = Σ ∂zᵢ. `given` and `flowing`: of as many rows as `input`.
-    pub(super) fn gradient(&self, team: &mut Team, input: &[f32], given: &Layers, flowing: &Layers, into: &mut [f32]) {
+    pub fn gradient(&self, team: &mut Team, input: &[f32], given: &Layers, flowing: &Layers, into: &mut [f32]) {
         for (index, layer) in self.layers.iter().enumerate() {
             let (flowing, inputs) = (&flowing[index], layer.inputs);
             let input = if index == 0 { input } else { &given[index - 1] };
@@ -249,11 +249,11 @@ struct Part<'a> {
 }
 
 /// What the last layer gave.
-pub(super) fn output(layers: &Layers) -> &[f32] {
+pub fn output(layers: &Layers) -> &[f32] {
     layers.last().expect("a network has layers")
 }
 
 /// As [`output`].
-pub(super) fn output_mut(layers: &mut Layers) -> &mut [f32] {
+pub fn output_mut(layers: &mut Layers) -> &mut [f32] {
     layers.last_mut().expect("a network has layers")
 }

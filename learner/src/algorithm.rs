@@ -1,0 +1,100 @@
+//! What a learning algorithm is to the rest of the learner, and which there are.
+//!
+//! It gets minibatches and noise, and gives a policy; replay, transport and actors know nothing of it. Another one is a module beside [`crate::sac`] and [`crate::td3`] that
+//! implements [`Algorithm`], a section of its settings, and an entry in each of two lists: [`new`] here, and the names in `skein_protocol::config::AlgorithmName`.
+
+use std::fmt;
+
+use skein_kernels::{Isa, Team};
+use skein_protocol::ACTION;
+use skein_protocol::config::{AlgorithmName, Config};
+use tch::Device;
+
+use crate::error::UpdateError;
+use crate::metrics::Scalar;
+use crate::networks::Layout;
+use crate::noise::Noise;
+use crate::sac::Sac;
+use crate::state::Stateful;
+use crate::td3::Td3;
+
+/// A way to learn a policy from transitions.
+///
+/// Its state is what [`Stateful::parts`] names: networks begin as functions of the run's seed, and all noise comes from the caller, so that an algorithm restored from its state
+/// goes on bit for bit.
+pub trait Algorithm: Stateful + fmt::Debug {
+    /// One update from a minibatch, on the threads of `team`. What it returns are points of curves, the same ones each time.
+    ///
+    /// # Errors
+    /// [`UpdateError::NonFinite`] names what was not finite and the update's number; nothing was changed then.
+    ///
+    /// # Panics
+    /// When the columns have different numbers of rows, or none.
+    fn update(
+        &mut self,
+        team: &mut Team,
+        columns: Columns<'_>,
+        noise: &mut Noise,
+    ) -> Result<Vec<(Scalar, f32)>, UpdateError>;
+
+    /// Updates done so far.
+    fn updates(&self) -> u64;
+
+    /// Names and shapes of what [`Algorithm::publish`] copies.
+    fn policy_layout(&self) -> &Layout;
+
+    /// Copies the policy's part of a snapshot, in the snapshot layout's order.
+    ///
+    /// # Panics
+    /// When `into` is not as long as the layout.
+    fn publish(&self, into: &mut [f32]);
+}
+
+/// The algorithm that a configuration names, untrained. `device`: libtorch's; the native engine is on the processor.
+pub fn new(config: &Config, device: Device) -> Box<dyn Algorithm> {
+    let (observation, seed) = (config.learning.observation, config.run.seed);
+    match config.learning.algorithm {
+        AlgorithmName::Sac => Box::new(Sac::new(&config.sac, observation, seed, config.run.engine(), device)),
+        AlgorithmName::Td3 => Box::new(Td3::new(&config.td3, observation, seed, Isa::best())),
+    }
+}
+
+/// A minibatch as the replay gathers it: one f32 slice for each column, rows back to back.
+#[derive(Debug, Clone, Copy)]
+pub struct Columns<'a> {
+    /// `[n, observation]`.
+    pub observations: &'a [f32],
+    /// `[n, 2]`.
+    pub actions: &'a [f32],
+    /// `[n]`.
+    pub rewards: &'a [f32],
+    /// `[n, observation]`: what was seen after the action, also where the flight ended there.
+    pub next_observations: &'a [f32],
+    /// `[n]`: 1 where the state after the action ends the task (a crash, the end wall), 0 elsewhere. A flight cut off by its step limit is not terminated.
+    pub terminated: &'a [f32],
+}
+
+impl Columns<'_> {
+    /// Looks whether the columns belong together; returns the number of their rows.
+    ///
+    /// # Panics
+    /// When they have different numbers of rows, or none.
+    pub(crate) fn check(&self, observation: usize) -> usize {
+        let rows = self.rewards.len();
+        assert!(rows > 0, "a minibatch has at least one transition");
+        for (column, width) in [
+            (self.observations, observation),
+            (self.actions, ACTION),
+            (self.next_observations, observation),
+            (self.terminated, 1),
+        ] {
+            let len = column.len();
+            assert_eq!(
+                len,
+                rows * width,
+                "every column of a minibatch has one row for each transition"
+            );
+        }
+        rows
+    }
+}

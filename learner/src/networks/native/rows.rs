@@ -1,0 +1,43 @@
+//! What every actor-critic does with rows of a critic and with a target network.
+
+use skein_kernels::{Isa, Team};
+use skein_protocol::ACTION;
+
+/// Q estimates of a critic.
+pub const ESTIMATES: usize = 2;
+
+/// Rows of observations and actions side by side.
+pub fn join(observations: &[f32], actions: &[f32], into: &mut [f32]) {
+    let rows = actions.len() / ACTION;
+    let (observation, width) = (observations.len() / rows, into.len() / rows);
+    for (row, into) in into.chunks_exact_mut(width).enumerate() {
+        into[..observation].copy_from_slice(&observations[row * observation..][..observation]);
+        into[observation..].copy_from_slice(&actions[row * ACTION..][..ACTION]);
+    }
+}
+
+/// A row's two estimates.
+pub fn pair(values: &[f32], row: usize) -> [f32; ESTIMATES] {
+    [values[row * ESTIMATES], values[row * ESTIMATES + 1]]
+}
+
+/// The smaller estimate; not a number if one of them is none.
+pub fn smaller([one, other]: [f32; ESTIMATES]) -> f32 {
+    if one < other || one.is_nan() { one } else { other }
+}
+
+/// Moves a target network by the share `rate` towards its leader.
+pub fn follow(team: &mut Team, isa: Isa, target: &mut [f32], leader: &[f32], rate: f32) {
+    /// Numbers that stay together: whole cache lines.
+    const GRAIN: usize = 1024;
+    team.split_rows(target, 1, GRAIN, |first, own| {
+        isa.vectorised(
+            #[inline(always)]
+            || {
+                for (own, leader) in own.iter_mut().zip(&leader[first..]) {
+                    *own = (leader - *own).mul_add(rate, *own);
+                }
+            },
+        );
+    });
+}

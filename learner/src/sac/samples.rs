@@ -1,0 +1,58 @@
+//! Transitions for tests.
+
+use skein_protocol::config::Observation;
+
+use crate::algorithm::Columns;
+use crate::noise::Noise;
+
+/// Transitions that own their columns.
+#[derive(Clone)]
+pub(crate) struct Transitions {
+    pub(crate) observations: Vec<f32>,
+    pub(crate) actions: Vec<f32>,
+    pub(crate) rewards: Vec<f32>,
+    pub(crate) next_observations: Vec<f32>,
+    pub(crate) terminated: Vec<f32>,
+}
+
+impl Transitions {
+    /// Numbers without a meaning; every third transition is the last of its task.
+    pub(crate) fn random(observation: Observation, rows: usize, noise: &mut Noise) -> Self {
+        let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(1.0)).collect() };
+        Self {
+            observations: draw(rows * observation.len()),
+            actions: draw(rows * 2),
+            rewards: draw(rows),
+            next_observations: draw(rows * observation.len()),
+            terminated: (0..rows).map(|row| f32::from(row % 3 == 1)).collect(),
+        }
+    }
+
+    /// A one-step task: the observation's first two numbers are the action that would have been right.
+    pub(crate) fn guessing(observation: Observation, rows: usize, noise: &mut Noise) -> Self {
+        let width = observation.len();
+        let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(0.8)).collect() };
+        let (observations, actions) = (draw(rows * width), draw(rows * 2));
+        let rewards = (0..rows).map(|row| {
+            let (wanted, done) = (&observations[row * width..][..2], &actions[row * 2..][..2]);
+            -((wanted[0] - done[0]).powi(2) + (wanted[1] - done[1]).powi(2))
+        });
+        Self {
+            rewards: rewards.collect(),
+            next_observations: observations.clone(),
+            terminated: vec![1.0; rows],
+            observations,
+            actions,
+        }
+    }
+
+    pub(crate) fn columns(&self) -> Columns<'_> {
+        Columns {
+            observations: &self.observations,
+            actions: &self.actions,
+            rewards: &self.rewards,
+            next_observations: &self.next_observations,
+            terminated: &self.terminated,
+        }
+    }
+}
