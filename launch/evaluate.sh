@@ -4,16 +4,17 @@ set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 
 help_if_asked "$@" <<END
-Usage: launch/evaluate.sh --run DIR | --snapshot FILE [--course FILE ...] [--flights N] [--json FILE] [--record FILE]
+Usage: launch/evaluate.sh --run DIR | --snapshot FILE [--course FILE ... | --suite FILE] [--flights N] [--json FILE] [--record FILE]
 
 Flies a trained snapshot from the start of level 1, without exploration noise, and prints per course how many flights passed
-each wall, the share R of walls passed, and how many courses were completed.
+each wall, the share R of walls passed, how many courses were completed, and what the other flights failed by.
 
 Options:
   --run DIR        evaluate the best snapshot of this run (the latest, if none was confirmed as best)
   --snapshot FILE  evaluate this snapshot
   --course FILE    fly this course; may be repeated [default: the evaluation courses of the snapshot's run]
-  --flights N      flights per course [default: evaluation.flights of that run, 100 as shipped]
+  --suite FILE     fly this suite of courses and disturbances, as configs/evaluations/generalist.toml
+  --flights N      flights per course or entry [default: evaluation.flights of that run, 100 as shipped, or what the suite says]
   --json FILE      write the table as JSON as well
   --record FILE    write every step (pose, velocity, depth image, latent, action, reward terms) as .npz, for numpy
   --threads N      threads to fly on; the result does not depend on it [default: one a core]

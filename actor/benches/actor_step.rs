@@ -89,10 +89,11 @@ fn environment(
     group.bench_function("environment", |bencher| {
         bencher.iter(|| {
             for (ticket, records) in tickets.iter().zip(flights) {
-                let simulator = simulators.of(ticket.course).expect("the course is loaded");
-                let mut start = Pcg64Mcg::seed_from_u64(derive(ticket.seed, Purpose::StartPosition, 0));
+                let simulator = simulators.of(ticket).expect("the course is loaded");
+                let [mut start, mut disturbances] = [Purpose::StartPosition, Purpose::Disturbances]
+                    .map(|purpose| Pcg64Mcg::seed_from_u64(derive(ticket.seed, purpose, 0)));
                 simulator
-                    .reset(ticket.start_level, &mut start)
+                    .reset(ticket.start_level, &mut start, &mut disturbances)
                     .expect("it has this level");
                 simulator.render(&mut image);
                 for record in steps_of(records) {

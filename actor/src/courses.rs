@@ -6,34 +6,40 @@ use std::path::Path;
 use std::sync::Arc;
 
 use skein_protocol::config::{Config, CoursesSection};
-use skein_protocol::ticket::CourseChoice;
+use skein_protocol::ids::FlightId;
+use skein_protocol::ticket::{CourseChoice, Ticket};
 use skein_simulator::course::{Course, CourseError, RangesError};
+use skein_simulator::disturbances::DisturbanceFault;
 use skein_simulator::simulator::{Simulator, SimulatorError, SimulatorSettings};
+use skein_simulator::suite::{EntryCourses, Suite, SuiteEntry};
 
 /// The courses a ticket may name, and how they are flown. Shared by the threads that fly them.
 #[derive(Debug)]
 pub struct Courses {
     settings: SimulatorSettings,
     training: Option<Arc<Course>>,
-    evaluation: Vec<EvaluationCourse>,
+    evaluation: Vec<EvaluationEntry>,
 }
 
-/// A course that evaluations fly.
+/// What a ticket of [`CourseChoice::Evaluation`] names: a course, or several that its flights fly in turn.
 #[derive(Debug)]
-pub struct EvaluationCourse {
-    /// What reports call it: its file's name without the extension.
-    pub name: String,
-    /// The course.
-    pub course: Arc<Course>,
+pub struct EvaluationEntry {
+    /// Courses, and what reports call them.
+    pub entry: SuiteEntry,
+    /// How they are flown: the run's settings with the entry's disturbances.
+    settings: SimulatorSettings,
 }
 
 /// Simulators of one thread.
 pub struct Simulators {
     courses: Arc<Courses>,
     fixed: HashMap<CourseChoice, Simulator>,
-    /// A generated course is flown once, so only the last is kept: a ticket issued again may come back to it.
-    generated: Option<(u64, Simulator)>,
+    /// Where every flight has a course of its own, only the last is kept: a ticket issued again may come back to it.
+    passing: Option<(Passing, Simulator)>,
 }
+
+/// A course that is flown once or seldom: the choice, and its number within that.
+type Passing = (CourseChoice, u64);
 
 impl Courses {
     /// The courses that a run's configuration names.
@@ -42,40 +48,131 @@ impl Courses {
     /// [`CoursesError`] names the file or the key.
     pub fn of_run(config: &Config) -> Result<Self, CoursesError> {
         Ok(Self {
-            settings: simulator_settings(config)?,
             training: Some(load(&config.courses.training)?),
-            evaluation: evaluation_courses(&config.courses.evaluation)?,
+            ..Self::of_files(config, &config.courses.evaluation)?
         })
     }
 
-    /// The courses in the files `paths`, as evaluation courses, and no others.
+    /// The courses in the files `paths`, as evaluation courses flown as in the run, and no others.
     ///
     /// # Errors
     /// [`CoursesError`] names the file or the key.
     pub fn of_files<P: AsRef<Path>>(config: &Config, paths: &[P]) -> Result<Self, CoursesError> {
+        let settings = simulator_settings(config)?;
+        let entry = |path: &P| {
+            let entry = SuiteEntry {
+                name: CoursesSection::name_of(path.as_ref()),
+                flights: config.evaluation.flights,
+                courses: EntryCourses::Listed(vec![load(path.as_ref())?]),
+                disturbances: settings.disturbances.clone(),
+            };
+            Ok(EvaluationEntry {
+                entry,
+                settings: settings.clone(),
+            })
+        };
+        let evaluation = paths.iter().map(entry).collect::<Result<_, CoursesError>>()?;
         Ok(Self {
-            settings: simulator_settings(config)?,
+            settings,
             training: None,
-            evaluation: evaluation_courses(paths)?,
+            evaluation,
         })
     }
 
-    /// The evaluation courses in order.
-    pub fn evaluation(&self) -> &[EvaluationCourse] {
-        &self.evaluation
+    /// What `suite` names, with the run's drone and camera and the suite's disturbances.
+    ///
+    /// # Errors
+    /// [`CoursesError`] names the key.
+    pub fn of_suite(config: &Config, suite: Suite) -> Result<Self, CoursesError> {
+        let settings = simulator_settings(config)?;
+        let entry = |entry: SuiteEntry| {
+            entry
+                .disturbances
+                .check(&settings.vehicle, &settings.camera)
+                .map_err(|source| CoursesError::Disturbances {
+                    entry: entry.name.clone(),
+                    source,
+                })?;
+            let settings = SimulatorSettings {
+                disturbances: entry.disturbances.clone(),
+                ..settings.clone()
+            };
+            Ok(EvaluationEntry { entry, settings })
+        };
+        let evaluation = suite
+            .entries
+            .into_iter()
+            .map(entry)
+            .collect::<Result<_, CoursesError>>()?;
+        Ok(Self {
+            settings,
+            training: None,
+            evaluation,
+        })
     }
 
-    fn course(&self, choice: CourseChoice) -> Result<Arc<Course>, NoCourse> {
-        match choice {
-            CourseChoice::Training => self.training.clone().ok_or(NoCourse::NotLoaded { choice }),
-            CourseChoice::Evaluation(index) => self
-                .evaluation
-                .get(index as usize)
-                .map(|evaluated| Arc::clone(&evaluated.course))
-                .ok_or(NoCourse::NotLoaded { choice }),
-            CourseChoice::Generated(seed) => Ok(Arc::new(Course::generate(seed, &self.settings.generator)?)),
+    /// The same with `flights` evaluation flights of each entry.
+    #[must_use]
+    pub fn with_flights(mut self, flights: u64) -> Self {
+        for evaluated in &mut self.evaluation {
+            evaluated.entry.flights = flights;
         }
+        self
     }
+
+    /// What evaluations fly, in order.
+    pub fn evaluation(&self) -> impl ExactSizeIterator<Item = &SuiteEntry> {
+        self.evaluation.iter().map(|evaluated| &evaluated.entry)
+    }
+
+    /// How training is flown, and what evaluations of files add nothing to.
+    pub fn settings(&self) -> &SimulatorSettings {
+        &self.settings
+    }
+
+    fn entry(&self, choice: CourseChoice, index: u32) -> Result<&EvaluationEntry, NoCourse> {
+        self.evaluation
+            .get(index as usize)
+            .ok_or(NoCourse::NotLoaded { choice })
+    }
+
+    /// A simulator of the course that `ticket` names.
+    fn build(&self, ticket: &Ticket) -> Result<Simulator, NoCourse> {
+        let choice = ticket.course;
+        let (course, settings) = match choice {
+            CourseChoice::Training => {
+                let course = self.training.clone().ok_or(NoCourse::NotLoaded { choice })?;
+                (course, &self.settings)
+            }
+            CourseChoice::Evaluation(index) => {
+                let EvaluationEntry { entry, settings } = self.entry(choice, index)?;
+                (entry.courses.of_flight(evaluation_flight(ticket))?, settings)
+            }
+            CourseChoice::Generated(seed) => (
+                Arc::new(Course::generate(seed, &self.settings.generator)?),
+                &self.settings,
+            ),
+        };
+        Ok(Simulator::new(course, settings)?)
+    }
+
+    /// What tells the ticket's course from others that pass; `None` if it is flown again and again.
+    fn passing(&self, ticket: &Ticket) -> Result<Option<Passing>, NoCourse> {
+        let choice = ticket.course;
+        Ok(match choice {
+            CourseChoice::Training => None,
+            CourseChoice::Generated(_) => Some((choice, 0)),
+            CourseChoice::Evaluation(index) => match &self.entry(choice, index)?.entry.courses {
+                EntryCourses::Listed(courses) if courses.len() == 1 => None,
+                several => Some((choice, several.number_of(evaluation_flight(ticket)))),
+            },
+        })
+    }
+}
+
+/// The flight's number within its evaluation, from 0: the one that says which of several courses it flies.
+fn evaluation_flight(ticket: &Ticket) -> u64 {
+    ticket.flight.0.saturating_sub(FlightId::FIRST_EVALUATION.0)
 }
 
 impl Simulators {
@@ -84,50 +181,38 @@ impl Simulators {
         Self {
             courses,
             fixed: HashMap::new(),
-            generated: None,
+            passing: None,
         }
     }
 
     /// How courses are flown.
     pub fn settings(&self) -> &SimulatorSettings {
-        &self.courses.settings
+        self.courses.settings()
     }
 
     /// The simulator of the course a ticket names.
     ///
     /// # Errors
     /// [`NoCourse`] says what is wrong with the choice.
-    pub fn of(&mut self, choice: CourseChoice) -> Result<&mut Simulator, NoCourse> {
+    pub fn of(&mut self, ticket: &Ticket) -> Result<&mut Simulator, NoCourse> {
         let Self {
             courses,
             fixed,
-            generated,
+            passing,
         } = self;
-        let build = || Ok::<_, NoCourse>(Simulator::new(courses.course(choice)?, &courses.settings)?);
-        match choice {
-            CourseChoice::Generated(seed) => {
-                if generated.as_ref().is_none_or(|(built, _)| *built != seed) {
-                    *generated = Some((seed, build()?));
+        match courses.passing(ticket)? {
+            Some(wanted) => {
+                if passing.as_ref().is_none_or(|(built, _)| *built != wanted) {
+                    *passing = Some((wanted, courses.build(ticket)?));
                 }
-                Ok(&mut generated.as_mut().expect("it was built in the lines above").1)
+                Ok(&mut passing.as_mut().expect("it was built in the lines above").1)
             }
-            CourseChoice::Training | CourseChoice::Evaluation(_) => Ok(match fixed.entry(choice) {
+            None => Ok(match fixed.entry(ticket.course) {
                 Entry::Occupied(entry) => entry.into_mut(),
-                Entry::Vacant(entry) => entry.insert(build()?),
+                Entry::Vacant(entry) => entry.insert(courses.build(ticket)?),
             }),
         }
     }
-}
-
-fn evaluation_courses<P: AsRef<Path>>(paths: &[P]) -> Result<Vec<EvaluationCourse>, CoursesError> {
-    let load = |path: &P| {
-        let name = CoursesSection::name_of(path.as_ref());
-        Ok(EvaluationCourse {
-            name,
-            course: load(path.as_ref())?,
-        })
-    };
-    paths.iter().map(load).collect()
 }
 
 fn load(path: &Path) -> Result<Arc<Course>, CoursesError> {
@@ -149,6 +234,14 @@ pub enum CoursesError {
     /// The configuration's simulator section is wrong.
     #[error("[simulator] {0}")]
     Settings(String),
+    /// The drone cannot be disturbed as an entry of a suite asks for.
+    #[error("entry \"{entry}\": {source}")]
+    Disturbances {
+        /// The entry.
+        entry: String,
+        /// Why.
+        source: DisturbanceFault,
+    },
 }
 
 /// Why a ticket's course cannot be flown.
@@ -170,8 +263,25 @@ pub enum NoCourse {
 
 #[cfg(test)]
 mod tests {
+    use skein_protocol::ids::{Attempt, PolicyVersion, RunId};
+    use skein_protocol::ticket::Exploration;
+
     use super::*;
     use crate::testing::config;
+
+    /// The ticket of flight `flight` of an evaluation, or of a training flight on `course`.
+    fn ticket(course: CourseChoice, flight: u64) -> Ticket {
+        Ticket {
+            run: RunId(0),
+            flight: FlightId(FlightId::FIRST_EVALUATION.0 + flight),
+            attempt: Attempt(0),
+            policy_version: PolicyVersion(0),
+            course,
+            start_level: 1,
+            exploration: Exploration::Mode,
+            seed: 1,
+        }
+    }
 
     fn refused(config: &Config) -> String {
         Courses::of_run(config).unwrap_err().to_string()
@@ -192,11 +302,7 @@ mod tests {
     #[test]
     fn evaluation_courses_go_by_their_files_names_in_order() {
         let courses = Courses::of_run(&config("")).unwrap();
-        let names: Vec<_> = courses
-            .evaluation()
-            .iter()
-            .map(|evaluated| evaluated.name.as_str())
-            .collect();
+        let names: Vec<_> = courses.evaluation().map(|entry| entry.name.as_str()).collect();
         assert_eq!(
             names,
             ["training", "rearranged_34125", "rearranged_53412", "non_rectangular"]
@@ -207,14 +313,46 @@ mod tests {
     fn a_simulator_is_built_once_and_only_the_last_generated_one_is_kept() {
         let mut simulators = Simulators::new(Arc::new(Courses::of_run(&config("")).unwrap()));
         let address = |simulator: &mut Simulator| std::ptr::from_ref(simulator.course()) as usize;
-        let training = address(simulators.of(CourseChoice::Training).unwrap());
+        let mut of = |choice| address(simulators.of(&ticket(choice, 0)).unwrap());
+        let training = of(CourseChoice::Training);
         for seed in 0..3 {
-            simulators.of(CourseChoice::Generated(seed)).unwrap();
+            of(CourseChoice::Generated(seed));
         }
-        assert_eq!(address(simulators.of(CourseChoice::Training).unwrap()), training);
-        assert_eq!(
-            (simulators.fixed.len(), simulators.generated.as_ref().unwrap().0),
-            (1, 2)
-        );
+        assert_eq!(of(CourseChoice::Training), training);
+        assert_eq!(simulators.fixed.len(), 1);
+        assert_eq!(simulators.passing.unwrap().0, (CourseChoice::Generated(2), 0));
+    }
+
+    #[test]
+    fn flights_of_an_entry_fly_its_courses_in_turn_with_its_disturbances() {
+        let text = r#"
+            name = "two orders and what is generated"
+            flights = 4
+            [[entry]]
+            name = "orders"
+            orders_of = "training.toml"
+            [[entry]]
+            name = "generated"
+            first_seed = 7
+            [entry.generated]
+            shapes = ["circle"]
+            [entry.disturbances]
+            latency_periods = 1
+        "#;
+        let path = config("").courses.training;
+        let suite = Suite::parse(text, &path).unwrap();
+        let courses = Arc::new(Courses::of_suite(&config("disturbances.mass_spread = 0.1"), suite).unwrap());
+        let mut simulators = Simulators::new(Arc::clone(&courses));
+        let mut order = |entry, flight| {
+            let simulator = simulators.of(&ticket(CourseChoice::Evaluation(entry), flight)).unwrap();
+            let walls = simulator.course().walls().iter();
+            walls.map(|wall| wall.safe_point()).collect::<Vec<_>>()
+        };
+        assert_ne!(order(0, 0), order(0, 1));
+        assert_eq!(order(0, 0), order(0, 120));
+        assert_ne!(order(1, 0), order(1, 120));
+        let disturbances = |entry: usize| &courses.evaluation[entry].settings.disturbances;
+        assert_eq!((disturbances(0).latency_periods, disturbances(0).mass_spread), (0, 0.0));
+        assert_eq!((disturbances(1).latency_periods, disturbances(1).mass_spread), (1, 0.0));
     }
 }

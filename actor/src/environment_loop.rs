@@ -2,7 +2,7 @@
 //!
 //! [`Pilot::fly`] is the whole of it, and the only one: training, evaluation during training and evaluation of a file differ in the ticket and in where
 //! the records go. A flight is a function of its ticket and of the snapshot the ticket names, so nothing is remembered from one flight to the next, and
-//! start and noise are drawn from generators of their own.
+//! start, exploration noise and disturbances are drawn from generators of their own.
 
 use std::ops::DerefMut;
 
@@ -17,7 +17,7 @@ use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
 use skein_simulator::course::{Course, NoSuchLevel};
 use skein_simulator::reward::{RewardSettings, RewardTerms};
-use skein_simulator::simulator::{self, LevelUp, SimulationError, Simulator, StepReport};
+use skein_simulator::simulator::{self, LevelUp, Obstacle, SimulationError, Simulator, StepReport};
 
 use crate::agent::Agent;
 use crate::courses::{NoCourse, Simulators};
@@ -60,8 +60,7 @@ impl Pilot {
         network: &Network,
         link: &mut L,
     ) -> Result<FlightScore, FlightError<L::Error>> {
-        let mut start = Pcg64Mcg::seed_from_u64(derive(ticket.seed, Purpose::StartPosition, 0));
-        let mut noise = Pcg64Mcg::seed_from_u64(derive(ticket.seed, Purpose::ActionNoise, 0));
+        let mut noise = generator(ticket, Purpose::ActionNoise);
         let begin = |link: &mut L, step| {
             let mut record = link.loan().map_err(FlightError::Link)?;
             record.begin(ticket, self.actor, self.incarnation, step);
@@ -69,7 +68,7 @@ impl Pilot {
         };
 
         let mut record = begin(link, 0)?;
-        let simulator = match take_off(&mut self.simulators, ticket, &mut start) {
+        let simulator = match take_off(&mut self.simulators, ticket) {
             Ok(simulator) => simulator,
             Err(fault) => return Err(give_up(fault, record, link)),
         };
@@ -106,6 +105,7 @@ impl Pilot {
             record = next;
             if let Some(ended) = report.outcome {
                 let outcome = outcome(ended);
+                let hit_wall = hit_wall(&report);
                 close(&mut record, outcome, &report, simulator.course());
                 link.send(record).map_err(FlightError::Link)?;
                 return Ok(FlightScore {
@@ -113,6 +113,7 @@ impl Pilot {
                     // As in `flights.csv`.
                     flight_return: f64::from(flight_return as f32),
                     outcome,
+                    hit_wall,
                 });
             }
         }
@@ -186,14 +187,19 @@ pub enum FlightFault {
     Simulation(#[from] SimulationError),
 }
 
-fn take_off<'a>(
-    simulators: &'a mut Simulators,
-    ticket: &Ticket,
-    start: &mut Pcg64Mcg,
-) -> Result<&'a mut Simulator, FlightFault> {
-    let simulator = simulators.of(ticket.course)?;
-    simulator.reset(ticket.start_level, start)?;
+fn take_off<'a>(simulators: &'a mut Simulators, ticket: &Ticket) -> Result<&'a mut Simulator, FlightFault> {
+    let simulator = simulators.of(ticket)?;
+    simulator.reset(
+        ticket.start_level,
+        &mut generator(ticket, Purpose::StartPosition),
+        &mut generator(ticket, Purpose::Disturbances),
+    )?;
     Ok(simulator)
+}
+
+/// What draws for one purpose in the flight of `ticket`.
+fn generator(ticket: &Ticket, purpose: Purpose) -> Pcg64Mcg {
+    Pcg64Mcg::seed_from_u64(derive(ticket.seed, purpose, 0))
 }
 
 /// Writes into the record of an observation what was done on it and what came of that.
@@ -214,6 +220,15 @@ fn close(record: &mut TransitionRecord, outcome: Outcome, report: &StepReport, c
     record.walls_passed = report.walls_passed;
     record.course_walls = course.levels();
     record.outcome = outcome.code();
+    record.hit_wall = hit_wall(report).unwrap_or(0);
+}
+
+/// The wall that was hit, from 1 in flight order.
+fn hit_wall(report: &StepReport) -> Option<u8> {
+    match report.hit {
+        Some(Obstacle::Wall(place)) => Some(place),
+        Some(Obstacle::Corridor) | None => None,
+    }
 }
 
 /// Sends `record` as the word that the flight has failed.

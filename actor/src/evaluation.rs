@@ -1,4 +1,4 @@
-//! Evaluation without a learner: how a snapshot flies, course by course.
+//! Evaluation without a learner: how a snapshot flies, entry by entry: a course, or a suite's several.
 //!
 //! The flights are those of the environment loop, with tickets written here: mode action, start of level 1, seeds from the run's. They are spread over all
 //! cores; which thread flies which changes nothing.
@@ -19,7 +19,7 @@ use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::TransitionRecord;
 
 use crate::agent::Agent;
-use crate::courses::{Courses, EvaluationCourse, Simulators};
+use crate::courses::{Courses, Simulators};
 use crate::environment_loop::{Directive, FlightError, FlightFault, Pilot, RecordLink};
 use skein_inference::Network;
 
@@ -33,10 +33,8 @@ pub struct Evaluation<'a> {
     pub snapshot: &'a Snapshot,
     /// The configuration it was trained with.
     pub config: &'a Config,
-    /// Each of its evaluation courses is flown.
+    /// Each of its evaluation entries is flown, as often as it says.
     pub courses: Arc<Courses>,
-    /// Flights per course.
-    pub flights: u64,
     /// Most threads to fly on; without influence on the result. See [`Evaluation::threads`].
     pub threads: NonZeroUsize,
     /// What to keep of the flights.
@@ -55,9 +53,9 @@ pub enum Keep {
 /// How it went.
 #[derive(Debug)]
 pub struct Evaluated {
-    /// Course by course.
+    /// Entry by entry.
     pub report: EvaluationReport,
-    /// Course by course, flight by flight.
+    /// Entry by entry, flight by flight.
     pub flights: Vec<Vec<EvaluatedFlight>>,
 }
 
@@ -66,6 +64,8 @@ pub struct Evaluated {
 pub struct EvaluatedFlight {
     /// What it came to.
     pub score: FlightScore,
+    /// Walls of the course.
+    pub walls: usize,
     /// Its steps and its closing record, if they were to be kept.
     pub records: Vec<Box<TransitionRecord>>,
 }
@@ -76,9 +76,9 @@ pub enum EvaluationError {
     /// A flight cannot be flown.
     #[error("course \"{course}\", flight {flight}: {fault}")]
     Flight {
-        /// The course.
+        /// The course or entry.
         course: String,
-        /// The flight's number on that course, from 0.
+        /// The flight's number in that entry, from 0.
         flight: u64,
         /// What went wrong.
         #[source]
@@ -106,15 +106,19 @@ impl Evaluation<'_> {
     /// Flies all flights.
     ///
     /// # Errors
-    /// [`EvaluationError`] names the first flight, in course and flight order, that cannot be flown, or the thread that cannot be had.
+    /// [`EvaluationError`] names the first flight, in entry and flight order, that cannot be flown, or the thread that cannot be had.
     pub fn run(&self) -> Result<Evaluated, EvaluationError> {
         let mut flights = self.fly_all()?.into_iter();
         let mut courses = Vec::new();
         let mut by_course = Vec::new();
-        for EvaluationCourse { name, course } in self.courses.evaluation() {
-            let flights: Vec<_> = flights.by_ref().take(self.flights as usize).collect::<Result<_, _>>()?;
+        for entry in self.courses.evaluation() {
+            let flights: Vec<_> = flights
+                .by_ref()
+                .take(entry.flights as usize)
+                .collect::<Result<_, _>>()?;
             let scores: Vec<_> = flights.iter().map(|flight: &EvaluatedFlight| flight.score).collect();
-            courses.push(CourseEvaluation::of(name, course.walls().len(), &scores));
+            let walls = flights.iter().map(|flight| flight.walls).max().unwrap_or(0);
+            courses.push(CourseEvaluation::of(&entry.name, walls, &scores));
             by_course.push(flights);
         }
         let report = EvaluationReport {
@@ -128,7 +132,7 @@ impl Evaluation<'_> {
         })
     }
 
-    /// Every flight's end, in course and flight order.
+    /// Every flight's end, in entry and flight order.
     fn fly_all(&self) -> Result<Vec<Result<EvaluatedFlight, EvaluationError>>, EvaluationError> {
         let network = Network::new(
             self.snapshot,
@@ -162,12 +166,23 @@ impl Evaluation<'_> {
         Ok(flown.into_iter().map(|(_, flight)| flight).collect())
     }
 
-    /// Flights on all courses together.
+    /// Flights of all entries together.
     fn total(&self) -> u64 {
-        self.flights * self.courses.evaluation().len() as u64
+        self.courses.evaluation().map(|entry| entry.flights).sum()
     }
 
-    /// One thread's share: whatever flight is next. The number counts flights through all courses.
+    /// Entry and flight of the flight `index` of all, from 0.
+    fn place(&self, mut index: u64) -> Option<(u32, u64)> {
+        for (entry, number) in self.courses.evaluation().zip(0..) {
+            if index < entry.flights {
+                return Some((number, index));
+            }
+            index -= entry.flights;
+        }
+        None
+    }
+
+    /// One thread's share: whatever flight is next. The number counts flights through all entries.
     fn fly_next_until_done(
         &self,
         network: &Network,
@@ -179,13 +194,10 @@ impl Evaluation<'_> {
         let mut flown = Vec::new();
         loop {
             let index = next.fetch_add(1, Ordering::Relaxed);
-            if index >= self.total() {
+            let Some((entry, flight)) = self.place(index) else {
                 return flown;
-            }
-            flown.push((
-                index,
-                self.fly(&mut pilot, network, index / self.flights, index % self.flights),
-            ));
+            };
+            flown.push((index, self.fly(&mut pilot, network, entry, flight)));
         }
     }
 
@@ -193,7 +205,7 @@ impl Evaluation<'_> {
         &self,
         pilot: &mut Pilot,
         network: &Network,
-        course: u64,
+        entry: u32,
         flight: u64,
     ) -> Result<EvaluatedFlight, EvaluationError> {
         let ticket = Ticket {
@@ -201,23 +213,26 @@ impl Evaluation<'_> {
             flight: FlightId(FlightId::FIRST_EVALUATION.0 + flight),
             attempt: Attempt(0),
             policy_version: self.snapshot.version,
-            course: CourseChoice::Evaluation(course as u32),
+            course: CourseChoice::Evaluation(entry),
             start_level: 1,
             exploration: Exploration::Mode,
             seed: derive(self.config.run.seed, Purpose::EvaluationFlight, flight),
         };
         let mut memory = Memory {
             keep: self.keep,
+            walls: 0,
             spare: Vec::new(),
             sent: Vec::new(),
         };
         match pilot.fly(&ticket, network, &mut memory) {
             Ok(score) => Ok(EvaluatedFlight {
                 score,
+                walls: memory.walls,
                 records: memory.sent,
             }),
             Err(FlightError::Fault(fault)) => {
-                let course = self.courses.evaluation()[course as usize].name.clone();
+                let names = self.courses.evaluation().map(|entry| entry.name.clone());
+                let course = names.into_iter().nth(entry as usize).unwrap_or_default();
                 Err(EvaluationError::Flight { course, flight, fault })
             }
             Err(FlightError::Link(never)) => match never {},
@@ -229,6 +244,8 @@ impl Evaluation<'_> {
 /// Records in plain memory.
 struct Memory {
     keep: Keep,
+    /// Of the course, as the closing record tells.
+    walls: usize,
     spare: Vec<Box<TransitionRecord>>,
     sent: Vec<Box<TransitionRecord>>,
 }
@@ -242,6 +259,7 @@ impl RecordLink for Memory {
     }
 
     fn send(&mut self, record: Box<TransitionRecord>) -> Result<(), Infallible> {
+        self.walls = record.course_walls.into();
         match self.keep {
             Keep::Scores => self.spare.push(record),
             Keep::Records => self.sent.push(record),
@@ -266,8 +284,11 @@ mod tests {
         look(&Evaluation {
             snapshot: &random_snapshot(&SnapshotLayout::of(&config), 3),
             config: &config,
-            courses: Arc::new(Courses::of_files(&config, &config.courses.evaluation).unwrap()),
-            flights,
+            courses: Arc::new(
+                Courses::of_files(&config, &config.courses.evaluation)
+                    .unwrap()
+                    .with_flights(flights),
+            ),
             threads: NonZeroUsize::new(threads).unwrap(),
             keep,
         })

@@ -305,9 +305,11 @@ mod tests {
             walls_passed: 0,
             flight_return: 0.0,
             outcome: Outcome::Collided,
+            hit_wall: None,
         };
         EvaluatedFlight {
             score,
+            walls: 5,
             records: (first..first + records).map(record).collect(),
         }
     }

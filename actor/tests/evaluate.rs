@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use skein_protocol::config::Config;
-use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, Failures};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 
@@ -110,6 +110,111 @@ fn a_snapshot_file_alone_is_flown_and_recorded() {
     let recording = std::fs::File::open(folder.path().join("flights.npz")).unwrap();
     let mut arrays = zip::ZipArchive::new(recording).unwrap();
     assert!(arrays.by_name("depth.npy").is_ok());
+}
+
+#[test]
+fn a_suite_is_flown_entry_by_entry_alike_on_any_number_of_threads() {
+    let folder = run_folder();
+    let text = r#"
+        name = "three ways"
+        flights = 3
+        [[entry]]
+        name = "as it is"
+        course = "courses/training.toml"
+        [[entry]]
+        name = "in any order"
+        orders_of = "courses/training.toml"
+        flights = 5
+        [entry.disturbances]
+        latency_periods = 1
+        gust.force_rms_n = 0.15
+        depth.model = "stereo"
+        [[entry]]
+        name = "new courses"
+        [entry.generated]
+        shapes = ["circle"]
+        clearance_m = [1.0, 1.0]
+    "#;
+    std::fs::write(folder.path().join("suite.toml"), text).unwrap();
+    for threads in ["1", "3"] {
+        let json = format!("{threads}.json");
+        let output = evaluate(
+            folder.path(),
+            &[
+                "--run",
+                ".",
+                "--suite",
+                "suite.toml",
+                "--threads",
+                threads,
+                "--json",
+                &json,
+            ],
+        );
+        assert!(output.status.success(), "{output:?}");
+        let announced = String::from_utf8(output.stderr).unwrap();
+        assert!(announced.contains("11 flights in 3 entries"), "{announced}");
+    }
+    let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
+    assert_eq!(read("1.json"), read("3.json"));
+    let report: EvaluationReport = serde_json::from_str(&read("1.json")).unwrap();
+    let flown: Vec<_> = report
+        .courses
+        .iter()
+        .map(|entry| (entry.course.as_str(), entry.flights))
+        .collect();
+    assert_eq!(flown, [("as it is", 3), ("in any order", 5), ("new courses", 3)]);
+    for entry in &report.courses {
+        let failed = |failures: &Failures| failures.hit_wall + failures.hit_corridor + failures.timed_out;
+        let failures: u64 = entry.failures.iter().map(failed).sum();
+        assert_eq!(failures + entry.reached_end, entry.flights, "{entry:?}");
+        assert_eq!(entry.failures.len(), 6);
+    }
+    // The first entry is the course as a file, flown undisturbed.
+    let output = evaluate(
+        folder.path(),
+        &[
+            "--run",
+            ".",
+            "--course",
+            "courses/training.toml",
+            "--flights",
+            "3",
+            "--json",
+            "file.json",
+        ],
+    );
+    assert!(output.status.success(), "{output:?}");
+    let alone: EvaluationReport = serde_json::from_str(&read("file.json")).unwrap();
+    let as_it_is = CourseEvaluation {
+        course: "training".to_owned(),
+        ..report.courses[0].clone()
+    };
+    assert_eq!(alone.courses, [as_it_is]);
+}
+
+#[test]
+fn a_suite_that_cannot_be_flown_is_refused_by_file_and_entry() {
+    let folder = run_folder();
+    let at = folder.path();
+    let refused = |text: &str| {
+        std::fs::write(at.join("suite.toml"), text).unwrap();
+        error_of(at, &["--run", ".", "--suite", "suite.toml"])
+    };
+    let head = "name = \"x\"\nflights = 1\n[[entry]]\nname = \"one\"\n";
+    let no_course = refused(head);
+    assert!(
+        no_course.contains("suite.toml: entry \"one\": names its courses by 0"),
+        "{no_course}"
+    );
+    let strong = refused(&format!(
+        "{head}course = \"courses/training.toml\"\ndisturbances.mass_spread = 3.0\n"
+    ));
+    assert!(
+        strong.contains("suite.toml") && strong.contains("entry \"one\"") && strong.contains("mass_spread = 3"),
+        "{strong}"
+    );
+    assert!(error_of(at, &["--run", ".", "--suite", "none.toml"]).contains("none.toml"));
 }
 
 #[test]

@@ -81,6 +81,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedFlight {
         outcome: Outcome::Collided,
         walls_passed: 0,
         course_walls: 5,
+        hit_wall: None,
         depth: None,
     }
 }

@@ -103,6 +103,7 @@ fn score(flight: &CommittedFlight) -> FlightScore {
         walls_passed: flight.walls_passed.into(),
         flight_return: flight.total_reward().into(),
         outcome: flight.outcome,
+        hit_wall: flight.hit_wall,
     }
 }
 

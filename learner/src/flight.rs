@@ -50,6 +50,8 @@ pub struct CommittedFlight {
     pub walls_passed: u8,
     /// Walls of the course.
     pub course_walls: u8,
+    /// The wall that was hit, from 1 in flight order, if it collided with one and not with the corridor.
+    pub hit_wall: Option<u8>,
     /// Depth images of all observations, `[T + 1, 72, 128]`, while the VAE is trained.
     pub depth: Option<Vec<u8>>,
 }
@@ -157,6 +159,7 @@ pub(crate) mod samples {
             outcome,
             walls_passed: 0,
             course_walls: 5,
+            hit_wall: None,
             depth: None,
         }
     }

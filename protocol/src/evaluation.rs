@@ -31,6 +31,8 @@ pub struct CourseEvaluation {
     pub r: f64,
     /// Share of flights that reached the end wall.
     pub completed: f64,
+    /// How many they are.
+    pub reached_end: u64,
     /// t_n: flights that passed wall n, in flight order.
     pub walls_passed: Vec<u64>,
     /// Mean sum of rewards.
@@ -38,6 +40,20 @@ pub struct CourseEvaluation {
     /// Flights that collided.
     pub collided: u64,
     /// Flights cut off by the step limit.
+    pub timed_out: u64,
+    /// Where and by what flights failed: an entry for each wall in flight order, and one for the way from the last wall to the end wall. Their sum is that of
+    /// `collided` and `timed_out`.
+    pub failures: Vec<Failures>,
+}
+
+/// Flights that failed at a wall or on the way to it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Failures {
+    /// Hit this wall or the edge of its opening, from before or from behind.
+    pub hit_wall: u64,
+    /// Hit a side, the floor or the ceiling of the corridor before they had passed this wall, and after the one before.
+    pub hit_corridor: u64,
+    /// Ran out of steps there.
     pub timed_out: u64,
 }
 
@@ -50,6 +66,8 @@ pub struct FlightScore {
     pub flight_return: f64,
     /// How it ended.
     pub outcome: Outcome,
+    /// The wall that it hit, from 1 in flight order, if it collided with one and not with the corridor.
+    pub hit_wall: Option<u8>,
 }
 
 impl CourseEvaluation {
@@ -60,12 +78,14 @@ impl CourseEvaluation {
         let walls_passed: Vec<u64> = (1..=walls)
             .map(|wall| count(&|flight| flight.walls_passed as usize >= wall))
             .collect();
+        let reached_end = count(&|flight| flight.outcome == Outcome::ReachedEnd);
         let returns: f64 = flights.iter().map(|flight| flight.flight_return).sum();
         Self {
             course: course.to_owned(),
             flights: flights.len() as u64,
             r: share(walls_passed.iter().sum(), walls * flights.len()),
-            completed: share(count(&|flight| flight.outcome == Outcome::ReachedEnd), flights.len()),
+            completed: share(reached_end, flights.len()),
+            reached_end,
             walls_passed,
             mean_return: if flights.is_empty() {
                 0.0
@@ -74,8 +94,37 @@ impl CourseEvaluation {
             },
             collided: count(&|flight| flight.outcome == Outcome::Collided),
             timed_out: count(&|flight| flight.outcome == Outcome::TimedOut),
+            failures: Failures::of(walls, flights),
         }
     }
+}
+
+impl Failures {
+    /// Counts the failures of `flights` from the start of level 1, `[walls + 1]`.
+    fn of(walls: usize, flights: &[FlightScore]) -> Vec<Self> {
+        let mut failures = vec![Self::default(); walls + 1];
+        for flight in flights {
+            let next = (flight.walls_passed as usize).min(walls);
+            match (flight.outcome, flight.hit_wall) {
+                (Outcome::ReachedEnd, _) => {}
+                (Outcome::TimedOut, _) => failures[next].timed_out += 1,
+                (Outcome::Collided, None) => failures[next].hit_corridor += 1,
+                (Outcome::Collided, Some(wall)) => {
+                    failures[usize::from(wall).saturating_sub(1).min(walls)].hit_wall += 1;
+                }
+            }
+        }
+        failures
+    }
+}
+
+/// Counts one after the other, a dot for none; one dot for nothing at all.
+fn counts(values: &[u64]) -> String {
+    if values.iter().all(|&value| value == 0) {
+        return "·".to_owned();
+    }
+    let shown = |&value: &u64| if value == 0 { "·".to_owned() } else { value.to_string() };
+    values.iter().map(shown).collect::<Vec<_>>().join(" ")
 }
 
 impl fmt::Display for EvaluationReport {
@@ -87,12 +136,15 @@ impl fmt::Display for EvaluationReport {
             "flights",
             "R",
             "completed",
-            "passed wall 1, 2, …",
+            "passed wall\n1, 2, …",
             "return",
-            "timed out",
+            "hit wall\n1, 2, …",
+            "hit corridor\nbefore 1, 2, …",
+            "timed out\nbefore 1, 2, …",
         ]);
         for course in &self.courses {
             let walls: Vec<String> = course.walls_passed.iter().map(u64::to_string).collect();
+            let failed = |by: fn(&Failures) -> u64| counts(&course.failures.iter().map(by).collect::<Vec<_>>());
             table.add_row([
                 course.course.clone(),
                 course.flights.to_string(),
@@ -100,7 +152,9 @@ impl fmt::Display for EvaluationReport {
                 format!("{:.1} %", 100.0 * course.completed),
                 walls.join(" "),
                 format!("{:.2}", course.mean_return),
-                course.timed_out.to_string(),
+                failed(|failures| failures.hit_wall),
+                failed(|failures| failures.hit_corridor),
+                failed(|failures| failures.timed_out),
             ]);
         }
         for column in table.column_iter_mut().skip(1) {
@@ -120,6 +174,7 @@ mod tests {
             walls_passed,
             flight_return: 2.0,
             outcome,
+            hit_wall: None,
         };
         let flights = [
             score(5, Outcome::ReachedEnd),
@@ -130,9 +185,50 @@ mod tests {
         let evaluation = CourseEvaluation::of("training", 5, &flights);
         assert_eq!(evaluation.walls_passed, [3, 3, 2, 2, 2]);
         assert_eq!(evaluation.r, 12.0 / 20.0);
-        assert_eq!(evaluation.completed, 0.25);
+        assert_eq!((evaluation.completed, evaluation.reached_end), (0.25, 1));
         assert_eq!((evaluation.collided, evaluation.timed_out), (2, 1));
         assert_eq!(evaluation.mean_return, 2.0);
+    }
+
+    #[test]
+    fn every_failure_is_counted_once_where_it_happened() {
+        let score = |walls_passed, outcome, hit_wall| FlightScore {
+            walls_passed,
+            flight_return: 0.0,
+            outcome,
+            hit_wall,
+        };
+        let flights = [
+            score(3, Outcome::ReachedEnd, None),
+            score(1, Outcome::Collided, Some(2)),
+            // Its centre had left the wall behind when its tail hit it.
+            score(2, Outcome::Collided, Some(2)),
+            score(2, Outcome::Collided, None),
+            score(0, Outcome::TimedOut, None),
+            score(3, Outcome::Collided, None),
+        ];
+        let evaluation = CourseEvaluation::of("training", 3, &flights);
+        let failures = |hit_wall, hit_corridor, timed_out| Failures {
+            hit_wall,
+            hit_corridor,
+            timed_out,
+        };
+        assert_eq!(
+            evaluation.failures,
+            [
+                failures(0, 0, 1),
+                failures(2, 0, 0),
+                failures(0, 1, 0),
+                failures(0, 1, 0)
+            ]
+        );
+        let report = EvaluationReport {
+            policy_version: PolicyVersion(1),
+            policy_sha256: String::new(),
+            courses: vec![evaluation],
+        };
+        let table = report.to_string();
+        assert!(table.contains("· 2 · ·") && table.contains("· · 1 1"), "{table}");
     }
 
     #[test]

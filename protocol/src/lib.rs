@@ -28,7 +28,7 @@ pub mod transition;
 
 /// Version of everything in this crate that crosses a process boundary; part of every service's attributes, so that a process of another version is
 /// refused when it opens a service.
-pub const PROTOCOL_VERSION: u32 = 4;
+pub const PROTOCOL_VERSION: u32 = 5;
 
 /// Width of the depth image in pixels (paper, section 3.3).
 pub const IMAGE_WIDTH: usize = 128;

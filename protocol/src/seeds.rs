@@ -31,6 +31,8 @@ pub enum Purpose {
     StartPosition = 10,
     /// Exploration noise of one flight; derived from the ticket's seed, so that a start drawn otherwise does not shift it.
     ActionNoise = 11,
+    /// What disturbs one flight; derived from the ticket's seed.
+    Disturbances = 12,
 }
 
 /// The seed for the `index`-th use of `purpose` in the run seeded `run_seed`.

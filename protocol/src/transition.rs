@@ -19,7 +19,7 @@ pub const LARGEST_NUMBER: f32 = 1e7;
 /// One step of a flight on the wire. Every bit pattern is a valid value of every field's type; [`TransitionRecord::check`] says whether it makes sense.
 #[derive(Debug, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
-#[type_name("skein.TransitionRecord.v1")]
+#[type_name("skein.TransitionRecord.v2")]
 pub struct TransitionRecord {
     /// The run.
     pub run: u64,
@@ -65,7 +65,9 @@ pub struct TransitionRecord {
     pub truncated: u8,
     /// Walls of the course, in the closing record: what `walls_passed` is measured against.
     pub course_walls: u8,
-    reserved: [u8; 8],
+    /// In the closing record of a flight that collided: the wall that was hit, from 1 in flight order, or 0 for the corridor. 0 in all others.
+    pub hit_wall: u8,
+    reserved: [u8; 7],
     /// The depth image, 128×72, row by row from the top left; 255 is the camera's range or farther. On a cache line of its own.
     pub depth: [u8; IMAGE_PIXELS],
 }
@@ -244,10 +246,20 @@ impl TransitionRecord {
             ("outcome", self.outcome)
         } else if u32::from(self.start_level) + u32::from(self.walls_passed) > u32::from(self.course_walls) + 1 {
             ("walls_passed", self.walls_passed)
+        } else if !self.may_have_hit_wall() {
+            ("hit_wall", self.hit_wall)
         } else {
             return Ok(());
         };
         Err(RecordFault::Code { name, value })
+    }
+
+    /// Whether `hit_wall` is none, or one that a flight which collided could reach: no farther than the first that it has not passed.
+    fn may_have_hit_wall(&self) -> bool {
+        let next = u32::from(self.start_level) + u32::from(self.walls_passed);
+        let reachable = next.min(self.course_walls.into());
+        let collided = Outcome::from_code(self.outcome) == Some(Outcome::Collided);
+        self.hit_wall == 0 || (collided && u32::from(self.hit_wall) <= reachable)
     }
 }
 
@@ -372,5 +384,27 @@ mod tests {
             (r.walls_passed, r.course_walls) = (6, 5);
         };
         assert!(check(closes).contains("walls_passed has the impossible value 6"));
+    }
+
+    #[test]
+    fn a_wall_is_hit_only_by_a_flight_that_collided_and_could_reach_it() {
+        let hit = |outcome: Outcome, hit_wall| {
+            let mut record = record();
+            record.kind = RecordKind::Closing.code();
+            record.outcome = outcome.code();
+            (record.walls_passed, record.course_walls, record.hit_wall) = (2, 5, hit_wall);
+            record.check(&ticket(), ACTOR, INCARNATION, 4)
+        };
+        for (outcome, hit_wall, is_sound) in [
+            (Outcome::Collided, 0, true),
+            (Outcome::Collided, 1, true),
+            (Outcome::Collided, 3, true),
+            (Outcome::Collided, 4, false),
+            (Outcome::TimedOut, 0, true),
+            (Outcome::TimedOut, 3, false),
+            (Outcome::ReachedEnd, 1, false),
+        ] {
+            assert_eq!(hit(outcome, hit_wall).is_ok(), is_sound, "{outcome:?}, wall {hit_wall}");
+        }
     }
 }

@@ -1,4 +1,4 @@
-//! The depth camera: frames a second drawn, and traced ray by ray in the same scene.
+//! The depth camera: frames a second drawn, drawn with a stereo camera's errors, and traced ray by ray in the same scene.
 //!
 //! An iteration is a flight's worth of poses through the whole corridor, leaning as drones do, so that near walls and open corridor are in it as they
 //! are in training.
@@ -10,6 +10,7 @@ use criterion::{BenchmarkId, Criterion, Throughput};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 use skein_simulator::camera::{CameraSettings, DepthCamera, IMAGE_PIXELS, ReferenceCamera};
 use skein_simulator::course::Course;
+use skein_simulator::disturbances::{DepthModel, DepthNoiseSettings};
 
 /// Poses drawn an iteration.
 const DRAWN: usize = 240;
@@ -28,7 +29,12 @@ fn camera(criterion: &mut Criterion, name: &str) {
     let courses = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
     let course = Course::load(courses.join(name).with_extension("toml")).expect("shipped courses can be flown");
     let settings = CameraSettings::default();
-    let mut camera = DepthCamera::new(&settings, &course).expect("default settings make sense");
+    let mut camera = DepthCamera::new(&settings, &course)
+        .expect("default settings make sense")
+        .with_noise(&DepthNoiseSettings {
+            model: DepthModel::Stereo,
+            ..Default::default()
+        });
     let reference = ReferenceCamera::new(&settings, &course).expect("a course's surfaces are a mesh");
     let poses: Vec<_> = (0..DRAWN).map(|number| pose(&course, number)).collect();
     let mut image = [0; IMAGE_PIXELS];
@@ -39,6 +45,14 @@ fn camera(criterion: &mut Criterion, name: &str) {
         bencher.iter(|| {
             for pose in &poses {
                 camera.render(black_box(pose), &mut image);
+                black_box(&image);
+            }
+        });
+    });
+    group.bench_function(BenchmarkId::new("noisy", name), |bencher| {
+        bencher.iter(|| {
+            for (pose, key) in poses.iter().zip(0..) {
+                camera.render_with_noise(black_box(pose), key, &mut image);
                 black_box(&image);
             }
         });

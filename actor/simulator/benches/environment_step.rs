@@ -56,8 +56,9 @@ fn main() {
 /// Flies once through the course; the number of steps it took.
 fn fly(simulator: &mut Simulator, camera: Camera) -> u64 {
     let mut image = [0; IMAGE_PIXELS];
+    let mut rng = Pcg64Mcg::seed_from_u64(START);
     simulator
-        .reset(1, &mut Pcg64Mcg::seed_from_u64(START))
+        .reset(1, &mut rng.clone(), &mut rng)
         .expect("every course has a first level");
     for steps in 1.. {
         let action = Oracle::act(simulator.course(), &simulator.state());

@@ -8,9 +8,11 @@
 
 pub mod camera;
 pub mod course;
+pub mod disturbances;
 pub mod oracle;
 pub mod reward;
 pub mod simulator;
+pub mod suite;
 pub mod vehicle;
 
 mod world;

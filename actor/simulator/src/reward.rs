@@ -134,6 +134,7 @@ mod tests {
             walls_passed: 1,
             level_up,
             outcome,
+            hit: None,
         }
     }
 

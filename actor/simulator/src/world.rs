@@ -14,7 +14,7 @@ use rapier3d::parry::query::{DefaultQueryDispatcher, QueryDispatcher};
 use rapier3d::parry::shape::{Cuboid, Shape, TriMesh, TriMeshBuilderError};
 use rapier3d::pipeline::PhysicsWorld;
 
-use crate::course::{Course, SurfaceKind};
+use crate::course::{Course, Mesh, SurfaceKind};
 use crate::vehicle::{Actuation, BodyProperties, GRAVITY_MPS2, VehicleState};
 
 /// What the body touches.
@@ -32,7 +32,9 @@ pub(crate) struct World {
     obstacles: TriMesh,
     end_wall_m: f32,
     body_shape: Cuboid,
-    properties: BodyProperties,
+    nominal: BodyProperties,
+    /// Mass of the body that flies now, kg.
+    mass_kg: f32,
     dt_secs: f32,
     physics: PhysicsWorld,
     body: RigidBodyHandle,
@@ -46,31 +48,37 @@ impl World {
     pub(crate) fn new(course: &Course, properties: BodyProperties, dt_secs: f32) -> Result<Self, TriMeshBuilderError> {
         let (physics, body) = pristine_physics(&properties, dt_secs, &Point3::origin());
         Ok(Self {
-            obstacles: obstacles(course)?,
+            obstacles: triangles(&course.mesh(), |kind| kind != SurfaceKind::EndWall)?,
             end_wall_m: course.corridor().length_m,
             body_shape: Cuboid::new(glam(&properties.half_extents_m)),
-            properties,
+            nominal: properties,
+            mass_kg: properties.mass_kg,
             dt_secs,
             physics,
             body,
         })
     }
 
-    /// Puts the body at rest at `position_m`. Physics is rebuilt, so that nothing of an earlier flight remains in rapier's
-    /// caches: a flight is a function of its start and actions alone.
-    pub(crate) fn reset(&mut self, position_m: &Point3<f32>) {
-        (self.physics, self.body) = pristine_physics(&self.properties, self.dt_secs, position_m);
+    /// Puts the body at rest at `position_m`, `mass_factor` times as heavy as it nominally is. Physics is rebuilt, so that nothing of an earlier flight
+    /// remains in rapier's caches: a flight is a function of its start and actions alone.
+    pub(crate) fn reset(&mut self, position_m: &Point3<f32>, mass_factor: f32) {
+        let body = self.nominal.scaled(mass_factor);
+        self.mass_kg = body.mass_kg;
+        (self.physics, self.body) = pristine_physics(&body, self.dt_secs, position_m);
     }
 
-    /// Integrates one physics step. A state that is no longer finite shows in [`World::is_quarantined`].
-    pub(crate) fn advance(&mut self, actuation: &Actuation) {
+    /// Integrates one physics step, in which `gust_n` pushes the body as well (world frame, N). A state that is no longer finite shows in [`World::is_quarantined`].
+    pub(crate) fn advance(&mut self, actuation: &Actuation, gust_n: Option<Vector3<f32>>) {
         let body = &mut self.physics.bodies[self.body];
         match actuation {
             Actuation::Wrench { force_n, torque_nm } => {
                 body.reset_forces(false);
                 body.reset_torques(false);
-                let weight_n = Vector3::z() * (self.properties.mass_kg * GRAVITY_MPS2);
+                let weight_n = Vector3::z() * (self.mass_kg * GRAVITY_MPS2);
                 body.add_force(glam(&(force_n - weight_n)), true);
+                if let Some(gust_n) = gust_n {
+                    body.add_force(glam(&gust_n), true);
+                }
                 body.add_torque(glam(torque_nm), true);
             }
             Actuation::Velocity(velocity_mps) => body.set_linvel(glam(velocity_mps), true),
@@ -102,14 +110,18 @@ impl World {
         !self.physics.quarantine().is_empty()
     }
 
+    /// Which wall of `course` the body touches now, by its place in flight order from 0.
+    pub(crate) fn touched_wall(&self, course: &Course) -> Option<usize> {
+        let mesh = course.mesh();
+        (0..course.walls().len()).find(|&place| {
+            triangles(&mesh, |kind| kind == SurfaceKind::Wall(place)).is_ok_and(|wall| self.touches(&wall))
+        })
+    }
+
     /// What the body touches now.
     pub(crate) fn contact(&self) -> Contact {
         let world_from_body = self.physics.bodies[self.body].position();
-        let body_from_world = world_from_body.inverse();
-        let touches_obstacle = DefaultQueryDispatcher
-            .intersection_test(&body_from_world, &self.body_shape, &self.obstacles)
-            // A cuboid against a triangle mesh is a pair that parry's dispatcher knows.
-            .is_ok_and(|test| test.intersecting);
+        let touches_obstacle = self.touches(&self.obstacles);
         // The end wall fills the whole section: a body that touches nothing else meets it as it would meet a plane.
         let past_end_wall = self.body_shape.compute_aabb(world_from_body).maxs.x >= self.end_wall_m;
         if touches_obstacle {
@@ -119,6 +131,14 @@ impl World {
         } else {
             Contact::Nothing
         }
+    }
+
+    fn touches(&self, surfaces: &TriMesh) -> bool {
+        let body_from_world = self.physics.bodies[self.body].position().inverse();
+        DefaultQueryDispatcher
+            .intersection_test(&body_from_world, &self.body_shape, surfaces)
+            // A cuboid against a triangle mesh is a pair that parry's dispatcher knows.
+            .is_ok_and(|test| test.intersecting)
     }
 }
 
@@ -144,14 +164,13 @@ fn pristine_physics(
     (physics, body)
 }
 
-/// All surfaces but the end wall, as triangles.
-fn obstacles(course: &Course) -> Result<TriMesh, TriMeshBuilderError> {
-    let mesh = course.mesh();
+/// The surfaces of some kinds, as triangles.
+fn triangles(mesh: &Mesh, wanted: impl Fn(SurfaceKind) -> bool) -> Result<TriMesh, TriMeshBuilderError> {
     let vertices = mesh.vertices.iter().map(|vertex| glam(&vertex.coords)).collect();
     let triangles = mesh
         .triangles()
         .into_iter()
-        .filter(|&(_, surface)| mesh.surfaces[surface].kind != SurfaceKind::EndWall)
+        .filter(|&(_, surface)| wanted(mesh.surfaces[surface].kind))
         .map(|(triangle, _)| triangle)
         .collect();
     TriMesh::new(vertices, triangles)
@@ -178,13 +197,13 @@ mod tests {
 
     fn world_at(position_m: Point3<f32>) -> World {
         let mut world = World::new(&test_course(), PROPERTIES, 0.005).unwrap();
-        world.reset(&position_m);
+        world.reset(&position_m, 1.0);
         world
     }
 
     fn push(world: &mut World, force_n: Vector3<f32>, torque_nm: Vector3<f32>, secs: f32) {
         for _ in 0..(secs / 0.005).round() as u32 {
-            world.advance(&Actuation::Wrench { force_n, torque_nm });
+            world.advance(&Actuation::Wrench { force_n, torque_nm }, None);
         }
     }
 
@@ -263,9 +282,34 @@ mod tests {
         let mid_wall_m = wall.x_m() + course.wall_thickness_m() / 2.0;
         assert_eq!(world_at(Point3::new(mid_wall_m, y_m, z_m)).contact(), Contact::Nothing);
         let beside_m = y_m + wall.clearance_m();
-        assert_eq!(
-            world_at(Point3::new(mid_wall_m, beside_m, z_m)).contact(),
-            Contact::Obstacle
+        let beside = world_at(Point3::new(mid_wall_m, beside_m, z_m));
+        assert_eq!(beside.contact(), Contact::Obstacle);
+        assert_eq!(beside.touched_wall(&course), Some(0));
+    }
+
+    #[test]
+    fn corridor_is_no_wall() {
+        let on_the_floor = world_at(Point3::new(5.0, 0.0, 0.05));
+        assert_eq!(on_the_floor.contact(), Contact::Obstacle);
+        assert_eq!(on_the_floor.touched_wall(&test_course()), None);
+    }
+
+    #[test]
+    fn twice_the_mass_is_moved_half_as_far_and_falls_alike() {
+        let mut world = World::new(&test_course(), PROPERTIES, 0.005).unwrap();
+        world.reset(&Point3::new(5.0, 0.0, 6.0), 2.0);
+        push(&mut world, Vector3::new(1.0, 0.0, 0.0), Vector3::x() * 0.1, 0.1);
+        let state = world.state();
+        let expected_mps = Vector3::new(0.025, 0.0, -0.981);
+        assert!(
+            (state.velocity_mps - expected_mps).norm() < 1e-3,
+            "{}",
+            state.velocity_mps
+        );
+        assert!(
+            (state.body_rates_radps.x - 0.5).abs() < 1e-3,
+            "{}",
+            state.body_rates_radps
         );
     }
 }

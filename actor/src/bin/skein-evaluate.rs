@@ -15,13 +15,15 @@ use skein_protocol::config::Config;
 use skein_protocol::failure::with_causes;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::snapshot::Snapshot;
+use skein_simulator::suite::{EntryCourses, Suite, SuiteEntry};
 
 /// Flies a trained snapshot through courses and prints how it fares.
 ///
 /// Every flight takes off from the start of level 1 and follows the policy without noise. The flights are the same each time, whatever the number of threads:
 /// their seeds derive from the seed of the run that trained the snapshot, whose configuration lies in the snapshot file.
 ///
-/// R is the average rate of walls passed, (t_1 + … + t_n) / (n · flights), where t_i counts the flights that passed wall i.
+/// R is the average rate of walls passed, (t_1 + … + t_n) / (n · flights), where t_i counts the flights that passed wall i. Beside it stands what the other flights
+/// failed by: which wall they hit, or before which one they hit the corridor or ran out of steps. Walls are counted in the order in which they are met.
 #[derive(Parser)]
 #[command(version, after_long_help = columns_help())]
 struct Arguments {
@@ -30,7 +32,10 @@ struct Arguments {
     /// A course file to fly, once for each course. By default the evaluation courses of the run that trained the snapshot.
     #[arg(long, value_name = "FILE")]
     course: Vec<PathBuf>,
-    /// Flights per course. By default evaluation.flights of that run.
+    /// A suite file to fly instead: courses, all orders of a course's walls, generated courses, each with disturbances of its own; as configs/evaluations/generalist.toml.
+    #[arg(long, value_name = "FILE", conflicts_with = "course")]
+    suite: Option<PathBuf>,
+    /// Flights per course, or of each entry of the suite. By default evaluation.flights of that run, or what the suite says.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     flights: Option<u64>,
     /// Also write the result to this file, as JSON.
@@ -76,12 +81,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let path = snapshot_path(&arguments.subject)?;
     let (snapshot, config) = Snapshot::load(&path)?;
-    let files = match arguments.course.as_slice() {
-        [] => evaluation_courses(&config, &path)?,
-        given => given.to_vec(),
-    };
-    let courses = Arc::new(Courses::of_files(&config, &files)?);
-    let flights = arguments.flights.unwrap_or(config.evaluation.flights);
+    let courses = Arc::new(courses(arguments, &config, &path)?);
     let threads = arguments
         .threads
         .map_or_else(std::thread::available_parallelism, Ok)
@@ -95,17 +95,19 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
         snapshot: &snapshot,
         config: &config,
         courses: Arc::clone(&courses),
-        flights,
         threads,
         keep,
     };
     eprintln!(
-        "snapshot {} of {}: {flights} flights on each of {} courses, {} threads",
+        "snapshot {} of {}: {}, {} threads",
         snapshot.version,
         path.display(),
-        files.len(),
+        what_is_flown(&courses),
         evaluation.threads()
     );
+    for note in shapes_trained_on(&config, &courses) {
+        eprintln!("{note}");
+    }
     let evaluated = evaluation.run()?;
 
     println!("{}", evaluated.report);
@@ -114,11 +116,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
         fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))?;
     }
     if let Some(file) = &arguments.record {
-        let names: Vec<_> = courses
-            .evaluation()
-            .iter()
-            .map(|evaluated| evaluated.name.as_str())
-            .collect();
+        let names: Vec<_> = courses.evaluation().map(|entry| entry.name.as_str()).collect();
         write_recording(file, &names, &evaluated.flights)?;
     }
     Ok(())
@@ -180,6 +178,55 @@ fn snapshot_path(subject: &Subject) -> anyhow::Result<PathBuf> {
             run.display()
         )
     })
+}
+
+/// What the arguments ask to be flown.
+fn courses(arguments: &Arguments, config: &Config, snapshot: &Path) -> anyhow::Result<Courses> {
+    let courses = match (&arguments.suite, arguments.course.as_slice()) {
+        (Some(file), _) => Courses::of_suite(config, Suite::load(file)?)
+            .with_context(|| format!("{} cannot be flown", file.display()))?,
+        (None, []) => Courses::of_files(config, &evaluation_courses(config, snapshot)?)?,
+        (None, files) => Courses::of_files(config, files)?,
+    };
+    Ok(match arguments.flights {
+        Some(flights) => courses.with_flights(flights),
+        None => courses,
+    })
+}
+
+/// How many flights of what, in words.
+fn what_is_flown(courses: &Courses) -> String {
+    let flights: Vec<u64> = courses.evaluation().map(|entry| entry.flights).collect();
+    match flights.as_slice() {
+        [first, others @ ..] if others.iter().all(|flights| flights == first) => {
+            format!("{first} flights on each of {} courses", flights.len())
+        }
+        _ => format!("{} flights in {} entries", flights.iter().sum::<u64>(), flights.len()),
+    }
+}
+
+/// A line for each entry that generates shapes which the snapshot was trained on: what it measures is not what an agent makes of new shapes.
+fn shapes_trained_on(config: &Config, courses: &Courses) -> Vec<String> {
+    let trained = &courses.settings().generator.shapes;
+    let known = |entry: &SuiteEntry| match &entry.courses {
+        EntryCourses::Generated { ranges, .. } if config.courses.generated_share > 0.0 => {
+            let shapes = ranges.shapes.iter().filter(|shape| trained.contains(shape));
+            shapes.map(|shape| shape.name()).collect::<Vec<_>>()
+        }
+        _ => Vec::new(),
+    };
+    courses
+        .evaluation()
+        .map(|entry| (entry, known(entry)))
+        .filter(|(_, known)| !known.is_empty())
+        .map(|(entry, known)| {
+            let shapes = known.join(", ");
+            format!(
+                "note: \"{}\" flies shapes that this snapshot was trained on: {shapes}",
+                entry.name
+            )
+        })
+        .collect()
 }
 
 /// The evaluation courses of the run that trained the snapshot: where its configuration says, or else in the run's directory, which may have moved.

@@ -132,6 +132,7 @@ fn a_flight_is_its_steps_without_a_gap_and_one_closing_record() {
     assert_eq!(Outcome::from_code(closing.outcome), Some(score.outcome));
     assert_eq!(u32::from(closing.walls_passed), score.walls_passed);
     assert_eq!(closing.course_walls, 5);
+    assert_eq!(closing.hit_wall, score.hit_wall.unwrap_or(0));
     let ends = |record: &&TransitionRecord| record.terminated + record.truncated > 0;
     assert!(steps.iter().rev().skip(1).all(|record| !ends(&&**record)) && ends(&&**steps.last().unwrap()));
     let sum: f64 = steps.iter().map(|record| f64::from(record.reward)).sum();
@@ -148,6 +149,7 @@ fn each_record_holds_what_was_seen_and_the_reward_for_what_came_next() {
             walls_passed: 0,
             level_up: LevelUp::No,
             outcome: None,
+            hit: None,
         };
         let expected = RewardTerms::of(&RewardSettings::default(), &report, &pair[1].depth);
         assert_eq!(pair[0].reward_terms[3], expected.action);
@@ -238,4 +240,49 @@ fn a_generated_course_is_the_tickets_own() {
     let (_, again) = flown(&mut used, &generated(1));
     assert_eq!(bytes(&first), bytes(&again));
     assert_ne!(bytes(&first), bytes(&other));
+}
+
+#[test]
+fn a_disturbed_flight_is_a_function_of_its_ticket_too() {
+    const STORMY: &str =
+        "disturbances = { mass_spread = 0.2, latency_periods = 1, gust.force_rms_n = 0.15, depth.model = \"stereo\" }";
+    let mut used = pilot(STORMY);
+    let (score, first) = flown(&mut used, &ticket(Exploration::Sample, 1));
+    let (_, other) = flown(&mut used, &ticket(Exploration::Sample, 2));
+    let (score_again, again) = flown(&mut used, &ticket(Exploration::Sample, 1));
+    let (_, elsewhere) = flown(&mut pilot(STORMY), &ticket(Exploration::Sample, 1));
+    assert_eq!(score, score_again);
+    assert_eq!(bytes(&first), bytes(&again));
+    assert_eq!(bytes(&first), bytes(&elsewhere));
+    assert_ne!(bytes(&first), bytes(&other));
+    // It starts where the calm flight of its ticket does, and sees it otherwise.
+    let (_, calm) = flown(&mut pilot(""), &ticket(Exploration::Sample, 1));
+    assert_eq!(first.sent[0].position_m, calm.sent[0].position_m);
+    assert_ne!(first.sent[0].depth, calm.sent[0].depth);
+}
+
+#[test]
+fn what_was_hit_is_in_the_closing_record() {
+    // A pilot that wants straight on hits the first wall; one that wants up, the ceiling.
+    let closing = |bias: f32| {
+        let mut tape = Tape::default();
+        let layout = SnapshotLayout::new(Observation::LatentVelocityAction.len(), 16);
+        let steady = network(|policy| {
+            policy.fill(0.0);
+            // The last layer's bias begins with the means: lateral, vertical.
+            let biases = policy.len() - 4;
+            policy[biases + 1] = bias;
+        });
+        assert!(layout.policy().len() > 4);
+        let ticket = Ticket {
+            start_level: 1,
+            ..ticket(Exploration::Mode, 1)
+        };
+        let score = pilot("").fly(&ticket, &steady, &mut tape).unwrap();
+        let closing = tape.sent.pop().unwrap();
+        assert_eq!((score.outcome, score.walls_passed), (Outcome::Collided, 0));
+        (score.hit_wall, closing.hit_wall)
+    };
+    assert_eq!(closing(0.0), (Some(1), 1));
+    assert_eq!(closing(5.0), (None, 0));
 }

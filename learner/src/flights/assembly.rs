@@ -78,6 +78,7 @@ impl Assembly {
             outcome: Outcome::TimedOut,
             walls_passed: 0,
             course_walls: 0,
+            hit_wall: None,
             depth: (keep == Keep::Depth).then(Vec::new),
         };
         Self {
@@ -202,6 +203,7 @@ impl Assembly {
         self.flight.outcome = outcome;
         self.flight.walls_passed = record.walls_passed;
         self.flight.course_walls = record.course_walls;
+        self.flight.hit_wall = (record.hit_wall > 0).then_some(record.hit_wall);
         if let Some(depth) = &mut self.flight.depth {
             depth.shrink_to_fit();
         }
@@ -372,6 +374,24 @@ mod tests {
                 assembly.push(&record).err()
             });
             assert_eq!(fault, Some(RecordFault::Contradiction { what: expected }), "{expected}");
+        }
+    }
+
+    #[test]
+    fn what_was_hit_is_known_of_the_committed_flight() {
+        for (hit_wall, expected) in [(0, None), (1, Some(1))] {
+            let mut assembly = assembly(Keep::Latents);
+            let mut last = record(0);
+            last.terminated = 1;
+            assembly.push(&last).unwrap();
+            let mut closing = record(1);
+            closing.kind = RecordKind::Closing.code();
+            closing.outcome = Outcome::Collided.code();
+            (closing.course_walls, closing.hit_wall) = (5, hit_wall);
+            let Assembled::Whole(flight) = assembly.push(&closing).unwrap() else {
+                panic!("a closing record ends a flight");
+            };
+            assert_eq!(flight.hit_wall, expected);
         }
     }
 

@@ -52,7 +52,7 @@ pub struct Config {
     pub checkpoints: CheckpointSection,
     /// Limits and deadlines between the processes; without influence on what is learned.
     pub transport: TransportSection,
-    /// Vehicle, camera, reward, course generator: see the simulator's `SimulatorSettings`.
+    /// Vehicle, camera, reward, course generator, disturbances: see the simulator's `SimulatorSettings`.
     pub simulator: toml::Table,
 }
 

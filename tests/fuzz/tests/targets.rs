@@ -128,6 +128,7 @@ drive! {
     no_course_file_panics_and_what_is_accepted_flies => "course_file",
     no_geometry_panics_and_what_is_accepted_flies => "course_layout",
     no_generator_ranges_panic_and_what_is_drawn_flies => "generator",
+    no_suite_panics_and_what_is_accepted_has_courses => "suite_file",
     no_records_panic_and_what_is_committed_is_whole_and_finite => "records",
     no_signal_panics_and_what_is_believed_says_the_same_again => "signals",
     no_snapshot_file_panics_and_what_is_accepted_is_finite => "snapshot_file",

@@ -255,8 +255,8 @@ fn wider_registers_change_no_bit_of_the_image() {
         let quaternion = std::array::from_fn(|_| rng.random_range(-1.0..1.0));
         let spot = [Spot::BetweenWalls, Spot::Opening][number % 2];
         let view = settings.view(&pose(lens(&course, number % 5, spot, share), quaternion));
-        super::draw(&mut camera, &view, &mut portable);
-        (super::fastest_draw())(&mut camera, &view, &mut chosen);
+        super::draw(&mut camera, &view, super::Errors::None, &mut portable);
+        (super::fastest_draw())(&mut camera, &view, super::Errors::None, &mut chosen);
         assert_eq!(portable, chosen, "{view:?}");
     }
 }

@@ -110,15 +110,27 @@ impl Canvas {
         self.end_row = 0;
     }
 
+    /// What has been drawn: range over depth, 1 at the range or farther.
+    #[inline(always)]
+    pub(super) fn nearness(&self) -> &[[f32; IMAGE_WIDTH]; IMAGE_HEIGHT] {
+        &self.nearness
+    }
+
     /// Grey levels: 0 at the lens, 255 at the range or farther.
     #[inline(always)]
     pub(super) fn write(&self, image: &mut [u8; IMAGE_PIXELS]) {
-        /// Added to a small number, it leaves the number, rounded, in the lowest bits of the sum.
-        const ROUNDER: f32 = 8_388_608.0;
         for (pixel, nearness) in image.iter_mut().zip(self.nearness.as_flattened()) {
-            *pixel = (255.0 / nearness + ROUNDER).to_bits() as u8;
+            *pixel = rounded(255.0 / nearness);
         }
     }
+}
+
+/// The nearest whole grey level of one from 0 to 255.
+#[inline(always)]
+pub(super) fn rounded(level: f32) -> u8 {
+    /// Added to a small number, it leaves the number, rounded, in the lowest bits of the sum.
+    const ROUNDER: f32 = 8_388_608.0;
+    (level + ROUNDER).to_bits() as u8
 }
 
 /// Raises a run of pixels to the plane.

@@ -5,16 +5,20 @@
 //! [`reference`](ReferenceCamera) traces the same surfaces ray by ray; a property test holds the two together.
 
 mod canvas;
+mod noise;
 mod reference;
 mod scene;
 mod settings;
 
 #[cfg(test)]
 mod agreement;
+#[cfg(test)]
+mod noise_tests;
 
 use nalgebra::Isometry3;
 
 use crate::course::Course;
+use crate::disturbances::DepthNoiseSettings;
 
 pub use reference::ReferenceCamera;
 pub use settings::{CameraFault, CameraSettings};
@@ -33,11 +37,20 @@ pub struct DepthCamera {
     settings: CameraSettings,
     scene: scene::Scene,
     canvas: canvas::Canvas,
+    noise: Option<noise::StereoNoise>,
     draw: Draw,
 }
 
 /// [`draw`], compiled for the instructions that this machine has.
-type Draw = fn(&mut DepthCamera, &settings::View, &mut [u8; IMAGE_PIXELS]);
+type Draw = fn(&mut DepthCamera, &settings::View, Errors, &mut [u8; IMAGE_PIXELS]);
+
+/// Which errors an image has.
+#[derive(Clone, Copy)]
+enum Errors {
+    None,
+    /// Those of this key.
+    OfKey(u64),
+}
 
 impl DepthCamera {
     /// A camera in this course.
@@ -50,8 +63,16 @@ impl DepthCamera {
             settings: settings.clone(),
             scene: scene::Scene::new(&course.mesh()),
             canvas: canvas::Canvas::new(),
+            noise: None,
             draw: fastest_draw(),
         })
+    }
+
+    /// The same camera with errors as a real one has them, in what [`DepthCamera::render_with_noise`] draws.
+    #[must_use]
+    pub fn with_noise(mut self, settings: &DepthNoiseSettings) -> Self {
+        self.noise = noise::StereoNoise::new(settings, &self.settings);
+        self
     }
 
     /// Draws what the camera sees with the body at `world_from_body`, straight into `image`.
@@ -61,15 +82,24 @@ impl DepthCamera {
     /// sees nothing: all 255.
     pub fn render(&mut self, world_from_body: &Isometry3<f32>, image: &mut [u8; IMAGE_PIXELS]) {
         let view = self.settings.view(world_from_body);
-        (self.draw)(self, &view, image);
+        (self.draw)(self, &view, Errors::None, image);
+    }
+
+    /// Draws the same with the camera's errors, if it has any. The same `key`, pose and settings give the same ones; see [`DepthNoiseSettings`].
+    pub fn render_with_noise(&mut self, world_from_body: &Isometry3<f32>, key: u64, image: &mut [u8; IMAGE_PIXELS]) {
+        let view = self.settings.view(world_from_body);
+        (self.draw)(self, &view, Errors::OfKey(key), image);
     }
 }
 
 #[inline(always)]
-fn draw(camera: &mut DepthCamera, view: &settings::View, image: &mut [u8; IMAGE_PIXELS]) {
+fn draw(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: &mut [u8; IMAGE_PIXELS]) {
     camera.canvas.clear();
     camera.scene.draw(&camera.settings, view, &mut camera.canvas);
-    camera.canvas.write(image);
+    match (errors, &camera.noise) {
+        (Errors::OfKey(key), Some(noise)) => noise.write(camera.canvas.nearness(), key, image),
+        _ => camera.canvas.write(image),
+    }
 }
 
 /// The same arithmetic in the same order whichever is chosen: wider registers do not change a bit of the image.
@@ -82,11 +112,11 @@ fn fastest_draw() -> Draw {
             && is_x86_feature_detected!("avx512vl")
         {
             // SAFETY: the machine has the features that the function is compiled for, as just asked.
-            return |camera, view, image| unsafe { draw_avx512(camera, view, image) };
+            return |camera, view, errors, image| unsafe { draw_avx512(camera, view, errors, image) };
         }
         if is_x86_feature_detected!("avx2") {
             // SAFETY: as above.
-            return |camera, view, image| unsafe { draw_avx2(camera, view, image) };
+            return |camera, view, errors, image| unsafe { draw_avx2(camera, view, errors, image) };
         }
     }
     draw
@@ -94,12 +124,12 @@ fn fastest_draw() -> Draw {
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-fn draw_avx512(camera: &mut DepthCamera, view: &settings::View, image: &mut [u8; IMAGE_PIXELS]) {
-    draw(camera, view, image);
+fn draw_avx512(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: &mut [u8; IMAGE_PIXELS]) {
+    draw(camera, view, errors, image);
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn draw_avx2(camera: &mut DepthCamera, view: &settings::View, image: &mut [u8; IMAGE_PIXELS]) {
-    draw(camera, view, image);
+fn draw_avx2(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: &mut [u8; IMAGE_PIXELS]) {
+    draw(camera, view, errors, image);
 }

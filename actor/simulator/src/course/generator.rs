@@ -25,7 +25,7 @@ pub struct GeneratorRanges {
     pub wall_x_m: Vec<f32>,
     /// Thickness of every wall, metres.
     pub wall_thickness_m: f32,
-    /// Kinds of openings, all equally likely.
+    /// Kinds of openings, all equally likely. Default: the families for training, [`GeneratedShape::TRAINED`].
     pub shapes: Vec<GeneratedShape>,
     /// Radius of the widest circle inside an opening, metres: at least [`BODY_CLEARANCE_M`].
     pub clearance_m: [f32; 2],
@@ -34,7 +34,11 @@ pub struct GeneratorRanges {
 }
 
 /// A kind of opening that the generator draws.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+///
+/// Some families are for training, the others are held out, so that flying them shows what an agent makes of shapes that it never met: [`GeneratedShape::TRAINED`],
+/// [`GeneratedShape::HELD_OUT`]. `shapes` decides which are drawn; by default those of training. Neighbours remain: a square on its corner is a diamond of equal
+/// diagonals, a polygon of eight corners is near a circle, and a T has an inner corner as an L and a cross have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum GeneratedShape {
     /// Sides up to 1 : 1.4.
@@ -51,6 +55,37 @@ pub enum GeneratedShape {
     L,
     /// Five to eight corners around the centre.
     Polygon,
+    /// The upper side 0.5 to 0.8 of the lower one.
+    Trapezoid,
+    /// A level beam upon an upright one, each of 0.45 to 0.65 of the width.
+    T,
+    /// Four to seven points, notches of 0.55 to 0.75 of the radius between them.
+    Star,
+}
+
+impl GeneratedShape {
+    /// Families for training.
+    pub const TRAINED: [Self; 5] = [Self::Rectangle, Self::Polygon, Self::Trapezoid, Self::T, Self::Star];
+
+    /// Families that training never shows: those of the gates in `configs/courses/non_rectangular.toml`.
+    pub const HELD_OUT: [Self; 5] = [Self::Circle, Self::Triangle, Self::Diamond, Self::Cross, Self::L];
+
+    /// Its name in the configuration.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Rectangle => "rectangle",
+            Self::Circle => "circle",
+            Self::Triangle => "triangle",
+            Self::Diamond => "diamond",
+            Self::Cross => "cross",
+            Self::L => "l",
+            Self::Polygon => "polygon",
+            Self::Trapezoid => "trapezoid",
+            Self::T => "t",
+            Self::Star => "star",
+        }
+    }
 }
 
 /// Ranges that no course can be drawn from.
@@ -85,15 +120,14 @@ pub enum RangesError {
 }
 
 impl Default for GeneratorRanges {
-    /// Five walls as in the paper's corridor, with the free space of the shipped courses.
+    /// Five walls as in the paper's corridor, with the free space of the shipped courses, of the shapes that are for training.
     fn default() -> Self {
-        use GeneratedShape::{Circle, Cross, Diamond, L, Polygon, Rectangle, Triangle};
         Self {
             corridor: Corridor::default(),
             start: StartArea::default(),
             wall_x_m: vec![10.0, 20.0, 30.0, 40.0, 50.0],
             wall_thickness_m: 0.3,
-            shapes: vec![Rectangle, Circle, Triangle, Diamond, Cross, L, Polygon],
+            shapes: GeneratedShape::TRAINED.to_vec(),
             clearance_m: [0.9, 1.15],
             rotation_deg: [-180.0, 180.0],
         }
@@ -219,9 +253,33 @@ impl GeneratedShape {
                 let corners = rng.random_range(5..=8);
                 let points_m = (0..corners)
                     .map(|corner| {
-                        let angle = (corner as f32 + rng.random_range(-0.2..=0.2)) / corners as f32 * TAU;
-                        let radius = rng.random_range(0.8..=1.2);
-                        [radius * angle.cos(), radius * angle.sin()]
+                        let share = (corner as f32 + rng.random_range(-0.2..=0.2)) / corners as f32;
+                        polar(share, rng.random_range(0.8..=1.2))
+                    })
+                    .collect();
+                Shape::Polygon { points_m }
+            }
+            Self::Trapezoid => {
+                let (upper, height) = (rng.random_range(0.25..=0.4), rng.random_range(0.35..=0.5));
+                let points_m = vec![[-0.5, -height], [0.5, -height], [upper, height], [-upper, height]];
+                Shape::Polygon { points_m }
+            }
+            Self::T => {
+                let (stem, bar) = (rng.random_range(0.225..=0.325), rng.random_range(0.45..=0.65));
+                let under = 0.5 - bar;
+                let right = [[stem, -0.5], [stem, under], [0.5, under], [0.5, 0.5]];
+                let left = right.into_iter().rev().map(|[y, z]| [-y, z]);
+                Shape::Polygon {
+                    points_m: right.into_iter().chain(left).collect(),
+                }
+            }
+            Self::Star => {
+                let points = rng.random_range(4..=7);
+                let notch = rng.random_range(0.55..=0.75);
+                let points_m = (0..2 * points)
+                    .map(|corner| {
+                        let radius = if corner % 2 == 0 { 1.0 } else { notch };
+                        polar(corner as f32 / (2 * points) as f32, radius)
                     })
                     .collect();
                 Shape::Polygon { points_m }
@@ -230,9 +288,43 @@ impl GeneratedShape {
     }
 }
 
+/// The point at `share` of a full turn, `radius` from the centre.
+fn polar(share: f32, radius: f32) -> [f32; 2] {
+    let (sin, cos) = (share * TAU).sin_cos();
+    [radius * cos, radius * sin]
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn every_family_is_drawn_with_exactly_the_free_space_asked_for() {
+        for shape in GeneratedShape::TRAINED.into_iter().chain(GeneratedShape::HELD_OUT) {
+            for clearance_m in [BODY_CLEARANCE_M + 0.01, 0.75, 1.0] {
+                let ranges = GeneratorRanges {
+                    shapes: vec![shape],
+                    clearance_m: [clearance_m; 2],
+                    ..Default::default()
+                };
+                for seed in 0..10 {
+                    let course = Course::generate(seed, &ranges).unwrap();
+                    for wall in course.walls() {
+                        // The widest circle is found to a millimetre.
+                        let off_m = (wall.clearance_m() - clearance_m).abs();
+                        assert!(off_m < 0.003, "{shape:?}: {} m", wall.clearance_m());
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn no_family_is_both_trained_on_and_held_out_and_defaults_hold_out() {
+        let is_held_out = |shape: &GeneratedShape| GeneratedShape::HELD_OUT.contains(shape);
+        assert!(!GeneratedShape::TRAINED.iter().any(is_held_out));
+        assert!(!GeneratorRanges::default().shapes.iter().any(is_held_out));
+    }
 
     #[test]
     fn every_seed_gives_a_course_with_the_free_space_asked_for() {

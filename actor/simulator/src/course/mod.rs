@@ -186,6 +186,29 @@ impl Course {
         Ok(())
     }
 
+    /// The same walls at the same places, in another order: `order` holds the place, from 0, of the wall that comes first, second, and so on.
+    ///
+    /// # Errors
+    /// The first [`CourseFault`], from the first wall on: not every order leaves way enough from one opening to the next.
+    ///
+    /// # Panics
+    /// If `order` is no permutation of the walls' places.
+    pub fn reordered(&self, order: &[usize]) -> Result<Self, CourseFault> {
+        assert_eq!(order.len(), self.walls.len(), "an order names each wall once");
+        let walls = order.iter().zip(&self.walls).map(|(&from, place)| WallLayout {
+            label: self.walls[from].label,
+            x_m: place.x_m,
+            opening: self.walls[from].opening.clone(),
+        });
+        Self::new(CourseLayout {
+            name: self.name.clone(),
+            corridor: self.corridor,
+            start: self.start,
+            wall_thickness_m: self.wall_thickness_m,
+            walls: walls.collect(),
+        })
+    }
+
     /// Name in reports.
     #[must_use]
     pub fn name(&self) -> &str {

@@ -1,6 +1,6 @@
 //! One flight at a time through a course: [`Simulator::reset`] starts it, [`Simulator::step`] lets one control period pass.
 //!
-//! A flight is a pure function of course, settings, start and actions. Numbers that are not finite never get further than the
+//! A flight is a pure function of course, settings, start, disturbances and actions. Numbers that are not finite never get further than the
 //! step they appear in: it returns [`SimulationError::NonFinite`] and the flight is over.
 
 mod report;
@@ -13,11 +13,12 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 use rand::Rng;
 
-pub use report::{LevelUp, Outcome, SimulationError, StepReport};
+pub use report::{LevelUp, Obstacle, Outcome, SimulationError, StepReport};
 pub use settings::{SimulatorError, SimulatorSettings};
 
 use crate::camera::{DepthCamera, IMAGE_PIXELS};
 use crate::course::{Course, NoSuchLevel};
+use crate::disturbances::{Delay, DisturbanceSettings, Drawn, Gust};
 use crate::vehicle::{Vehicle, VehicleState};
 use crate::world::{Contact, World};
 
@@ -32,6 +33,9 @@ pub struct Simulator {
     vehicle: Vehicle,
     world: World,
     camera: DepthCamera,
+    disturbances: DisturbanceSettings,
+    commands: Delay,
+    gust: Option<Gust>,
     flight: Flight,
 }
 
@@ -43,6 +47,7 @@ struct Flight {
     /// Walls of the course whose back face the drone's centre has left behind, those before its start included.
     walls_behind: usize,
     walls_behind_at_start: usize,
+    depth_seed: u64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,8 +73,10 @@ impl Simulator {
             course: course.name().to_owned(),
             source,
         })?;
+        let camera = DepthCamera::new(&settings.camera, &course)?;
+        settings.disturbances.check(&settings.vehicle, &settings.camera)?;
         Ok(Self {
-            camera: DepthCamera::new(&settings.camera, &course)?,
+            camera: camera.with_noise(&settings.disturbances.depth),
             course,
             max_steps: settings.max_steps,
             physics_steps,
@@ -78,34 +85,43 @@ impl Simulator {
             pristine_vehicle: vehicle.clone(),
             vehicle,
             world,
+            commands: Delay::new(settings.disturbances.latency_periods),
+            disturbances: settings.disturbances.clone(),
+            gust: None,
             flight: Flight {
                 phase: Phase::Over,
                 steps: 0,
                 walls_behind: 0,
                 walls_behind_at_start: 0,
+                depth_seed: 0,
             },
         })
     }
 
-    /// Starts a flight: hovering at the start of `level` (1 = before the first wall), jittered by `rng` as the course says.
+    /// Starts a flight: hovering at the start of `level` (1 = before the first wall), jittered by `start` as the course says. Everything that disturbs the flight
+    /// is drawn from `disturbances`; in calm settings it has no influence.
     ///
     /// # Errors
     /// [`NoSuchLevel`] if the course has fewer walls.
-    pub fn reset(&mut self, level: u8, rng: &mut impl Rng) -> Result<(), NoSuchLevel> {
-        let position_m = self.course.start_position(level, rng)?;
+    pub fn reset(&mut self, level: u8, start: &mut impl Rng, disturbances: &mut impl Rng) -> Result<(), NoSuchLevel> {
+        let position_m = self.course.start_position(level, start)?;
+        let drawn = Drawn::draw(&self.disturbances, disturbances);
         self.vehicle = self.pristine_vehicle.clone();
-        self.world.reset(&position_m);
+        self.world.reset(&position_m, drawn.mass_factor);
+        self.commands.clear();
+        self.gust = Gust::new(&self.disturbances.gust, self.dt_secs, drawn.gust_seed);
         let walls_behind = self.walls_behind(position_m.x);
         self.flight = Flight {
             phase: Phase::Flying,
             steps: 0,
             walls_behind,
             walls_behind_at_start: walls_behind,
+            depth_seed: drawn.depth_seed,
         };
         Ok(())
     }
 
-    /// Flies one control period with `action` = `[v_y, v_z]`, m/s in the heading frame, each clamped to [-1, 1].
+    /// Flies one control period with `action` = `[v_y, v_z]`, m/s in the heading frame, each clamped to [-1, 1]. With latency, `action` is what takes effect later.
     ///
     /// The flight ends within the step at the physics step that touches something; the state is then the one at that moment.
     ///
@@ -134,12 +150,14 @@ impl Simulator {
                 LevelUp::No
             },
             outcome,
+            hit: (contact == Contact::Obstacle).then(|| self.obstacle()),
         })
     }
 
-    /// Draws what the depth camera sees now into `image`, row by row from the top.
+    /// Draws what the depth camera sees now into `image`, row by row from the top. Its errors belong to the step: looking twice shows the same ones.
     pub fn render(&mut self, image: &mut [u8; IMAGE_PIXELS]) {
-        self.camera.render(&self.world.state().pose(), image);
+        let key = self.flight.depth_seed ^ u64::from(self.flight.steps);
+        self.camera.render_with_noise(&self.world.state().pose(), key, image);
     }
 
     /// Where the drone is and how it moves.
@@ -171,14 +189,15 @@ impl Simulator {
         if !action.iter().all(|v| v.is_finite()) {
             return Err(self.break_off("action"));
         }
-        let [left, up] = action.map(|v| v.clamp(-1.0, 1.0));
+        let [left, up] = self.commands.pass(action.map(|v| v.clamp(-1.0, 1.0)));
         Ok(Vector3::new(self.forward_speed_mps, left, up))
     }
 
     fn fly_until_contact(&mut self, velocity_mps: &Vector3<f32>) -> Result<Contact, SimulationError> {
         for _ in 0..self.physics_steps {
             let actuation = self.vehicle.actuate(&self.world.state(), velocity_mps, self.dt_secs);
-            self.world.advance(&actuation);
+            let gust_n = self.gust.as_mut().map(Gust::advance);
+            self.world.advance(&actuation, gust_n);
 
             if self.world.is_quarantined() {
                 return Err(self.break_off("the body's pose or velocity"));
@@ -202,6 +221,15 @@ impl Simulator {
             Contact::EndWall => Some(Outcome::ReachedEnd),
             Contact::Nothing if self.flight.steps >= self.max_steps => Some(Outcome::TimedOut),
             Contact::Nothing => None,
+        }
+    }
+
+    /// What the body has hit, once it is known to touch an obstacle.
+    fn obstacle(&self) -> Obstacle {
+        match self.world.touched_wall(&self.course) {
+            // A course has at most `MAX_WALLS` walls.
+            Some(place) => Obstacle::Wall(place as u8 + 1),
+            None => Obstacle::Corridor,
         }
     }
 

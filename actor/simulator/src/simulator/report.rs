@@ -23,6 +23,15 @@ pub enum LevelUp {
     Yes,
 }
 
+/// What a body that collided has hit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Obstacle {
+    /// A wall or the edge of its opening, by its place in flight order from 1. What touches a wall and the corridor has hit the wall.
+    Wall(u8),
+    /// A side of the corridor, its floor or its ceiling.
+    Corridor,
+}
+
 /// What one step brought.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StepReport {
@@ -32,6 +41,8 @@ pub struct StepReport {
     pub level_up: LevelUp,
     /// How the flight ended, if it did.
     pub outcome: Option<Outcome>,
+    /// What was hit, if it ended as [`Outcome::Collided`].
+    pub hit: Option<Obstacle>,
 }
 
 /// Why a step failed. The flight is over then; [`Simulator::reset`](super::Simulator::reset) starts another.

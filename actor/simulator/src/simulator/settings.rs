@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::camera::{CameraFault, CameraSettings};
 use crate::course::GeneratorRanges;
+use crate::disturbances::{DisturbanceFault, DisturbanceSettings};
 use crate::reward::{RewardSettings, RewardSettingsError};
 use crate::vehicle::{VehicleSettings, VehicleSettingsError};
 
@@ -20,6 +21,8 @@ pub struct SimulatorSettings {
     pub reward: RewardSettings,
     /// Ranges that random courses are drawn from, for whoever trains on them: see [`Course::generate`](crate::course::Course::generate).
     pub generator: GeneratorRanges,
+    /// What disturbs flights: noise in the image, gusts, latency, another mass. All off by default.
+    pub disturbances: DisturbanceSettings,
     /// Steps after which a flight is broken off as [`Outcome::TimedOut`](super::Outcome::TimedOut). Default 160: the corridor takes 120 steps of 0.5 s at
     /// 1 m/s, and a third is added.
     pub max_steps: u32,
@@ -32,6 +35,7 @@ impl Default for SimulatorSettings {
             camera: CameraSettings::default(),
             reward: RewardSettings::default(),
             generator: GeneratorRanges::default(),
+            disturbances: DisturbanceSettings::default(),
             max_steps: 160,
         }
     }
@@ -49,6 +53,9 @@ pub enum SimulatorError {
     /// A reward is out of bounds.
     #[error(transparent)]
     Reward(#[from] RewardSettingsError),
+    /// A disturbance is out of bounds.
+    #[error(transparent)]
+    Disturbances(#[from] DisturbanceFault),
     /// No flight could ever begin.
     #[error("[simulator] max_steps = 0: every flight would be over before its first step; give it at least 1")]
     NoSteps,

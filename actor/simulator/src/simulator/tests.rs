@@ -33,7 +33,7 @@ fn fly(
     seed: u64,
     pilot: impl Fn(&Course, &VehicleState) -> [f32; 2],
 ) -> Vec<(VehicleState, StepReport)> {
-    simulator.reset(level, &mut rng(seed)).unwrap();
+    simulator.reset(level, &mut rng(seed), &mut rng(!seed)).unwrap();
     let mut steps = Vec::new();
     loop {
         let action = pilot(simulator.course(), &simulator.state());
@@ -86,7 +86,7 @@ fn whole_course_passes_every_wall_once_and_reaches_the_end() {
             "{preset:?} at {}",
             state.position_m
         );
-        assert_eq!((last.walls_passed, simulator.level()), (5, 6));
+        assert_eq!((last.walls_passed, simulator.level(), last.hit), (5, 6, None));
         assert_eq!(
             steps
                 .iter()
@@ -100,7 +100,7 @@ fn whole_course_passes_every_wall_once_and_reaches_the_end() {
 #[test]
 fn later_start_level_counts_only_the_walls_that_remain() {
     let mut simulator = simulator(Preset::Point);
-    simulator.reset(4, &mut rng(1)).unwrap();
+    simulator.reset(4, &mut rng(1), &mut rng(2)).unwrap();
     assert_eq!((simulator.level(), simulator.walls_passed()), (4, 0));
     let steps = fly(&mut simulator, 4, 1, Oracle::act);
     assert_eq!(steps.last().unwrap().1.walls_passed, 2);
@@ -127,6 +127,7 @@ fn straight_flight_ends_at_the_first_wall_with_the_nose_on_it() {
     let steps = fly(&mut simulator(Preset::Point), 1, 1, |_, _| [0.0, 0.0]);
     let (state, last) = steps.last().unwrap();
     assert_eq!((last.outcome, last.walls_passed), (Some(Outcome::Collided), 0));
+    assert_eq!(last.hit, Some(Obstacle::Wall(1)));
     let nose_m = state.position_m.x + 0.49;
     assert!((10.0..10.01).contains(&nose_m), "{nose_m}");
 }
@@ -136,7 +137,10 @@ fn floor_ceiling_and_sides_are_solid() {
     for action in [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]] {
         let steps = fly(&mut simulator(Preset::Airsim), 1, 1, move |_, _| action);
         let (state, last) = steps.last().unwrap();
-        assert_eq!(last.outcome, Some(Outcome::Collided));
+        assert_eq!(
+            (last.outcome, last.hit),
+            (Some(Outcome::Collided), Some(Obstacle::Corridor))
+        );
         assert!(
             state.position_m.x < 9.0,
             "went to x = {} under {action:?}",
@@ -154,7 +158,7 @@ fn step_limit_breaks_the_flight_off_as_timed_out() {
     let mut simulator = Simulator::new(Arc::new(test_course()), &settings).unwrap();
     let steps = fly(&mut simulator, 1, 1, |_, _| [0.0, 0.0]);
     assert_eq!(steps.len(), 3);
-    assert_eq!(steps[2].1.outcome, Some(Outcome::TimedOut));
+    assert_eq!((steps[2].1.outcome, steps[2].1.hit), (Some(Outcome::TimedOut), None));
     assert_eq!(simulator.step([0.0, 0.0]), Err(SimulationError::NotFlying));
 }
 
@@ -169,7 +173,7 @@ fn actions_beyond_the_range_are_clamped() {
 #[test]
 fn action_that_is_not_a_number_ends_the_flight_with_an_error() {
     let mut simulator = simulator(Preset::Airsim);
-    simulator.reset(1, &mut rng(1)).unwrap();
+    simulator.reset(1, &mut rng(1), &mut rng(2)).unwrap();
     simulator.step([0.0, 0.0]).unwrap();
     let error = simulator.step([0.0, f32::NAN]);
     assert_eq!(
@@ -186,7 +190,7 @@ fn action_that_is_not_a_number_ends_the_flight_with_an_error() {
 fn physics_that_is_not_a_number_ends_the_flight_with_an_error() {
     for preset in PRESETS {
         let mut simulator = simulator(preset);
-        simulator.reset(1, &mut rng(1)).unwrap();
+        simulator.reset(1, &mut rng(1), &mut rng(2)).unwrap();
         match &mut simulator.vehicle {
             Vehicle::Point { time_constant_secs } => *time_constant_secs = f32::NAN,
             Vehicle::Quadrotor { airframe, .. } => airframe.rotor_thrust_n = f32::NAN,
@@ -237,6 +241,6 @@ fn settings_out_of_bounds_are_refused_by_key() {
 
 #[test]
 fn level_beyond_the_course_is_refused() {
-    let error = simulator(Preset::Point).reset(6, &mut rng(1)).unwrap_err();
+    let error = simulator(Preset::Point).reset(6, &mut rng(1), &mut rng(2)).unwrap_err();
     assert_eq!((error.level, error.levels), (6, 5));
 }

@@ -76,6 +76,17 @@ pub(crate) struct BodyProperties {
     pub(crate) half_extents_m: Vector3<f32>,
 }
 
+impl BodyProperties {
+    /// The same body of `factor` times the density.
+    pub(crate) fn scaled(self, factor: f32) -> Self {
+        Self {
+            mass_kg: self.mass_kg * factor,
+            inertia_kgm2: self.inertia_kgm2 * factor,
+            ..self
+        }
+    }
+}
+
 /// A drone and its controller, as it stands at some moment of a flight.
 #[derive(Debug, Clone)]
 pub(crate) enum Vehicle {

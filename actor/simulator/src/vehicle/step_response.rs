@@ -18,11 +18,11 @@ fn fly(preset: Preset, velocity_mps: Vector3<f32>, secs: f32) -> (f32, Vec<Vehic
     let (_, dt_secs) = settings.physics_steps();
     let mut vehicle = Vehicle::trimmed(&settings);
     let mut world = World::new(&test_course(), vehicle.body(), dt_secs).unwrap();
-    world.reset(&Point3::new(1.5, 0.0, 3.5));
+    world.reset(&Point3::new(1.5, 0.0, 3.5), 1.0);
     let states = (0..(secs / dt_secs) as usize)
         .map(|_| {
             let actuation = vehicle.actuate(&world.state(), &velocity_mps, dt_secs);
-            world.advance(&actuation);
+            world.advance(&actuation, None);
             world.state()
         })
         .collect();

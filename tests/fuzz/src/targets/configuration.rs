@@ -110,6 +110,7 @@ fn simulator_samples() -> Vec<Vec<u8>> {
     samples.extend(
         [
             "max_steps = 3\n[vehicle]\npreset = \"hummingbird\"\nforward_speed_mps = 10.0\ncontrol_period_secs = 0.01\n",
+            "[disturbances]\nmass_spread = 0.5\nlatency_periods = 8\n[disturbances.gust]\nforce_rms_n = 10.0\n[disturbances.depth]\nmodel = \"stereo\"\ndropout_share = 0.5\n",
             "[vehicle]\npreset = \"point\"\npoint_time_constant_secs = 0.01\nphysics_hz = 10000.0\n",
             "[camera]\nhorizontal_fov_deg = 150.0\nmount_m = [2.0, -2.0, 2.0]\nmount_pitch_deg = 90.0\n[reward]\ncollision = -1e6\n",
         ]

@@ -10,6 +10,7 @@ use skein_simulator::course::{
 };
 use skein_simulator::reward::RewardTerms;
 use skein_simulator::simulator::{Outcome, Simulator, SimulatorSettings};
+use skein_simulator::suite::Suite;
 
 use super::{Target, USUAL, Verdict, shipped, text};
 use crate::script::Script;
@@ -57,6 +58,44 @@ pub(super) const GENERATOR: Target = Target {
         }
     },
 };
+
+pub(super) const SUITE: Target = Target {
+    name: "suite_file",
+    reads: "evaluation suites, with the shipped course files to name",
+    longest_bytes: 4096,
+    weight: USUAL / 20,
+    samples: suite_samples,
+    run: |bytes| {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/evaluations");
+        let file = std::path::Path::new(folder).join("fuzzed.toml");
+        match text(bytes).map(|text| Suite::parse(text, &file)) {
+            Some(Ok(suite)) => {
+                for entry in &suite.entries {
+                    assert!(entry.flights > 0);
+                    for flight in [0, entry.flights - 1] {
+                        // A range may hold what fits for one seed and nothing for another.
+                        if let Ok(course) = entry.courses.of_flight(flight) {
+                            assert!(course.levels() > 0);
+                        }
+                    }
+                }
+                Verdict::Accepted
+            }
+            Some(Err(error)) => {
+                assert!(error.to_string().contains("fuzzed.toml"), "{error}");
+                Verdict::Refused
+            }
+            None => Verdict::Refused,
+        }
+    },
+};
+
+fn suite_samples() -> Vec<Vec<u8>> {
+    vec![
+        shipped("configs/evaluations/generalist.toml"),
+        b"name = \"x\"\n[[entry]]\nname = \"one\"\nflights = 3\nfirst_seed = 18446744073709551615\n[entry.generated]\nshapes = [\"star\"]\n".to_vec(),
+    ]
+}
 
 fn file_samples() -> Vec<Vec<u8>> {
     ["training", "rearranged_34125", "rearranged_53412", "non_rectangular"]
@@ -111,7 +150,8 @@ pub(super) fn assert_flyable(course: Course) -> Verdict {
 
 /// Flies two steps from `level`.
 pub(super) fn fly(simulator: &mut Simulator, settings: &SimulatorSettings, level: u8) {
-    simulator.reset(level, &mut Pcg64Mcg::seed_from_u64(1)).unwrap();
+    let [mut start, mut disturbances] = [1, 2].map(Pcg64Mcg::seed_from_u64);
+    simulator.reset(level, &mut start, &mut disturbances).unwrap();
     let mut image = [0; IMAGE_PIXELS];
     for action in [[0.0, 0.0], [1.0, -1.0]] {
         simulator.render(&mut image);
@@ -220,7 +260,6 @@ fn polygon(script: &mut Script<'_>) -> Shape {
 }
 
 fn ranges(script: &mut Script<'_>) -> GeneratorRanges {
-    use GeneratedShape::{Circle, Cross, Diamond, L, Polygon, Rectangle, Triangle};
     let mut range = |usual: std::ops::RangeInclusive<f32>| [script.number(usual.clone()), script.number(usual)];
     let (clearance_m, rotation_deg) = (range(0.6..=1.3), range(-360.0..=360.0));
     let (corridor, start) = (corridor(script), start(script));
@@ -234,7 +273,7 @@ fn ranges(script: &mut Script<'_>) -> GeneratorRanges {
             .map(|wall| gap_m * f32::from(wall) + script.number(-1.0..=1.0))
             .collect(),
         shapes: (0..script.u8() % 4)
-            .map(|_| script.one_of(&[Rectangle, Circle, Triangle, Diamond, Cross, L, Polygon]))
+            .map(|_| script.one_of(&[GeneratedShape::TRAINED, GeneratedShape::HELD_OUT].concat()))
             .collect(),
         clearance_m,
         rotation_deg,

@@ -65,13 +65,14 @@ impl Target {
 const USUAL: usize = 200;
 
 /// All of them.
-pub static TARGETS: [Target; 21] = [
+pub static TARGETS: [Target; 22] = [
     configuration::CONFIG,
     configuration::OVERRIDES,
     configuration::SIMULATOR,
     courses::FILE,
     courses::LAYOUT,
     courses::GENERATOR,
+    courses::SUITE,
     records::RECORDS,
     signals::SIGNALS,
     snapshots::FILE,

@@ -111,6 +111,7 @@ pub(super) fn flight() -> CommittedFlight {
         outcome: Outcome::Collided,
         walls_passed: 1,
         course_walls: 5,
+        hit_wall: None,
         depth: Some(vec![9; 3 * IMAGE_PIXELS]),
     }
 }

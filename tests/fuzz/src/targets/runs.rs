@@ -107,6 +107,7 @@ fn result_samples() -> Vec<Vec<u8>> {
         walls_passed: 3,
         flight_return: -1.5,
         outcome: Outcome::Collided,
+        hit_wall: Some(4),
     }; 4];
     let report = EvaluationReport {
         policy_version: PolicyVersion(80),

@@ -1,0 +1,232 @@
+//! A stereo camera's errors, against what the settings ask for.
+
+use nalgebra::Isometry3;
+
+use super::{CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use crate::course::{Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout, test_course};
+use crate::disturbances::{DepthModel, DepthNoiseSettings};
+
+/// The noise alone: no shadows, no patches.
+fn noise_alone() -> DepthNoiseSettings {
+    DepthNoiseSettings {
+        model: DepthModel::Stereo,
+        baseline_m: 0.0,
+        dropout_share: 0.0,
+        ..Default::default()
+    }
+}
+
+/// A wall 41 m along a corridor so wide that a camera before it sees nothing else around the middle; its opening is far aside.
+fn wide_hall() -> Course {
+    Course::new(CourseLayout {
+        name: "hall".into(),
+        corridor: Corridor {
+            length_m: 60.0,
+            width_m: 80.0,
+            height_m: 60.0,
+        },
+        start: StartArea::default(),
+        wall_thickness_m: 0.3,
+        walls: vec![WallLayout {
+            label: WallLabel(1),
+            x_m: 41.0,
+            opening: Opening {
+                shape: Shape::Rectangle {
+                    width_m: 2.0,
+                    height_m: 2.0,
+                },
+                centre_m: [34.0, 30.0],
+                rotation_deg: 0.0,
+            },
+        }],
+    })
+    .unwrap()
+}
+
+/// A camera in the middle of the body.
+fn lens() -> CameraSettings {
+    CameraSettings {
+        mount_m: [0.0; 3],
+        ..Default::default()
+    }
+}
+
+/// An image of the wall from `depth_m` before it.
+fn facing_wall(noise: &DepthNoiseSettings, depth_m: f32, key: u64) -> Box<[u8; IMAGE_PIXELS]> {
+    let mut image = Box::new([0; IMAGE_PIXELS]);
+    let mut camera = DepthCamera::new(&lens(), &wide_hall()).unwrap().with_noise(noise);
+    camera.render_with_noise(&Isometry3::translation(41.0 - depth_m, 0.0, 30.0), key, &mut image);
+    image
+}
+
+/// An image from before the first wall of the course with one opening of each kind, `depth_m` before it.
+fn facing_opening(noise: &DepthNoiseSettings, depth_m: f32, key: u64) -> Box<[u8; IMAGE_PIXELS]> {
+    let mut image = Box::new([0; IMAGE_PIXELS]);
+    let course = test_course();
+    let wall = &course.walls()[0];
+    let [y_m, z_m] = wall.safe_point();
+    let mut camera = DepthCamera::new(&lens(), &course).unwrap().with_noise(noise);
+    camera.render_with_noise(&Isometry3::translation(wall.x_m() - depth_m, y_m, z_m), key, &mut image);
+    image
+}
+
+#[test]
+fn readings_scatter_by_sigma_around_the_true_depth() {
+    let noise = noise_alone();
+    for depth_m in [1.0, 2.0, 5.0, 10.0, 15.0] {
+        let readings: Vec<f64> = (0..20)
+            .flat_map(|key| *facing_wall(&noise, depth_m, key))
+            .map(|level| f64::from(level) / 255.0 * 20.0)
+            .collect();
+        let mean = readings.iter().sum::<f64>() / readings.len() as f64;
+        let variance = readings.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / readings.len() as f64;
+        // Rounding to whole levels adds a twelfth of a level's square.
+        let level_m = 20.0 / 255.0;
+        let sigma = f64::from(noise.sigma_m(depth_m));
+        assert!(
+            (mean - f64::from(depth_m)).abs() < 0.5 * level_m,
+            "{depth_m} m: mean {mean}"
+        );
+        let expected = (sigma.powi(2) + level_m.powi(2) / 12.0).sqrt();
+        // Where the noise is less than a level, rounding is not independent of it.
+        if sigma > level_m {
+            assert!(
+                (variance.sqrt() / expected - 1.0).abs() < 0.02,
+                "{depth_m} m: {} m, not {expected} m",
+                variance.sqrt()
+            );
+        } else {
+            assert!(variance.sqrt() < level_m, "{depth_m} m: {} m", variance.sqrt());
+        }
+    }
+}
+
+#[test]
+fn noise_far_below_a_grey_level_still_shows_where_the_depth_lies_between_two() {
+    // 6.04 m is level 77.01, 6.00 m is 76.5: sigma 0.15 m is two levels.
+    let image = facing_wall(&noise_alone(), 6.0, 1);
+    let mean = image.iter().map(|&level| f64::from(level)).sum::<f64>() / IMAGE_PIXELS as f64;
+    assert!((mean - 76.5).abs() < 0.1, "{mean}");
+}
+
+#[test]
+fn images_of_two_keys_err_independently_and_of_one_key_alike() {
+    let noise = noise_alone();
+    let deviation = |key| facing_wall(&noise, 10.0, key).map(|level| f64::from(level) - 127.5);
+    let (one, other) = (deviation(1), deviation(2));
+    assert!(one == deviation(1));
+    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / IMAGE_PIXELS as f64;
+    assert!((product(&one, &other) / product(&one, &one)).abs() < 0.04);
+    // Nor does a pixel err as its neighbour does, to the right or below.
+    for lag in [1, IMAGE_WIDTH] {
+        assert!(
+            (product(&one[lag..], &one) / product(&one, &one)).abs() < 0.04,
+            "lag {lag}"
+        );
+    }
+}
+
+#[test]
+fn what_is_out_of_range_stays_so() {
+    assert!(facing_wall(&noise_alone(), 30.0, 1).iter().all(|&level| level == 255));
+}
+
+#[test]
+fn shadow_lies_left_of_near_edges_and_is_as_wide_as_the_disparities_differ() {
+    let shadows_alone = |baseline_m| DepthNoiseSettings {
+        model: DepthModel::Stereo,
+        sigma_quadratic_per_m: 0.0,
+        sigma_linear: 0.0,
+        sigma_constant_m: 0.0,
+        baseline_m,
+        dropout_share: 0.0,
+        ..Default::default()
+    };
+    // The opening shows the next wall 10 m behind; at 64 pixels of focal length, 0.2 m between the lenses, 2 m and 12.3 m, the disparities are 6.4 and 1.0 pixels.
+    let row = IMAGE_HEIGHT / 2;
+    let of_row = |image: &[u8; IMAGE_PIXELS]| image[row * IMAGE_WIDTH..][..IMAGE_WIDTH].to_vec();
+    let (seen, truth) = (
+        of_row(&facing_opening(&shadows_alone(0.2), 2.0, 1)),
+        of_row(&facing_opening(&shadows_alone(0.0), 2.0, 1)),
+    );
+    let lost: Vec<usize> = (0..IMAGE_WIDTH)
+        .filter(|&column| seen[column] == 0 && truth[column] != 0)
+        .collect();
+    // The opening's right edge, where near begins again. Its left edge casts no shadow: the left lens sees less there than the right one.
+    let edge = (IMAGE_WIDTH / 2..IMAGE_WIDTH)
+        .find(|&column| truth[column] < truth[column - 1] / 2)
+        .unwrap();
+    let (border, within): (Vec<usize>, Vec<usize>) = lost.iter().partition(|&&column| column < 16);
+    assert!((4..=6).contains(&within.len()), "{within:?}, edge at {edge}");
+    assert!(
+        within.iter().all(|&column| column < edge && column + 7 > edge),
+        "{within:?}, edge at {edge}"
+    );
+    // The left border of the image, which the right lens does not see: 6.4 pixels at 2 m, and more at the side that is nearer.
+    assert!((5..=8).contains(&border.len()), "{border:?}");
+    // Everything else is as it was.
+    assert!((0..IMAGE_WIDTH).all(|column| lost.contains(&column) || seen[column] == truth[column]));
+}
+
+#[test]
+fn patches_cover_the_share_asked_for_and_are_patches() {
+    let patches_alone = DepthNoiseSettings {
+        baseline_m: 0.0,
+        dropout_share: 0.05,
+        ..noise_alone()
+    };
+    let (mut lost, mut with_lost_neighbour) = (0, 0);
+    let images = 200;
+    for key in 0..images {
+        let image = facing_wall(&patches_alone, 5.0, key);
+        for (number, _) in image.iter().enumerate().filter(|(_, level)| **level == 0) {
+            lost += 1;
+            with_lost_neighbour += usize::from(number % IMAGE_WIDTH > 0 && image[number - 1] == 0);
+        }
+    }
+    let share = lost as f64 / (images as usize * IMAGE_PIXELS) as f64;
+    // A little less than asked for, where patches overlap.
+    assert!((0.045..0.051).contains(&share), "{share}");
+    assert!(
+        with_lost_neighbour as f64 > 0.8 * lost as f64,
+        "{with_lost_neighbour} of {lost}"
+    );
+}
+
+#[test]
+fn what_has_a_reading_is_never_taken_for_what_has_none() {
+    // Noise as large as the depth itself.
+    let wild = DepthNoiseSettings {
+        sigma_constant_m: 5.0,
+        ..noise_alone()
+    };
+    assert!(facing_wall(&wild, 2.0, 1).iter().all(|&level| level > 0));
+}
+
+#[test]
+fn camera_without_noise_draws_the_truth_whatever_the_key() {
+    let off = DepthNoiseSettings::default();
+    let mut truth = [0; IMAGE_PIXELS];
+    DepthCamera::new(&lens(), &wide_hall())
+        .unwrap()
+        .render(&Isometry3::translation(36.0, 0.0, 30.0), &mut truth);
+    assert!(*facing_wall(&off, 5.0, 1) == truth && *facing_wall(&off, 5.0, 2) == truth);
+}
+
+#[test]
+fn instructions_do_not_change_a_bit_of_the_errors() {
+    let settings = DepthNoiseSettings {
+        model: DepthModel::Stereo,
+        ..Default::default()
+    };
+    let course = test_course();
+    let mut camera = DepthCamera::new(&CameraSettings::default(), &course)
+        .unwrap()
+        .with_noise(&settings);
+    let pose = Isometry3::translation(7.0, 0.4, 3.0);
+    let [mut fastest, mut plain] = [[0; IMAGE_PIXELS]; 2];
+    camera.render_with_noise(&pose, 9, &mut fastest);
+    camera.draw = super::draw;
+    camera.render_with_noise(&pose, 9, &mut plain);
+    assert!(fastest == plain);
+}

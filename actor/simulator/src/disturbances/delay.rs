@@ -1,0 +1,35 @@
+//! Commands that take effect late.
+
+use std::collections::VecDeque;
+
+/// Holds each action back for a number of control periods. Until the first one arrives, nothing is commanded sideways or up.
+#[derive(Debug, Clone)]
+pub(crate) struct Delay {
+    periods: usize,
+    on_the_way: VecDeque<[f32; 2]>,
+}
+
+impl Delay {
+    /// A way of `periods` control periods on which nothing is yet.
+    pub(crate) fn new(periods: u32) -> Self {
+        let periods = periods as usize;
+        let mut delay = Self {
+            periods,
+            on_the_way: VecDeque::with_capacity(periods + 1),
+        };
+        delay.clear();
+        delay
+    }
+
+    /// Forgets what was on the way.
+    pub(crate) fn clear(&mut self) {
+        self.on_the_way.clear();
+        self.on_the_way.resize(self.periods, [0.0, 0.0]);
+    }
+
+    /// Takes `action` in and gives the one out that takes effect now.
+    pub(crate) fn pass(&mut self, action: [f32; 2]) -> [f32; 2] {
+        self.on_the_way.push_back(action);
+        self.on_the_way.pop_front().unwrap_or(action)
+    }
+}

@@ -1,0 +1,93 @@
+//! Evaluation suites: what a pilot is put to, entry by entry.
+//!
+//! An entry names courses (a file, all orders of a file's walls, or generated ones), how many flights are spread over them, and what disturbs them. A suite says all of it
+//! by itself, so that two pilots that were trained on different courses, and with different disturbances, are put to the same.
+
+mod file;
+#[cfg(test)]
+mod tests;
+
+use std::sync::Arc;
+
+pub use file::{EntryFault, SuiteError};
+
+use crate::course::{Course, GeneratorRanges, RangesError};
+use crate::disturbances::DisturbanceSettings;
+
+/// Most walls of a course of which all orders are flown: 720 courses.
+pub const MOST_WALLS_TO_ORDER: usize = 6;
+
+/// A list of entries, none of which is called as another.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Suite {
+    /// What reports call it.
+    pub name: String,
+    /// What is flown, in order.
+    pub entries: Vec<SuiteEntry>,
+}
+
+/// Flights of one kind.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SuiteEntry {
+    /// What reports call it.
+    pub name: String,
+    /// How many.
+    pub flights: u64,
+    /// Where.
+    pub courses: EntryCourses,
+    /// What disturbs them.
+    pub disturbances: DisturbanceSettings,
+}
+
+/// The courses of an entry. Flight n flies course n, and begins anew after the last.
+#[derive(Debug, Clone, PartialEq)]
+pub enum EntryCourses {
+    /// These; at least one.
+    Listed(Vec<Arc<Course>>),
+    /// One for each flight: that of the seed `first_seed` + n.
+    Generated {
+        /// Seed of the first flight's course.
+        first_seed: u64,
+        /// What they are drawn from.
+        ranges: GeneratorRanges,
+    },
+}
+
+impl EntryCourses {
+    /// Number of the course that flight `flight`, from 0, flies: two flights with one number fly one course.
+    #[must_use]
+    pub fn number_of(&self, flight: u64) -> u64 {
+        match self {
+            Self::Listed(courses) => flight % courses.len() as u64,
+            Self::Generated { .. } => flight,
+        }
+    }
+
+    /// The course of flight `flight`, from 0.
+    ///
+    /// # Errors
+    /// [`RangesError`] if none can be generated for it.
+    pub fn of_flight(&self, flight: u64) -> Result<Arc<Course>, RangesError> {
+        match self {
+            Self::Listed(courses) => Ok(Arc::clone(&courses[self.number_of(flight) as usize])),
+            Self::Generated { first_seed, ranges } => {
+                Course::generate(first_seed.wrapping_add(flight), ranges).map(Arc::new)
+            }
+        }
+    }
+}
+
+/// All orders of `count` things, in lexicographic order: the first leaves everything where it is.
+fn orders(count: usize) -> Vec<Vec<usize>> {
+    let mut all = vec![Vec::new()];
+    for _ in 0..count {
+        all = all
+            .into_iter()
+            .flat_map(|begun: Vec<usize>| {
+                let free = (0..count).filter(|next| !begun.contains(next)).collect::<Vec<_>>();
+                free.into_iter().map(move |next| [begun.as_slice(), &[next]].concat())
+            })
+            .collect();
+    }
+    all
+}
