@@ -31,6 +31,8 @@ pub enum Purpose {
     StartPosition = 10,
     /// Exploration noise of one flight; derived from the ticket's seed, so that a start drawn otherwise does not shift it.
     ActionNoise = 11,
+    /// Resamples of the runs of an experiment, from which the uncertainty of what it found is told; the seed is their number, the index that of the resamples.
+    Bootstrap = 12,
 }
 
 /// The seed for the `index`-th use of `purpose` in the run seeded `run_seed`.
