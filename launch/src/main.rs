@@ -12,6 +12,7 @@ use rustix::fs::Mode;
 use rustix::process::umask;
 use skein_launch::conclusion::conclusion;
 use skein_launch::display::Display;
+use skein_launch::interrupts::{INTERRUPTED, interrupts, runtime};
 use skein_launch::prepare::room::{check_shared_memory_for_more, scarce_disk};
 use skein_launch::prepare::{Prepared, ideal_walls_passed, load_courses, prepare};
 use skein_launch::reports;
@@ -21,12 +22,10 @@ use skein_protocol::claims::ActorClaim;
 use skein_protocol::failure::with_causes;
 use skein_protocol::run::{RunDirectory, RunError, SupervisorSeat, sweep_leftovers};
 use skein_protocol::summary::{Ending, Summary};
-use tokio::runtime::Runtime;
-use tokio::signal::unix::{SignalKind, signal};
-use tokio::sync::mpsc;
 
-/// Status of a process that was interrupted, as shells report it: 128 + SIGINT.
-const INTERRUPTED: u8 = 130;
+/// What the system may refuse.
+const RUNTIME: &str = "cannot start the runtime";
+const SIGNALS: &str = "cannot listen for signals";
 /// How long a learner that nobody supervises may still be ending, before its run is resumed.
 const PATIENCE: Duration = Duration::from_secs(10);
 
@@ -163,8 +162,8 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         deadlines: Deadlines::of(config),
     };
     let mut display = Display::new();
-    let outcome = runtime()?.block_on(async {
-        let mut interrupts = interrupts()?;
+    let outcome = runtime().context(RUNTIME)?.block_on(async {
+        let mut interrupts = interrupts().context(SIGNALS)?;
         anyhow::Ok(supervisor::run(&plan, &mut interrupts, &mut display).await)
     });
     display.finish();
@@ -303,8 +302,8 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
         deadlines: Deadlines::of(&config),
     };
     let mut display = Display::new();
-    runtime()?.block_on(async {
-        let mut interrupts = interrupts()?;
+    runtime().context(RUNTIME)?.block_on(async {
+        let mut interrupts = interrupts().context(SIGNALS)?;
         let is_under_way = || run.is_under_way().unwrap_or(false);
         Ok(supervisor::attach(&plan, is_under_way, &mut interrupts, &mut display).await?)
     })
@@ -338,28 +337,4 @@ fn open(directory: &Path) -> anyhow::Result<RunDirectory> {
 
 fn claim_actors(run: &RunDirectory, count: usize) -> Result<Vec<ActorClaim>, RunError> {
     (0..count).map(|_| run.claim_actor()).collect()
-}
-
-/// All on the main thread: children are bound to the life of the thread that started them.
-fn runtime() -> anyhow::Result<Runtime> {
-    tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .context("cannot start the runtime")
-}
-
-/// One message for each time the user, or the system, asks this process to end.
-fn interrupts() -> anyhow::Result<mpsc::Receiver<()>> {
-    let (sender, receiver) = mpsc::channel(4);
-    for kind in [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()] {
-        let mut signal = signal(kind).context("cannot listen for signals")?;
-        let sender = sender.clone();
-        tokio::spawn(async move {
-            while signal.recv().await.is_some() {
-                // When four are waiting, a fifth says nothing new.
-                let _ = sender.try_send(());
-            }
-        });
-    }
-    Ok(receiver)
 }

@@ -33,6 +33,8 @@ pub enum Purpose {
     ActionNoise = 11,
     /// What disturbs one flight; derived from the ticket's seed.
     Disturbances = 12,
+    /// Resamples of the runs of an experiment, from which the uncertainty of what it found is told; the seed is their number, the index that of the resamples.
+    Bootstrap = 13,
 }
 
 /// The seed for the `index`-th use of `purpose` in the run seeded `run_seed`.

@@ -47,10 +47,7 @@ pub fn prepare(
     run_directory: &Path,
     actors: usize,
 ) -> Result<Prepared, PrepareError> {
-    let mut config = Config::load(config_file, overrides)?;
-    let settings =
-        check(config_file, &config, actors).map_err(|error| checks::blame(error, config_file, overrides, actors))?;
-    config.simulator = written_out(&settings);
+    let config = resolve(config_file, overrides, actors)?;
     room::check_shared_memory(&config, actors)?;
     room::check_folders()?;
     let new = NewDirectory::make(run_directory)?;
@@ -65,6 +62,19 @@ pub fn prepare(
             Err(error)
         }
     }
+}
+
+/// The configuration in `config_file` with `overrides`, checked as that of a run with `actors` actors is, with all that the simulator was not told written
+/// out.
+///
+/// # Errors
+/// [`PrepareError`] names file, key and remedy, and the override that is to blame.
+pub fn resolve(config_file: &Path, overrides: &[String], actors: usize) -> Result<Config, PrepareError> {
+    let mut config = Config::load(config_file, overrides)?;
+    let settings =
+        check(config_file, &config, actors).map_err(|error| checks::blame(error, config_file, overrides, actors))?;
+    config.simulator = written_out(&settings);
+    Ok(config)
 }
 
 /// Puts everything into a new run's directory that its processes begin with.

@@ -13,12 +13,14 @@ const HEIGHT: u32 = 640;
 
 /// The columns of `flights.csv` that are plotted, in flight order.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
-pub(super) struct FlightRow {
+pub(crate) struct FlightRow {
+    /// Its environment steps.
+    pub(crate) steps: u32,
     /// Walls passed in the flight.
-    pub(super) walls_passed: u32,
+    pub(crate) walls_passed: u32,
     /// Sum of its rewards, undiscounted.
     #[serde(rename = "return")]
-    pub(super) episode_return: f64,
+    pub(crate) episode_return: f64,
 }
 
 /// No return is larger: a flight has at most 65536 records, of rewards up to `skein_protocol::transition::LARGEST_NUMBER`. An axis much longer than any
@@ -29,7 +31,7 @@ const LARGEST_RETURN: f64 = 1e12;
 ///
 /// # Errors
 /// [`ReportError::Malformed`] names the line.
-pub(super) fn read_flights(path: &Path) -> Result<Vec<FlightRow>, ReportError> {
+pub(crate) fn read_flights(path: &Path) -> Result<Vec<FlightRow>, ReportError> {
     let malformed = |problem: String| ReportError::Malformed {
         path: path.to_owned(),
         problem,
@@ -92,7 +94,7 @@ pub(super) fn draw_walls_passed(
 }
 
 /// Mean over the last `window` values at each of them, over fewer where there are no more yet.
-pub(super) fn trailing_mean(values: &[f64], window: usize) -> Vec<f64> {
+pub(crate) fn trailing_mean(values: &[f64], window: usize) -> Vec<f64> {
     let mut sum = 0.0;
     (0..values.len())
         .map(|i| {
@@ -197,18 +199,22 @@ impl Curve {
 }
 
 /// A line of `width` drawn pixels, segment by segment: the library's own leaves holes where a thick line turns sharply.
-fn thick_line(points: &[(f64, f64)], colour: RGBColor, width: u32) -> impl Iterator<Item = PathElement<(f64, f64)>> {
+pub(super) fn thick_line(
+    points: &[(f64, f64)],
+    colour: RGBColor,
+    width: u32,
+) -> impl Iterator<Item = PathElement<(f64, f64)>> {
     points
         .windows(2)
         .map(move |ends| PathElement::new(ends.to_vec(), colour.stroke_width(width)))
 }
 
-fn legend_line((x, y): (i32, i32), colour: RGBColor) -> PathElement<(i32, i32)> {
+pub(super) fn legend_line((x, y): (i32, i32), colour: RGBColor) -> PathElement<(i32, i32)> {
     PathElement::new([(x, y), (x + px(24) as i32, y)], colour.stroke_width(px(3)))
 }
 
 /// The values' range with a margin, never empty.
-fn padded_range(values: &[f64]) -> (f64, f64) {
+pub(super) fn padded_range(values: &[f64]) -> (f64, f64) {
     let (low, high) = values
         .iter()
         .filter(|value| value.is_finite())
@@ -245,7 +251,7 @@ mod tests {
     fn a_damaged_row_is_named_by_its_line() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("flights.csv");
-        std::fs::write(&path, "flight,walls_passed,return\n0,2,1.5\n1,two,1.5\n").unwrap();
+        std::fs::write(&path, "flight,steps,walls_passed,return\n0,9,2,1.5\n1,9,two,1.5\n").unwrap();
         let error = read_flights(&path).unwrap_err().to_string();
         assert!(error.contains("flights.csv") && error.contains("line: 3"), "{error}");
     }
@@ -255,7 +261,11 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("flights.csv");
         for value in ["1e308", "-1e13", "inf", "nan"] {
-            std::fs::write(&path, format!("flight,walls_passed,return\n0,2,1.5\n1,2,{value}\n")).unwrap();
+            std::fs::write(
+                &path,
+                format!("flight,steps,walls_passed,return\n0,9,2,1.5\n1,9,2,{value}\n"),
+            )
+            .unwrap();
             let error = read_flights(&path).unwrap_err().to_string();
             assert!(error.contains("line 3: a return of"), "{error}");
         }

@@ -113,7 +113,7 @@ fn decades((low, high): (f64, f64)) -> std::ops::Range<f64> {
 }
 
 /// A number short enough for an axis.
-fn brief(value: f64) -> String {
+pub(super) fn brief(value: f64) -> String {
     let (value, suffix) = match value {
         value if value >= 1e6 => (value / 1e6, " M"),
         value if value >= 1e4 => (value / 1e3, " k"),

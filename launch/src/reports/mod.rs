@@ -3,7 +3,8 @@
 //! Nothing here asks a running process: whatever a run wrote before it ended, however it ended, can be drawn again later.
 
 mod canvas;
-mod curves;
+pub mod comparison;
+pub(crate) mod curves;
 mod flight_paths;
 pub mod growth;
 mod reconstructions;

@@ -10,7 +10,7 @@ const LINES: usize = 12;
 const MAX_BYTES: u64 = 16 * 1024;
 
 /// The last lines of the log at `path`, indented; a remark if there are none.
-pub(super) fn log_tail(path: &Path) -> String {
+pub(crate) fn log_tail(path: &Path) -> String {
     let text = read_end(path).unwrap_or_default();
     let lines: Vec<_> = text.lines().filter(|line| !line.trim().is_empty()).collect();
     if lines.is_empty() {

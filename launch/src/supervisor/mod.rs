@@ -15,7 +15,7 @@ mod crew;
 mod dismissal;
 mod error;
 mod learner;
-mod log_tail;
+pub(crate) mod log_tail;
 mod memory;
 mod process;
 mod restarts;

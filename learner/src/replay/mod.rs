@@ -1,7 +1,7 @@
 //! The split replay buffer (paper, section 3.5).
 //!
 //! Successful avoidance is rare in the beginning and would drown among everything else, so it has a part of its own with a fixed share of every
-//! minibatch. Each part is a [`ring`] of self-contained rows. Whole flights go in, in flight order, and nothing here is random but what the
+//! minibatch. (With a share of nought there is one part for all, the ordinary buffer.) Each part is a [`ring`] of self-contained rows. Whole flights go in, in flight order, and nothing here is random but what the
 //! caller's seeded generator draws: the content is a function of the flights, and a minibatch one of content and seed.
 //!
 //! While the VAE is trained, the depth [`images`] of stored transitions are kept: the VAE learns from them, and when it is frozen the latent codes of all
@@ -237,8 +237,11 @@ impl Minibatch {
     }
 }
 
-/// Capacities of the success and the regular part; each has room for one transition at least.
+/// Capacities of the success and the regular part; each has room for one transition at least, unless there is to be no success part.
 fn capacities(section: &ReplaySection) -> (usize, usize) {
+    if section.success_share == 0.0 {
+        return (0, section.capacity);
+    }
     let success = (section.capacity as f64 * section.success_share).round() as usize;
     let success = success.clamp(1, section.capacity - 1);
     (success, section.capacity - success)

@@ -7,8 +7,11 @@ use skein_protocol::config::{ReplaySection, SuccessRule};
 
 /// Which steps of a flight are success experience, `[steps]`.
 ///
-/// `level_up`, `[steps]`: a wall was crossed or the destination reached in this step.
+/// `level_up`, `[steps]`: a wall was crossed or the destination reached in this step. None is where success experience has no part of its own.
 pub(super) fn success_steps(level_up: &[bool], section: &ReplaySection) -> Vec<bool> {
+    if section.success_share == 0.0 {
+        return vec![false; level_up.len()];
+    }
     let before = match section.success {
         SuccessRule::LevelUp => 0,
         SuccessRule::Approach => section.approach_steps,

@@ -10,7 +10,8 @@ use super::{Invalid, require};
 pub struct ReplaySection {
     /// Transitions held in both parts together (paper: 2^17). Default 131072.
     pub capacity: usize,
-    /// Share of the capacity, and of every minibatch, that belongs to success experience (paper: 0.125). Default 0.125.
+    /// Share of the capacity, and of every minibatch, that belongs to success experience (paper: 0.125); with 0 there is one part for everything, as in
+    /// ordinary SAC. Default 0.125.
     pub success_share: f64,
     /// What counts as success experience; the paper does not say. Default `level-up`.
     pub success: SuccessRule,
@@ -38,10 +39,10 @@ impl ReplaySection {
             "is outside 256..=2^24: each transition takes some 300 bytes of memory",
         )?;
         require(
-            self.success_share > 0.0 && self.success_share < 1.0,
+            (0.0..1.0).contains(&self.success_share),
             "replay.success_share",
             self.success_share,
-            "is outside (0, 1): one of the two parts would be empty for ever",
+            "is outside [0, 1): nothing but success experience would ever be learned from; 0 keeps everything in one part",
         )?;
         require(
             (1..=1000).contains(&self.approach_steps),

@@ -125,6 +125,7 @@ drive! {
     no_configuration_file_panics_and_what_is_accepted_reads_back => "config",
     no_override_panics_and_what_is_refused_has_a_culprit => "overrides",
     no_simulator_section_panics_and_what_is_accepted_flies => "simulator",
+    no_experiment_panics_and_what_is_accepted_can_be_run => "experiment",
     no_course_file_panics_and_what_is_accepted_flies => "course_file",
     no_geometry_panics_and_what_is_accepted_flies => "course_layout",
     no_generator_ranges_panic_and_what_is_drawn_flies => "generator",

@@ -72,6 +72,29 @@ fn an_empty_part_is_made_up_for_by_the_other() {
 }
 
 #[test]
+fn without_a_success_share_the_whole_buffer_is_one_part_that_knows_no_success() {
+    let mut config = config(1000, Observation::Latent);
+    config.replay.success_share = 0.0;
+    let mut replay = frozen(&config);
+    for number in 0..50 {
+        let mut crossing = flight(number, 20, Outcome::Collided);
+        crossing.level_up[7] = true;
+        replay.insert(crossing).unwrap();
+    }
+    assert_eq!((replay.len(), replay.success_len()), (1000, 0));
+    let mut batch = Minibatch::default();
+    replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 20_000, &mut batch);
+    // The level-up of the newest flight is one transition of a thousand.
+    let level_up = 49_007.0_f32 / 100.0;
+    let drawn = batch.rewards.iter().filter(|&&reward| reward == level_up).count();
+    assert!((5..50).contains(&drawn), "{drawn}");
+    assert_eq!(
+        Replay::restore(&config, replay.state()).unwrap().state(),
+        replay.state()
+    );
+}
+
+#[test]
 fn every_transition_of_a_part_is_equally_likely() {
     let mut replay = frozen(&config(1000, Observation::Latent));
     replay.insert(flight(0, 10, Outcome::Collided)).unwrap();

@@ -62,7 +62,8 @@ impl Model {
                 SuccessRule::LevelUp => 0,
                 SuccessRule::Approach => self.section.approach_steps,
             };
-            let success = flight.level_up[step..].iter().take(ahead + 1).any(|&level_up| level_up);
+            let success = self.section.success_share > 0.0
+                && flight.level_up[step..].iter().take(ahead + 1).any(|&level_up| level_up);
             let (part, capacity) = &mut self.parts[usize::from(!success)];
             part.push_back(transition);
             if part.len() > *capacity {
@@ -138,8 +139,10 @@ proptest! {
         ]),
         rule in prop::sample::select(vec![SuccessRule::LevelUp, SuccessRule::Approach]),
         chunk in 1..9_usize,
+        share in prop::sample::select(vec![0.0, 0.25]),
     ) {
         let mut config = config(capacity, observation);
+        config.replay.success_share = share;
         config.replay.success = rule;
         config.replay.approach_steps = 3;
         let (mut replay, mut model) = (Replay::new(&config), Model::new(&config));

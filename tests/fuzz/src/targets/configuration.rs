@@ -1,8 +1,9 @@
-//! Configuration files, the overrides of a command line, and the simulator's section.
+//! Configuration files, the overrides of a command line, the simulator's section, and experiments.
 
 use std::path::Path;
 use std::sync::{Arc, LazyLock};
 
+use skein_launch::experiments::definition::{Experiment, MOST_ARMS};
 use skein_protocol::config::{Config, ConfigError, culprit};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_simulator::course::Course;
@@ -10,6 +11,7 @@ use skein_simulator::simulator::{Simulator, SimulatorSettings};
 
 use super::courses::{assert_flyable, fly};
 use super::{Target, USUAL, Verdict, shipped, text};
+use crate::scratch::with_files;
 
 pub(super) const CONFIG: Target = Target {
     name: "config",
@@ -40,6 +42,44 @@ pub(super) const SIMULATOR: Target = Target {
     samples: simulator_samples,
     run: simulated,
 };
+
+pub(super) const EXPERIMENT: Target = Target {
+    name: "experiment",
+    reads: "the file of an experiment",
+    longest_bytes: 2048,
+    // Each arm that makes sense has its courses read.
+    weight: USUAL / 10,
+    samples: experiment_samples,
+    run: |bytes| {
+        with_files(&[("fuzzed.toml", bytes)], |folder| {
+            match Experiment::load(folder, "fuzzed", None) {
+                Ok(experiment) => {
+                    assert!((1..=MOST_ARMS).contains(&experiment.arms.len()));
+                    assert!(experiment.arms.iter().all(|arm| arm.config.validate().is_ok()));
+                    Verdict::Accepted
+                }
+                Err(error) => {
+                    assert!(error.to_string().contains("fuzzed.toml"), "{error}");
+                    Verdict::Refused
+                }
+            }
+        })
+    },
+};
+
+/// The shipped ones, with the configuration they are based on where this process finds it.
+fn experiment_samples() -> Vec<Vec<u8>> {
+    let configs = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/");
+    ["paper", "success-share", "vae-freeze", "action-reward"]
+        .map(|name| shipped(&format!("configs/experiments/{name}.toml")))
+        .map(|bytes| {
+            String::from_utf8(bytes)
+                .unwrap()
+                .replace("\"../", &format!("\"{configs}"))
+                .into_bytes()
+        })
+        .to_vec()
+}
 
 fn file() -> &'static Path {
     Path::new("/somewhere/fuzzed.toml")

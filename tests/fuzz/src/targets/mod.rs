@@ -65,10 +65,11 @@ impl Target {
 const USUAL: usize = 200;
 
 /// All of them.
-pub static TARGETS: [Target; 22] = [
+pub static TARGETS: [Target; 23] = [
     configuration::CONFIG,
     configuration::OVERRIDES,
     configuration::SIMULATOR,
+    configuration::EXPERIMENT,
     courses::FILE,
     courses::LAYOUT,
     courses::GENERATOR,

@@ -1,0 +1,242 @@
+//! `skein-experiment`: runs the experiments of `configs/experiments/`, and tells what they found. `launch/experiment.sh` builds it and hands over.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::thread;
+
+use anyhow::{Context, Result, bail};
+use clap::Parser;
+use skein_launch::experiments::board::Board;
+use skein_launch::experiments::definition::{Experiment, names};
+use skein_launch::experiments::plan::{Plan, State, root};
+use skein_launch::experiments::report::{Findings, Publication};
+use skein_launch::experiments::results;
+use skein_launch::experiments::runner::{self, Manner, Session};
+use skein_launch::interrupts::{INTERRUPTED, interrupts, runtime};
+use skein_protocol::failure::with_causes;
+
+/// Runs an experiment with several seeds, and tells what it found.
+#[derive(Debug, Parser)]
+#[command(version)]
+struct Cli {
+    /// The repository whose experiments, results and pictures these are.
+    #[arg(long, value_name = "DIR")]
+    repository: PathBuf,
+    /// The experiment: the name of a file in configs/experiments/.
+    #[arg(required_unless_present = "list")]
+    name: Option<String>,
+    /// Print the experiments, and what each is to find out.
+    #[arg(long, conflicts_with = "name")]
+    list: bool,
+    /// Runs of each arm [default: what the experiment's file says].
+    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u64).range(1..=100))]
+    seeds: Option<u64>,
+    /// Runs at a time [default: number of cores].
+    #[arg(long, value_name = "J", value_parser = clap::value_parser!(u16).range(1..))]
+    jobs: Option<u16>,
+    /// Shorten every run to so many training flights.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    flights: Option<u64>,
+    /// Where the runs of all experiments go [default: runs/experiments in the repository].
+    #[arg(long, value_name = "DIR")]
+    runs: Option<PathBuf>,
+    /// Run nothing: tell again what is there.
+    #[arg(long)]
+    report: bool,
+    /// Put the report into RESULTS.md, and its pictures into launch/pictures/experiments/.
+    #[arg(long)]
+    publish: bool,
+}
+
+/// How it ended, when nothing was wrong with what was asked.
+enum Ended {
+    Complete,
+    Incomplete,
+    Interrupted,
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let done = match &cli.name {
+        Some(name) => cli.carry_out(name),
+        None => list(&cli.catalogue()).map(|()| Ended::Complete),
+    };
+    match done {
+        Ok(Ended::Complete) => ExitCode::SUCCESS,
+        Ok(Ended::Incomplete) => ExitCode::FAILURE,
+        Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
+        Err(error) => {
+            eprintln!("skein: {}", with_causes(error.as_ref()));
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Prints what each experiment in `folder` is to find out.
+fn list(folder: &Path) -> Result<()> {
+    let names = names(folder)?;
+    let width = names.iter().map(|name| name.chars().count()).max().unwrap_or(0);
+    for name in &names {
+        let experiment = Experiment::load(folder, name, None)?;
+        let runs = format!("{} × {}", experiment.arms.len(), experiment.seeds);
+        println!("{name:width$}  {runs:>7} runs  {}", experiment.question);
+    }
+    Ok(())
+}
+
+impl Cli {
+    fn catalogue(&self) -> PathBuf {
+        self.repository.join("configs/experiments")
+    }
+
+    fn carry_out(&self, name: &str) -> Result<Ended> {
+        let experiment = Experiment::load(&self.catalogue(), name, self.flights)?;
+        let seeds = self.seeds.unwrap_or(experiment.seeds);
+        let runs = self.runs.clone();
+        let runs = runs.unwrap_or_else(|| self.repository.join("runs/experiments"));
+        let root = root(&runs, &experiment, self.flights);
+        // What would keep hours of work from being published is told before they begin.
+        let publication = self
+            .publish
+            .then(|| Publication::find(&self.repository, name))
+            .transpose()?;
+
+        let mut ended = Ended::Complete;
+        if !self.report {
+            let session = self.run(&experiment, &root, seeds)?;
+            if session.interruptions > 0 {
+                eprintln!("skein: to go on with it: {}", self.command(&experiment, Options::All));
+                return Ok(Ended::Interrupted);
+            }
+            if !session.failed.is_empty() {
+                eprintln!(
+                    "skein: {} failed: {}; the same command tries them again and leaves alone what is complete",
+                    plural(session.failed.len(), "run"),
+                    session.failed.join(", ")
+                );
+                ended = Ended::Incomplete;
+            }
+        }
+        self.tell(&experiment, &root, seeds, publication.as_ref())?;
+        Ok(ended)
+    }
+
+    fn run(&self, experiment: &Experiment, root: &Path, seeds: u64) -> Result<Session> {
+        let _claim = Plan::claim(root)?;
+        let plan = Plan::new(experiment, root, seeds)?;
+        plan.check_idle()?;
+        let jobs = match self.jobs {
+            Some(jobs) => jobs.into(),
+            None => thread::available_parallelism().map_or(1, Into::into),
+        };
+        let this = std::env::current_exe().context("cannot tell where this program lies")?;
+        let skein = this.with_file_name("skein");
+        if !skein.is_file() {
+            bail!(
+                "{} is missing: build it with `cargo build --release --workspace --bins`",
+                skein.display()
+            );
+        }
+        announce(experiment, &plan, jobs);
+        let mut board = Board::new();
+        let manner = Manner { skein: &skein, jobs };
+        let session = runtime().context("cannot start the runtime")?.block_on(async {
+            let mut interrupts = interrupts().context("cannot listen for signals")?;
+            anyhow::Ok(runner::run(experiment, &plan, manner, &mut interrupts, &mut board).await)
+        });
+        board.finish();
+        session
+    }
+
+    /// Reports what there is, and publishes it if that was asked for.
+    fn tell(&self, experiment: &Experiment, root: &Path, seeds: u64, publication: Option<&Publication>) -> Result<()> {
+        // Looked at anew: a file that was changed while runs were under way has made two experiments of one.
+        let plan = Plan::new(experiment, root, seeds)?;
+        let findings = Findings {
+            experiment,
+            plan: &plan,
+            results: &results::read(&plan)?,
+            command: self.command(experiment, Options::OfTheResult),
+        };
+        let report = findings.write()?;
+        println!("{}", report.text.trim_end());
+        eprintln!("skein: the report is in {}", report.document.display());
+        let Some(publication) = publication else {
+            return Ok(());
+        };
+        if !findings.is_whole() {
+            bail!(
+                "nothing was published: {} of {} runs are complete",
+                findings.results.len(),
+                plan.runs.len()
+            );
+        }
+        for file in publication.publish(&findings, &report)? {
+            eprintln!("skein: published {}", file.display());
+        }
+        Ok(())
+    }
+
+    /// The command that does what this one does.
+    fn command(&self, experiment: &Experiment, options: Options) -> String {
+        let mut command = format!("launch/experiment.sh {}", experiment.name);
+        let mut option = |name: &str, value: Option<String>| {
+            if let Some(value) = value {
+                command.push_str(&format!(" {name} {value}"));
+            }
+        };
+        option(
+            "--seeds",
+            self.seeds
+                .filter(|seeds| *seeds != experiment.seeds)
+                .map(|seeds| seeds.to_string()),
+        );
+        option("--flights", self.flights.map(|flights| flights.to_string()));
+        if options == Options::All {
+            option("--jobs", self.jobs.map(|jobs| jobs.to_string()));
+            option("--runs", self.runs.as_ref().map(|runs| runs.display().to_string()));
+            option("--publish", self.publish.then(String::new));
+        }
+        command.trim_end().to_owned()
+    }
+}
+
+/// Which options of a command are told.
+#[derive(Clone, Copy, PartialEq)]
+enum Options {
+    All,
+    /// Those that the result depends on.
+    OfTheResult,
+}
+
+fn announce(experiment: &Experiment, plan: &Plan, jobs: usize) {
+    eprintln!("skein: {}", experiment.question);
+    let there = [(State::Complete, "complete"), (State::Begun, "begun")]
+        .map(|(state, what)| (plan.count(state), what))
+        .into_iter()
+        .filter(|(count, _)| *count > 0)
+        .map(|(count, what)| format!(", {count} {what} already"))
+        .collect::<String>();
+    eprintln!(
+        "skein: {} of {} with {} each{there}; {jobs} at a time, in {}",
+        plural(plan.runs.len(), "run"),
+        plural(experiment.arms.len(), "arm"),
+        plural(plan.seeds as usize, "seed"),
+        plan.root.display()
+    );
+    if experiment.is_shortened() {
+        eprintln!(
+            "skein: shortened: {} training flights a run instead of the {} of {}",
+            experiment.flights(),
+            experiment.base_flights,
+            experiment.base_name
+        );
+    }
+}
+
+fn plural(count: usize, what: &str) -> String {
+    match count {
+        1 => format!("1 {what}"),
+        count => format!("{count} {what}s"),
+    }
+}

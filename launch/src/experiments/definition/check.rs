@@ -1,0 +1,190 @@
+//! Whether an experiment makes sense and every arm of it can be run.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use skein_protocol::config::Config;
+
+use super::file::{ArmFile, File, as_overrides};
+use super::{Arm, DefinitionError, Experiment, MOST_ARMS};
+use crate::experiments::plan::{ACTORS, REPORT};
+use crate::prepare::{self, PrepareError};
+
+/// What is set in every run: it gets one core, and the native engine's results do not depend on it.
+const FOR_ALL: &str = "run.learner_threads=1";
+/// Keys that no file may set, and why.
+const OURS: [(&str, &str); 2] = [
+    (
+        "run.seed",
+        "each arm is run with the seeds from 1 on; `seeds` says how many",
+    ),
+    (
+        "run.learner_threads",
+        "each run has one, because runs are side by side; leave it out",
+    ),
+];
+
+/// What `file`, read from `path`, means.
+pub(super) fn resolve(
+    file: File,
+    path: &Path,
+    name: &str,
+    flights: Option<u64>,
+) -> Result<Experiment, DefinitionError> {
+    check_values(&file, path)?;
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let base = folder.join(&file.base);
+    let settings_of = |whose: &str, settings| {
+        as_overrides(settings, folder)
+            .and_then(refuse_ours)
+            .map_err(|problem| settings_error(path, whose, problem))
+    };
+    let settings = settings_of("[settings]", &file.settings)?;
+    let base_config = Config::load(&base, &[])
+        .map_err(|error| settings_error(path, "base", PrepareError::from(error).to_string()))?;
+    let mut arms = Vec::with_capacity(file.arms.len());
+    for arm in &file.arms {
+        let own = settings_of(&format!("arm {}", arm.name), &arm.settings)?;
+        let overrides = [&[FOR_ALL.to_owned()], &settings[..], &own].concat();
+        arms.push(arm_of(arm, own, overrides, &base, flights, path)?);
+    }
+    check_comparable(&arms, path)?;
+    Ok(Experiment {
+        name: name.to_owned(),
+        question: file.question,
+        base_name: file.base.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+        base,
+        base_flights: base_config.run.flights,
+        settings,
+        seeds: file.seeds,
+        tables: file.tables,
+        curves: file.curves,
+        arms,
+    })
+}
+
+fn arm_of(
+    arm: &ArmFile,
+    settings: Vec<String>,
+    mut overrides: Vec<String>,
+    base: &Path,
+    flights: Option<u64>,
+    path: &Path,
+) -> Result<Arm, DefinitionError> {
+    let load = |overrides: &[String]| {
+        prepare::resolve(base, overrides, ACTORS).map_err(|source| DefinitionError::Arm {
+            path: path.to_owned(),
+            arm: arm.name.clone(),
+            source: Box::new(source),
+        })
+    };
+    let mut config = load(&overrides)?;
+    if let Some(flights) = flights {
+        if flights >= config.run.flights {
+            let problem = format!(
+                "shortens nothing: arm {} flies {}; give fewer, or leave it out",
+                arm.name, config.run.flights
+            );
+            return Err(value_error(path, "--flights", flights, problem));
+        }
+        overrides.push(format!("run.flights={flights}"));
+        config = load(&overrides)?;
+    }
+    config.run.seed = 1;
+    Ok(Arm {
+        name: arm.name.clone(),
+        label: arm.label.clone(),
+        settings,
+        overrides,
+        config,
+    })
+}
+
+fn refuse_ours(overrides: Vec<String>) -> Result<Vec<String>, String> {
+    for setting in &overrides {
+        let key = setting.split_once('=').map_or(setting.as_str(), |(key, _)| key);
+        if let Some((_, why)) = OURS.iter().find(|(ours, _)| *ours == key) {
+            return Err(format!("{setting} cannot be set: {why}"));
+        }
+    }
+    Ok(overrides)
+}
+
+fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
+    let refuse = |key, value: &dyn std::fmt::Display, problem: &str| Err(value_error(path, key, value, problem.into()));
+    if file.question.trim().is_empty() {
+        return refuse(
+            "question",
+            &"\"\"",
+            "asks nothing: write what the experiment is to find out",
+        );
+    }
+    if !(1..=100).contains(&file.seeds) {
+        return refuse("seeds", &file.seeds, "is outside 1..=100");
+    }
+    if !(1..=MOST_ARMS).contains(&file.arms.len()) {
+        let problem = format!("of them are outside 1..={MOST_ARMS}: more could not be told apart in one picture");
+        return refuse("[[arm]]", &file.arms.len(), &problem);
+    }
+    let (mut names, mut labels) = (BTreeSet::new(), BTreeSet::new());
+    for arm in &file.arms {
+        let is_plain = |character: char| character.is_ascii_alphanumeric() || "-_.".contains(character);
+        if !arm.name.starts_with(|first: char| first.is_ascii_alphanumeric())
+            || !arm.name.chars().all(is_plain)
+            || arm.name == REPORT
+        {
+            let problem = format!(
+                "cannot be a folder: begin with a letter or digit, use these, -, _ and . only, and not {REPORT}"
+            );
+            return refuse("arm.name", &arm.name, &problem);
+        }
+        if arm.label.trim().is_empty() || arm.label.contains(['|', '\n']) {
+            return refuse(
+                "arm.label",
+                &arm.label,
+                "cannot stand in a table: write one line without |",
+            );
+        }
+        if !names.insert(&arm.name) {
+            return refuse("arm.name", &arm.name, "is there twice: give each arm its own");
+        }
+        if !labels.insert(&arm.label) {
+            return refuse("arm.label", &arm.label, "is there twice: give each arm its own");
+        }
+    }
+    Ok(())
+}
+
+/// Whether all arms are measured alike.
+fn check_comparable(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
+    let measured = |arm: &Arm| (arm.config.evaluation.clone(), arm.config.courses.evaluation.clone());
+    let Some(first) = arms.first() else { return Ok(()) };
+    match arms.iter().find(|arm| measured(arm) != measured(first)) {
+        None => Ok(()),
+        Some(other) => Err(settings_error(
+            path,
+            &format!("arm {}", other.name),
+            format!(
+                "[evaluation] and courses.evaluation cannot differ from those of arm {}, or the two could not be compared: set them in [settings]",
+                first.name
+            ),
+        )),
+    }
+}
+
+fn settings_error(path: &Path, whose: &str, problem: String) -> DefinitionError {
+    DefinitionError::Settings {
+        path: path.to_owned(),
+        whose: whose.to_owned(),
+        problem,
+    }
+}
+
+fn value_error(path: &Path, key: &'static str, value: impl std::fmt::Display, problem: String) -> DefinitionError {
+    DefinitionError::Value {
+        path: path.to_owned(),
+        key,
+        value: value.to_string(),
+        problem,
+    }
+}

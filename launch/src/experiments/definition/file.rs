@@ -1,0 +1,136 @@
+//! The file of an experiment as it is written.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use toml::{Table, Value};
+
+use super::{Curve, DefinitionError, TableKind};
+
+/// What an experiment's file says.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct File {
+    pub(super) question: String,
+    /// Relative to the file.
+    pub(super) base: PathBuf,
+    #[serde(default = "three")]
+    pub(super) seeds: u64,
+    /// In what all arms differ from the base.
+    #[serde(default)]
+    pub(super) settings: Table,
+    pub(super) tables: Vec<TableKind>,
+    pub(super) curves: Vec<Curve>,
+    #[serde(rename = "arm")]
+    pub(super) arms: Vec<ArmFile>,
+}
+
+/// A `[[arm]]` of it.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ArmFile {
+    pub(super) name: String,
+    pub(super) label: String,
+    #[serde(default)]
+    pub(super) settings: Table,
+}
+
+/// The fewest runs of which anything can be said.
+const fn three() -> u64 {
+    3
+}
+
+/// Names of the experiments in `folder`, in alphabetical order.
+///
+/// # Errors
+/// [`DefinitionError::Read`].
+pub fn names(folder: &Path) -> Result<Vec<String>, DefinitionError> {
+    let fail = |source| DefinitionError::Read {
+        path: folder.to_owned(),
+        source,
+    };
+    let mut names = Vec::new();
+    for entry in fs::read_dir(folder).map_err(fail)? {
+        let path = entry.map_err(fail)?.path();
+        if path.extension().is_some_and(|extension| extension == "toml")
+            && let Some(name) = path.file_stem().and_then(|stem| stem.to_str())
+        {
+            names.push(name.to_owned());
+        }
+    }
+    names.sort();
+    Ok(names)
+}
+
+/// The file of the experiment called `name`.
+pub(super) fn find(folder: &Path, name: &str) -> Result<PathBuf, DefinitionError> {
+    let names = names(folder)?;
+    if names.iter().any(|known| known == name) {
+        return Ok(folder.join(format!("{name}.toml")));
+    }
+    Err(DefinitionError::Unknown {
+        name: name.to_owned(),
+        folder: folder.to_owned(),
+        known: match names.as_slice() {
+            [] => "none".to_owned(),
+            names => names.join(", "),
+        },
+    })
+}
+
+pub(super) fn read(path: &Path) -> Result<File, DefinitionError> {
+    let text = fs::read_to_string(path).map_err(|source| DefinitionError::Read {
+        path: path.to_owned(),
+        source,
+    })?;
+    toml::from_str(&text).map_err(|source| DefinitionError::Syntax {
+        path: path.to_owned(),
+        source: Box::new(source),
+    })
+}
+
+/// `settings` as overrides, `section.key=value`. Course files are named relative to `folder`.
+///
+/// # Errors
+/// What is wrong with them.
+pub(super) fn as_overrides(settings: &Table, folder: &Path) -> Result<Vec<String>, String> {
+    let mut overrides = Vec::new();
+    flatten("", settings, folder, &mut overrides)?;
+    Ok(overrides)
+}
+
+/// Tables within each other at most: more than any setting has, and few enough to be gone through.
+const DEEPEST: usize = 16;
+
+fn flatten(section: &str, table: &Table, folder: &Path, into: &mut Vec<String>) -> Result<(), String> {
+    if section.split('.').count() > DEEPEST {
+        return Err(format!(
+            "{section} lies deeper than any setting: write section.key = value"
+        ));
+    }
+    for (name, value) in table {
+        let key = match section {
+            "" => name.clone(),
+            section => format!("{section}.{name}"),
+        };
+        match value {
+            Value::Table(inner) if inner.is_empty() => return Err(format!("{key} holds no setting: leave it out")),
+            Value::Table(inner) => flatten(&key, inner, folder, into)?,
+            value if ["courses.training", "courses.evaluation"].contains(&key.as_str()) => {
+                into.push(format!("{key}={}", within(value, folder)));
+            }
+            value => into.push(format!("{key}={value}")),
+        }
+    }
+    Ok(())
+}
+
+/// `value` with every path in it relative to `folder`.
+fn within(value: &Value, folder: &Path) -> Value {
+    match value {
+        Value::String(path) => Value::String(folder.join(path).to_string_lossy().into_owned()),
+        Value::Array(values) => Value::Array(values.iter().map(|value| within(value, folder)).collect()),
+        value => value.clone(),
+    }
+}

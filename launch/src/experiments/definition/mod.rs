@@ -1,0 +1,191 @@
+//! `configs/experiments/NAME.toml`: what an experiment asks, and what is run to answer it.
+
+mod check;
+mod file;
+#[cfg(test)]
+mod tests;
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use skein_protocol::config::Config;
+
+use crate::prepare::PrepareError;
+
+pub use file::names;
+
+/// More arms than this could not be told apart in one picture.
+pub const MOST_ARMS: usize = 8;
+
+/// An experiment whose every arm can be run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Experiment {
+    /// The file's name without its ending.
+    pub name: String,
+    /// What it is to find out, and which figure or table of the paper it belongs to.
+    pub question: String,
+    /// The configuration that all arms differ from, as the file names it, for readers.
+    pub base_name: String,
+    /// Its path.
+    pub base: PathBuf,
+    /// Training flights that the base configuration flies.
+    pub base_flights: u64,
+    /// In what all arms differ from the base: `section.key=value`.
+    pub settings: Vec<String>,
+    /// Runs of each arm, with seeds from 1.
+    pub seeds: u64,
+    /// What is set in tables.
+    pub tables: Vec<TableKind>,
+    /// What is drawn.
+    pub curves: Vec<Curve>,
+    /// What is compared.
+    pub arms: Vec<Arm>,
+}
+
+/// One way of training, of several that are compared.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Arm {
+    /// The folder of its runs.
+    pub name: String,
+    /// What it is called in tables and pictures.
+    pub label: String,
+    /// In what it differs from the other arms: `section.key=value`.
+    pub settings: Vec<String>,
+    /// Everything that is set beside the base configuration, but for the seed: for `--set`, in this order.
+    pub overrides: Vec<String>,
+    /// What comes of it, for seed 1.
+    pub config: Config,
+}
+
+/// A table of a report.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TableKind {
+    /// R and completed courses of the best snapshot, for each evaluation course.
+    Evaluation,
+    /// How the evaluation flights went: wall by wall, and what ended those that did not get through.
+    Outcomes,
+    /// What it took until the agent was trained, and how well and steadily it flew at the end of training.
+    Learning,
+    /// What the runs took: steps, updates, time.
+    Cost,
+}
+
+/// A picture of a report: one line an arm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Curve {
+    /// What is shown.
+    pub measure: Measure,
+    /// Over what.
+    pub over: Axis,
+}
+
+/// What a curve shows, averaged over `evaluation.window_flights` training flights.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Measure {
+    /// Walls passed a flight.
+    WallsPassed,
+    /// Sum of a flight's rewards.
+    Return,
+}
+
+/// What a curve is drawn over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Axis {
+    /// Training flights.
+    Flights,
+    /// Environment steps of training flights.
+    Steps,
+    /// Updates of the agent.
+    Updates,
+}
+
+/// Why an experiment cannot be run.
+#[derive(Debug, thiserror::Error)]
+pub enum DefinitionError {
+    /// The folder or file cannot be read.
+    #[error("cannot read {}: {source}", path.display())]
+    Read {
+        /// The folder or file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: std::io::Error,
+    },
+    /// There is no experiment of this name.
+    #[error("no experiment is called {name}: {} has {known}", folder.display())]
+    Unknown {
+        /// The name.
+        name: String,
+        /// Where it was looked for.
+        folder: PathBuf,
+        /// Those that are there.
+        known: String,
+    },
+    /// It is not TOML, or has other keys or kinds of value.
+    #[error("{} is no experiment: {source}", path.display())]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// Where and why.
+        #[source]
+        source: Box<toml::de::Error>,
+    },
+    /// A value makes no sense.
+    #[error("{}: {key} = {value} {problem}", path.display())]
+    Value {
+        /// The file.
+        path: PathBuf,
+        /// Which key.
+        key: &'static str,
+        /// The value found.
+        value: String,
+        /// What is wrong with it, and what to write instead.
+        problem: String,
+    },
+    /// The settings of an arm, or of all of them, cannot be used.
+    #[error("{}: {whose}: {problem}", path.display())]
+    Settings {
+        /// The file.
+        path: PathBuf,
+        /// Whose settings.
+        whose: String,
+        /// What is wrong with them.
+        problem: String,
+    },
+    /// An arm cannot be run.
+    #[error("{}: arm {arm} cannot be run: {source}", path.display())]
+    Arm {
+        /// The file.
+        path: PathBuf,
+        /// Its name.
+        arm: String,
+        /// Why; an override that it names is a setting of the file.
+        #[source]
+        source: Box<PrepareError>,
+    },
+}
+
+impl Experiment {
+    /// Reads the experiment called `name` in `folder`, and checks that each of its arms can be run. `flights` shortens all runs to so many.
+    ///
+    /// # Errors
+    /// [`DefinitionError`] names file, arm, key, value and remedy.
+    pub fn load(folder: &Path, name: &str, flights: Option<u64>) -> Result<Self, DefinitionError> {
+        let path = file::find(folder, name)?;
+        check::resolve(file::read(&path)?, &path, name, flights)
+    }
+
+    /// Training flights that the runs of an arm fly at most.
+    pub fn flights(&self) -> u64 {
+        self.arms.iter().map(|arm| arm.config.run.flights).max().unwrap_or(0)
+    }
+
+    /// Whether an arm flies less than the configuration that it is based on.
+    pub fn is_shortened(&self) -> bool {
+        self.arms.iter().any(|arm| arm.config.run.flights < self.base_flights)
+    }
+}

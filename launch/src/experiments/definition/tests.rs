@@ -1,0 +1,215 @@
+//! Experiments that can be run, and experiments that cannot.
+
+use std::fs;
+
+use super::*;
+
+fn shipped(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs").join(path)
+}
+
+/// The head of an experiment's file, based on the shipped smoke configuration.
+fn head() -> String {
+    format!(
+        "question = \"What for?\"\nbase = {:?}\ntables = [\"evaluation\"]\ncurves = [{{ measure = \"return\", over = \"steps\" }}]\n",
+        shipped("smoke.toml")
+    )
+}
+
+fn load(text: &str, flights: Option<u64>) -> Result<Experiment, String> {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("test.toml"), text).unwrap();
+    Experiment::load(folder.path(), "test", flights).map_err(|error| skein_protocol::failure::with_causes(&error))
+}
+
+const ARM: &str = "[[arm]]\nname = \"a\"\nlabel = \"A\"\n";
+
+#[test]
+fn every_shipped_experiment_can_be_run() {
+    let folder = shipped("experiments");
+    let names = names(&folder).unwrap();
+    assert!(names.contains(&"paper".to_owned()), "{names:?}");
+    for name in names {
+        let experiment = Experiment::load(&folder, &name, None).unwrap();
+        assert!(
+            experiment.seeds >= 3,
+            "{name}: fewer seeds than anything can be said of"
+        );
+        assert!(
+            Experiment::load(&folder, &name, Some(experiment.flights() - 1)).is_ok_and(|short| short.is_shortened())
+        );
+    }
+}
+
+#[test]
+fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
+    let text = format!(
+        "{}[settings]\nrun.flights = 90\nreplay = {{ success_share = 0.5, success = \"approach\" }}\n{ARM}settings.\"replay.success_share\" = 0.25\nsettings.simulator.reward.action_scale = 2.0\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n",
+        head()
+    );
+    let experiment = load(&text, None).unwrap();
+    let [a, b] = &experiment.arms[..] else {
+        panic!("{experiment:?}")
+    };
+    assert_eq!(
+        (a.config.replay.success_share, b.config.replay.success_share),
+        (0.25, 0.5)
+    );
+    assert_eq!((a.config.run.flights, a.config.run.learner_threads), (90, 1));
+    assert_eq!(a.config.simulator["reward"]["action_scale"].as_float(), Some(2.0));
+    assert_eq!(
+        b.config.simulator["reward"]["action_scale"].as_float(),
+        Some(1.0),
+        "written out"
+    );
+    assert_eq!(
+        (experiment.seeds, b.settings.len(), experiment.base_flights),
+        (3, 0, 300)
+    );
+    assert!(experiment.is_shortened());
+    assert_eq!(load(&text, Some(40)).unwrap().arms[1].config.run.flights, 40);
+}
+
+#[test]
+fn the_example_in_the_readme_can_be_run() {
+    let readme = fs::read_to_string(shipped("../README.md")).unwrap();
+    let example = readme
+        .split("```toml\n")
+        .find(|part| part.starts_with("question = "))
+        .unwrap();
+    let (example, _) = example.split_once("```").unwrap();
+    let text = example.replace("../local.toml", shipped("local.toml").to_str().unwrap());
+    let experiment = load(&text, None).unwrap();
+    assert_eq!((experiment.seeds, experiment.arms[1].config.sac.batch_size), (5, 512));
+}
+
+#[test]
+fn course_files_are_named_relative_to_the_experiment() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::copy(shipped("courses/training.toml"), folder.path().join("mine.toml")).unwrap();
+    let text = format!(
+        "{}{ARM}[settings]\ncourses.training = \"mine.toml\"\ncourses.evaluation = [\"mine.toml\"]\n",
+        head()
+    );
+    fs::write(folder.path().join("test.toml"), text).unwrap();
+    let config = &Experiment::load(folder.path(), "test", None).unwrap().arms[0].config;
+    assert_eq!(config.courses.training, folder.path().join("mine.toml"));
+    assert_eq!(config.courses.evaluation, [folder.path().join("mine.toml")]);
+}
+
+#[test]
+fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
+    let with_arm = |rest: &str| format!("{}{ARM}{rest}", head());
+    for (text, flights, expected) in [
+        (
+            "question = 1".to_owned(),
+            None,
+            vec!["test.toml is no experiment", "question = 1"],
+        ),
+        (with_arm("sed = 1"), None, vec!["unknown field `sed`", "settings"]),
+        (head() + "arms = 1\n" + ARM, None, vec!["unknown field `arms`"]),
+        (head(), None, vec!["missing field `arm`"]),
+        (
+            head().replace("evaluation", "evaluations") + ARM,
+            None,
+            vec!["unknown variant `evaluations`", "outcomes"],
+        ),
+        (
+            head().replace("steps", "step") + ARM,
+            None,
+            vec!["unknown variant `step`", "steps"],
+        ),
+        (
+            head().replace("What for?", " ") + ARM,
+            None,
+            vec!["question = \"\" asks nothing"],
+        ),
+        (
+            format!("seeds = 0\n{}{ARM}", head()),
+            None,
+            vec!["seeds = 0", "1..=100"],
+        ),
+        (head() + &ARM.repeat(2), None, vec!["arm.name = a is there twice"]),
+        (
+            head() + &ARM.replace("\"a\"", "\"../a\""),
+            None,
+            vec!["arm.name = ../a", "letter or digit"],
+        ),
+        (
+            head() + &ARM.replace("\"a\"", "\"report\""),
+            None,
+            vec!["arm.name = report"],
+        ),
+        (
+            head() + &ARM.replace("\"A\"", "\"a|b\""),
+            None,
+            vec!["arm.label = a|b", "without |"],
+        ),
+        (
+            with_arm("settings.run.sed = 1"),
+            None,
+            vec!["arm a cannot be run", "run.sed=1", "unknown field `sed`"],
+        ),
+        (
+            with_arm("settings.replay.success_share = 1.5"),
+            None,
+            vec!["test.toml: arm a", "replay.success_share = 1.5", "outside [0, 1)"],
+        ),
+        (
+            with_arm("settings.simulator.max_step = 1"),
+            None,
+            vec!["arm a", "smoke.toml", "max_step"],
+        ),
+        (
+            with_arm("settings.learning.levels = 6"),
+            None,
+            vec!["arm a", "learning.levels = 6", "5 walls"],
+        ),
+        (
+            with_arm("settings.run.seed = 4"),
+            None,
+            vec!["arm a: run.seed=4 cannot be set", "`seeds`"],
+        ),
+        (with_arm("settings.run = {}"), None, vec!["arm a: run holds no setting"]),
+        (
+            with_arm("settings.seed = 4"),
+            None,
+            vec!["arm a", "seed=4", "section.key=value"],
+        ),
+        (
+            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.evaluation.flights = 9"),
+            None,
+            vec!["arm b", "[evaluation]", "arm a", "[settings]"],
+        ),
+        (
+            with_arm(""),
+            Some(300),
+            vec!["--flights = 300 shortens nothing", "arm a flies 300"],
+        ),
+        (
+            head().replace("smoke.toml", "nowhere.toml") + ARM,
+            None,
+            vec!["test.toml: base: ", "nowhere.toml"],
+        ),
+    ] {
+        let error = load(&text, flights).unwrap_err();
+        for part in expected {
+            assert!(error.contains(part), "`{error}` does not mention `{part}`");
+        }
+        assert!(error.contains("test.toml"), "{error}");
+    }
+    let many: String = (0..9).map(|n| ARM.replace("\"a\"", &format!("\"a{n}\""))).collect();
+    assert!(load(&(head() + &many), None).unwrap_err().contains("[[arm]] = 9"));
+}
+
+#[test]
+fn an_unknown_name_is_told_with_the_known_ones() {
+    let error = Experiment::load(&shipped("experiments"), "papre", None)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("no experiment is called papre") && error.contains("paper"),
+        "{error}"
+    );
+    assert!(Experiment::load(&shipped("experiments"), "../smoke", None).is_err());
+}

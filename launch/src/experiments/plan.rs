@@ -1,0 +1,346 @@
+//! Which runs an experiment consists of, and what of them is there already.
+
+use std::fs::{self, File, TryLockError};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use skein_protocol::config::Config;
+use skein_protocol::failure::with_causes;
+use skein_protocol::run::RunDirectory;
+use skein_protocol::summary::{Ending, Summary};
+
+use super::definition::Experiment;
+use crate::prepare;
+
+/// Actors of each run: runs are side by side instead, and how many fly changes nothing that is learned.
+pub const ACTORS: usize = 1;
+/// The folder of the report, beside those of the arms.
+pub const REPORT: &str = "report";
+
+/// The runs of an experiment, in the order in which they are started: first seeds come first, so that early results cover all arms.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    /// Where all of it lies.
+    pub root: PathBuf,
+    /// Runs of each arm.
+    pub seeds: u64,
+    /// Every run.
+    pub runs: Vec<PlannedRun>,
+}
+
+/// One run of an experiment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PlannedRun {
+    /// Its arm's place in [`Experiment::arms`].
+    pub arm: usize,
+    /// Its seed.
+    pub seed: u64,
+    /// `ARM/seed-N`.
+    pub name: String,
+    /// Its directory, which may not be there.
+    pub directory: RunDirectory,
+    /// What is set beside the base configuration.
+    pub overrides: Vec<String>,
+    /// Its configuration as the experiment has it now.
+    pub config: Config,
+    /// What is there of it.
+    pub state: State,
+}
+
+/// What is there of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum State {
+    /// Nothing.
+    New,
+    /// It was begun.
+    Begun,
+    /// Somebody is at it.
+    UnderWay,
+    /// All of it.
+    Complete,
+}
+
+/// Why an experiment cannot be begun, or gone on with.
+#[derive(Debug, thiserror::Error)]
+pub enum PlanError {
+    /// A folder cannot be made or looked at.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The folder.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+    /// Somebody is at it.
+    #[error("{} is under way already: wait for it, or stop it first", .0.display())]
+    UnderWay(PathBuf),
+    /// There are runs that cannot be part of it.
+    #[error("{} cannot be gone on with or reported as it is\n{}", root.display(), problems.join("\n"))]
+    Runs {
+        /// Where the experiment lies.
+        root: PathBuf,
+        /// Each run, with what is wrong with it and the remedy.
+        problems: Vec<String>,
+    },
+}
+
+/// The experiment's directory, claimed. To be held while its runs are under way.
+#[derive(Debug)]
+pub struct Claim {
+    _directory: File,
+}
+
+/// Where in `runs` the experiment lies. One that is shortened by an option of the command has a place of its own, so that trying it out is never in its
+/// way.
+pub fn root(runs: &Path, experiment: &Experiment, flights: Option<u64>) -> PathBuf {
+    runs.join(match flights {
+        Some(flights) => format!("{}_{flights}_flights", experiment.name),
+        None => experiment.name.clone(),
+    })
+}
+
+impl Plan {
+    /// `seeds` runs of each arm of `experiment` in `root`, and what is there of them.
+    ///
+    /// # Errors
+    /// [`PlanError::Runs`] when a run is there that was started with another configuration, or cannot be looked at: nothing is ever removed or overwritten.
+    pub fn new(experiment: &Experiment, root: &Path, seeds: u64) -> Result<Self, PlanError> {
+        let root = std::path::absolute(root).map_err(io_at(root))?;
+        let mut plan = Self {
+            runs: Vec::new(),
+            root,
+            seeds,
+        };
+        let mut problems = Vec::new();
+        for seed in 1..=seeds {
+            for arm in 0..experiment.arms.len() {
+                let mut run = planned(experiment, &plan.root, arm, seed);
+                match run.look() {
+                    Ok(state) => run.state = state,
+                    Err(problem) => problems.push(problem),
+                }
+                plan.runs.push(run);
+            }
+        }
+        match problems.is_empty() {
+            true => Ok(plan),
+            false => Err(PlanError::Runs {
+                root: plan.root,
+                problems,
+            }),
+        }
+    }
+
+    /// Refuses to go on while somebody else is at one of the runs.
+    ///
+    /// # Errors
+    /// [`PlanError::UnderWay`] names the first.
+    pub fn check_idle(&self) -> Result<(), PlanError> {
+        match self.runs.iter().find(|run| run.state == State::UnderWay) {
+            None => Ok(()),
+            Some(run) => Err(PlanError::UnderWay(run.directory.root().to_owned())),
+        }
+    }
+
+    /// Runs in this state.
+    pub fn count(&self, state: State) -> usize {
+        self.runs.iter().filter(|run| run.state == state).count()
+    }
+
+    /// Makes the experiment's directory, and claims it for this process.
+    ///
+    /// # Errors
+    /// [`PlanError::UnderWay`] when another process has it.
+    pub fn claim(root: &Path) -> Result<Claim, PlanError> {
+        fs::create_dir_all(root).map_err(io_at(root))?;
+        let directory = File::open(root).map_err(io_at(root))?;
+        match directory.try_lock() {
+            Ok(()) => Ok(Claim { _directory: directory }),
+            Err(TryLockError::WouldBlock) => Err(PlanError::UnderWay(root.to_owned())),
+            Err(TryLockError::Error(error)) => Err(io_at(root)(error)),
+        }
+    }
+}
+
+fn planned(experiment: &Experiment, root: &Path, number: usize, seed: u64) -> PlannedRun {
+    let arm = &experiment.arms[number];
+    let name = format!("{}/seed-{seed}", arm.name);
+    let mut config = arm.config.clone();
+    config.run.seed = seed;
+    PlannedRun {
+        arm: number,
+        seed,
+        directory: RunDirectory::new(root.join(&name)),
+        name,
+        overrides: [&arm.overrides[..], &[format!("run.seed={seed}")]].concat(),
+        config,
+        state: State::New,
+    }
+}
+
+impl PlannedRun {
+    /// What the run's programs say, on standard output and standard error; beside its directory, which must be empty when it is begun.
+    pub fn said(&self) -> PathBuf {
+        self.directory.root().with_extension("log")
+    }
+
+    /// What is there of it now.
+    ///
+    /// # Errors
+    /// Why it can be no part of the experiment, with the remedy.
+    pub fn look(&self) -> Result<State, String> {
+        let root = self.directory.root().display();
+        if !self.directory.identity().is_file() {
+            let is_empty = fs::read_dir(self.directory.root()).map_or(true, |mut entries| entries.next().is_none());
+            return match is_empty {
+                true => Ok(State::New),
+                false => Err(format!(
+                    "  {root} is not empty and not the directory of a run: move it away"
+                )),
+            };
+        }
+        let aside = format!("to begin it anew, move it away: mv {root} {root}.old");
+        let differences =
+            differences(&self.directory, &self.config).map_err(|problem| format!("  {root}: {problem}; {aside}"))?;
+        if !differences.is_empty() {
+            return Err(format!(
+                "  {root} was started with another configuration (\"there\" is the run's, \"here\" the experiment's as it is now): {}; put the experiment's file back, or, {aside}",
+                differences.join(", ")
+            ));
+        }
+        if Summary::of(&self.directory).is_some_and(|summary| summary.ending == Ending::Completed) {
+            return Ok(State::Complete);
+        }
+        match self.directory.is_under_way() {
+            Ok(false) => Ok(State::Begun),
+            Ok(true) => Ok(State::UnderWay),
+            Err(error) => Err(format!("  {root}: {}", with_causes(&error))),
+        }
+    }
+}
+
+/// In what the configuration of `run`, its courses included, differs from `expected`. Of a key that is younger than the run, the run has the default.
+fn differences(run: &RunDirectory, expected: &Config) -> Result<Vec<String>, String> {
+    let mut stored = prepare::resolve(&run.config(), &[], ACTORS).map_err(|error| with_causes(&error))?;
+    let mut expected = expected.clone();
+    let mut courses = Vec::new();
+    for (here, there) in expected.courses.paths_mut().zip(stored.courses.paths_mut()) {
+        // The copy of a course whose file has the name of another has a name of its own.
+        match fs::read(&here).ok() == fs::read(&there).ok() {
+            true => here.clone_from(there),
+            false => courses.push(format!("the course {} is another there", here.display())),
+        }
+    }
+    let keys = expected.differences(&stored.portable());
+    Ok([keys.map_err(|error| error.to_string())?, courses].concat())
+}
+
+fn io_at(path: &Path) -> impl FnOnce(io::Error) -> PlanError {
+    let path = path.to_owned();
+    move |source| PlanError::Io { path, source }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+    use crate::prepare::prepare;
+
+    fn experiment(folder: &Path, share: &str) -> Experiment {
+        let base: PathBuf = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/smoke.toml");
+        let text = format!(
+            "question = \"?\"\nbase = {base:?}\nseeds = 2\ntables = []\ncurves = []\n[[arm]]\nname = \"a\"\nlabel = \"A\"\nsettings.replay.success_share = {share}\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n"
+        );
+        fs::write(folder.join("test.toml"), text).unwrap();
+        Experiment::load(folder, "test", None).unwrap()
+    }
+
+    fn begin(run: &PlannedRun, experiment: &Experiment) {
+        prepare(&experiment.base, &run.overrides, run.directory.root(), ACTORS).unwrap();
+    }
+
+    #[test]
+    fn first_seeds_of_all_arms_come_first() {
+        let folder = tempfile::tempdir().unwrap();
+        let plan = Plan::new(&experiment(folder.path(), "0.25"), &folder.path().join("runs"), 2).unwrap();
+        let names: Vec<_> = plan.runs.iter().map(|run| run.name.as_str()).collect();
+        assert_eq!(names, ["a/seed-1", "b/seed-1", "a/seed-2", "b/seed-2"]);
+        assert_eq!(plan.count(State::New), 4);
+        assert_eq!(plan.runs[2].config.run.seed, 2);
+        assert_eq!(plan.runs[2].overrides.last().unwrap(), "run.seed=2");
+    }
+
+    #[test]
+    fn what_was_begun_is_gone_on_with_and_what_is_complete_is_left_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let (experiment, root) = (experiment(folder.path(), "0.25"), folder.path().join("runs"));
+        let plan = Plan::new(&experiment, &root, 2).unwrap();
+        begin(&plan.runs[0], &experiment);
+        begin(&plan.runs[3], &experiment);
+        let summary = r#"{"skein_version":"0","run":7,"seed":2,"ending":"ENDING","policy_sha256":"","final_version":8,"best_version":7,
+            "best_confirmed_walls_passed":4.9,"flights":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_flights":4,
+            "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
+        let states = |ending| {
+            fs::write(plan.runs[3].directory.summary_json(), summary.replace("ENDING", ending)).unwrap();
+            let plan = Plan::new(&experiment, &root, 2).unwrap();
+            plan.runs.iter().map(|run| run.state).collect::<Vec<_>>()
+        };
+        assert_eq!(
+            states("interrupted"),
+            [State::Begun, State::New, State::New, State::Begun]
+        );
+        assert_eq!(
+            states("completed"),
+            [State::Begun, State::New, State::New, State::Complete]
+        );
+    }
+
+    #[test]
+    fn a_run_of_another_configuration_or_course_is_refused_with_what_differs() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("runs");
+        let before = experiment(folder.path(), "0.25");
+        begin(&Plan::new(&before, &root, 1).unwrap().runs[0], &before);
+        let refusal = |share| {
+            Plan::new(&experiment(folder.path(), share), &root, 1)
+                .unwrap_err()
+                .to_string()
+        };
+        for part in ["a/seed-1", "replay.success_share = 0.25 there, 0.5 here", "mv "] {
+            assert!(refusal("0.5").contains(part), "{}", refusal("0.5"));
+        }
+        // A course of the same name is another one all the same.
+        let copy = root.join("a/seed-1/courses/training.toml");
+        let course = fs::read_to_string(&copy).unwrap();
+        fs::write(&copy, format!("# changed\n{course}")).unwrap();
+        assert!(
+            refusal("0.25").contains("training.toml is another there"),
+            "{}",
+            refusal("0.25")
+        );
+    }
+
+    #[test]
+    fn a_folder_that_is_no_run_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let stray = folder.path().join("runs/b/seed-1/mine.txt");
+        fs::create_dir_all(stray.parent().unwrap()).unwrap();
+        fs::write(&stray, "").unwrap();
+        let error = Plan::new(&experiment(folder.path(), "0.25"), &folder.path().join("runs"), 1).unwrap_err();
+        assert!(
+            error.to_string().contains("not the directory of a run: move it away"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn an_experiment_is_run_by_one_process_at_a_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let claim = Plan::claim(folder.path()).unwrap();
+        assert!(matches!(Plan::claim(folder.path()), Err(PlanError::UnderWay(_))));
+        drop(claim);
+        Plan::claim(folder.path()).unwrap();
+    }
+}

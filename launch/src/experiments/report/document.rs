@@ -1,0 +1,160 @@
+//! The text of a report: everything a reader needs to judge a figure, and to have it again.
+
+use std::fmt::Write;
+
+use super::{Findings, Picture};
+use crate::display::Clock;
+use crate::experiments::definition::{Experiment, TableKind};
+use crate::experiments::results::RunResult;
+
+impl Findings<'_> {
+    /// The report as Markdown; its pictures lie where `prefix` and a file's name say.
+    pub(super) fn document(&self, pictures: &[Picture], prefix: &str) -> String {
+        let mut text = format!("**{}**\n\n```sh\n{}\n```\n\n", self.experiment.question, self.command);
+        push(&mut text, &self.what_was_run());
+        if let Some(note) = self.shortened() {
+            push(&mut text, &note);
+        }
+        if let Some(note) = self.missing() {
+            push(&mut text, &note);
+        }
+        for &kind in &self.experiment.tables {
+            for titled in self.tables(kind) {
+                push(&mut text, &format!("*{}.*", titled.title));
+                push(&mut text, &titled.table);
+            }
+            push(&mut text, &self.rests_on());
+        }
+        for picture in pictures {
+            push(&mut text, &format!("![{}]({prefix}{})", picture.caption, picture.file));
+        }
+        push(&mut text, &self.how_to_read(pictures));
+        text
+    }
+
+    fn what_was_run(&self) -> String {
+        let Experiment {
+            base_name,
+            settings,
+            arms,
+            ..
+        } = self.experiment;
+        let mut text = format!("Trained with `configs/{base_name}`");
+        if !settings.is_empty() {
+            let _ = write!(text, " and {}", code(settings));
+        }
+        if let [arm] = &arms[..]
+            && arm.settings.is_empty()
+        {
+            text.push('.');
+            return text;
+        }
+        text.push_str("; the arms set, beside that:\n\n");
+        for arm in arms {
+            let settings = match arm.settings.is_empty() {
+                true => "nothing".to_owned(),
+                false => code(&arm.settings),
+            };
+            let _ = writeln!(text, "- {}: {settings}", arm.label);
+        }
+        text.trim_end().to_owned()
+    }
+
+    fn shortened(&self) -> Option<String> {
+        self.experiment.is_shortened().then(|| {
+            format!(
+                "**Shortened**: {} training flights a run instead of the {} of `configs/{}`.",
+                self.experiment.flights(),
+                self.experiment.base_flights,
+                self.experiment.base_name
+            )
+        })
+    }
+
+    fn missing(&self) -> Option<String> {
+        let (planned, complete) = (self.plan.runs.len(), self.results.len());
+        (complete < planned).then(|| format!("**Not all of it**: {complete} of {planned} runs are complete."))
+    }
+
+    /// What the figures rest on: under each table.
+    fn rests_on(&self) -> String {
+        let shortened = match self.experiment.is_shortened() {
+            true => "; shortened",
+            false => "",
+        };
+        let seeds = match self.plan.seeds {
+            1 => "1 seed".to_owned(),
+            seeds => format!("{seeds} seeds"),
+        };
+        format!(
+            "<sub>{seeds} an arm{shortened}; a run: {} flights, {} steps, {} updates, {} of wall time.</sub>",
+            range(
+                self.results,
+                |run| run.summary.flights as f64,
+                |value| format!("{value:.0}")
+            ),
+            range(
+                self.results,
+                |run| run.summary.steps as f64,
+                |value| format!("{value:.0}")
+            ),
+            range(
+                self.results,
+                |run| run.summary.updates as f64,
+                |value| format!("{value:.0}")
+            ),
+            range(
+                self.results,
+                |run| run.summary.wall_secs,
+                |secs| Clock(secs).to_string()
+            ),
+        )
+    }
+
+    fn how_to_read(&self, pictures: &[Picture]) -> String {
+        let tables = &self.experiment.tables;
+        let estimates = tables.iter().any(|kind| *kind != TableKind::Outcomes);
+        let mut text = String::new();
+        if estimates {
+            text.push_str(match self.plan.seeds {
+                1 => "One seed has no interval, and says nothing about others. ",
+                2..5 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval; of so few seeds it is a rough one, and rather too narrow. ",
+                _ => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval. ",
+            });
+        }
+        if tables.contains(&TableKind::Learning) {
+            let window = self.experiment.arms[0].config.evaluation.window_flights;
+            let _ = write!(
+                text,
+                "A run that never reached the rate counts with all that it took (≥). Volatility is the root mean square of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to. "
+            );
+        }
+        if !pictures.is_empty() {
+            text.push_str("Lines are interquartile means over the seeds, bands their 95 % bootstrap intervals; a line ends where the first of its runs does. ");
+        }
+        text.trim_end().to_owned()
+    }
+}
+
+/// One paragraph more.
+fn push(text: &mut String, paragraph: &str) {
+    if !paragraph.is_empty() {
+        text.push_str(paragraph);
+        text.push_str("\n\n");
+    }
+}
+
+fn code(settings: &[String]) -> String {
+    let quoted: Vec<_> = settings.iter().map(|setting| format!("`{setting}`")).collect();
+    quoted.join(", ")
+}
+
+/// From the least to the most, or the one that all have.
+fn range(results: &[RunResult], of: impl Fn(&RunResult) -> f64, show: impl Fn(f64) -> String) -> String {
+    let values = || results.iter().map(&of);
+    let (least, most) = (values().fold(f64::INFINITY, f64::min), values().fold(0.0, f64::max));
+    match (show(least), show(most)) {
+        (least, most) if least == most => least,
+        (least, most) => format!("{least} to {most}"),
+    }
+}

@@ -1,0 +1,311 @@
+//! The tables of a report, as Markdown.
+
+use comfy_table::presets::ASCII_MARKDOWN;
+use comfy_table::{CellAlignment, Table};
+use skein_protocol::evaluation::CourseEvaluation;
+use skein_protocol::summary::Trained;
+
+use super::Findings;
+use crate::display::Clock;
+use crate::experiments::definition::{Arm, TableKind};
+use crate::experiments::results::RunResult;
+use crate::experiments::statistics::{Estimate, RESAMPLES, interquartile_mean};
+
+/// What is shown where there is nothing to show.
+const NOTHING: &str = "–";
+
+/// A table and what stands above it.
+pub(super) struct Titled {
+    pub(super) title: String,
+    pub(super) table: String,
+}
+
+impl Findings<'_> {
+    /// The tables of one kind.
+    pub(super) fn tables(&self, kind: TableKind) -> Vec<Titled> {
+        match kind {
+            TableKind::Evaluation => self.evaluation(),
+            TableKind::Outcomes => vec![self.outcomes()],
+            TableKind::Learning => vec![self.learning()],
+            TableKind::Cost => vec![self.cost()],
+        }
+    }
+
+    fn evaluation(&self) -> Vec<Titled> {
+        let flights = self.experiment.arms[0].config.evaluation.flights;
+        let rate = |estimate: Estimate| with_interval(estimate, |value| format!("{value:.3}"));
+        let percent = |estimate: Estimate| with_interval(estimate, |value| format!("{:.1} %", 100.0 * value));
+        vec![
+            Titled {
+                title: format!(
+                    "R, the share of walls passed, of the best snapshot in {flights} flights a course without exploration"
+                ),
+                table: self.by_course(|course| course.r, rate),
+            },
+            Titled {
+                title: format!("Share of these {flights} flights that completed the course"),
+                table: self.by_course(|course| course.completed, percent),
+            },
+        ]
+    }
+
+    /// A row an arm, a column a course.
+    fn by_course(&self, value: impl Fn(&CourseEvaluation) -> f64, show: impl Fn(Estimate) -> String) -> String {
+        let courses = self.courses();
+        let mut rows = Vec::new();
+        for (number, arm) in self.experiment.arms.iter().enumerate() {
+            let mut row = self.head(number, arm);
+            row.extend(courses.iter().map(|name| {
+                let of_course = |result: &RunResult| course_of(result, name).map(&value);
+                self.estimate(number, of_course).map_or(NOTHING.to_owned(), &show)
+            }));
+            rows.push(row);
+        }
+        let header = ["arm".to_owned(), "seeds".to_owned()].into_iter().chain(courses);
+        grid(header.collect(), rows, 1)
+    }
+
+    /// A row for each arm and course: flights of all seeds together.
+    fn outcomes(&self) -> Titled {
+        let mut rows = Vec::new();
+        for (number, arm) in self.experiment.arms.iter().enumerate() {
+            for name in self.courses() {
+                let of_course: Vec<_> = self
+                    .of_arm(number)
+                    .filter_map(|result| course_of(result, &name))
+                    .collect();
+                let sum = |count: &dyn Fn(&CourseEvaluation) -> u64| {
+                    of_course.iter().map(|course| count(course)).sum::<u64>()
+                };
+                let flights = sum(&|course| course.flights);
+                let completed = flights - sum(&|course| course.collided + course.timed_out);
+                let walls = of_course
+                    .iter()
+                    .map(|course| course.walls_passed.len())
+                    .max()
+                    .unwrap_or(0);
+                let passed: Vec<u64> = (0..walls)
+                    .map(|wall| sum(&|course| course.walls_passed.get(wall).copied().unwrap_or(0)))
+                    .collect();
+                let share = |part: u64, whole: u64| match whole {
+                    0 => NOTHING.to_owned(),
+                    whole => format!("{:.3}", part as f64 / whole as f64),
+                };
+                let r = share(passed.iter().sum(), flights * walls as u64);
+                let by_wall: Vec<_> = passed.iter().map(u64::to_string).collect();
+                rows.push(vec![
+                    arm.label.clone(),
+                    name,
+                    of_course.len().to_string(),
+                    flights.to_string(),
+                    r,
+                    by_wall.join(" "),
+                    completed.to_string(),
+                    sum(&|course| course.collided).to_string(),
+                    sum(&|course| course.timed_out).to_string(),
+                ]);
+            }
+        }
+        let header = [
+            "arm",
+            "course",
+            "seeds",
+            "flights",
+            "R",
+            "passed wall 1, 2, …",
+            "completed",
+            "collided",
+            "timed out",
+        ];
+        Titled {
+            title: "How the evaluation flights went, all seeds together".to_owned(),
+            table: grid(header.map(str::to_owned).to_vec(), rows, 2),
+        }
+    }
+
+    fn learning(&self) -> Titled {
+        let evaluation = &self.experiment.arms[0].config.evaluation;
+        let count = |value: f64| format!("{value:.0}");
+        let mut rows = Vec::new();
+        for (number, arm) in self.experiment.arms.iter().enumerate() {
+            let mut row = self.head(number, arm);
+            let trained = self
+                .of_arm(number)
+                .filter(|result| result.summary.trained.is_some())
+                .count();
+            row.push(format!("{trained} of {}", self.of_arm(number).count()));
+            row.push(self.until_trained(number, |at| at.flights as f64, |run| run.summary.flights as f64, &count));
+            row.push(self.until_trained(number, |at| at.steps as f64, |run| run.summary.steps as f64, &count));
+            row.push(self.until_trained(number, |at| at.updates as f64, |run| run.summary.updates as f64, &count));
+            row.push(
+                self.until_trained(number, |at| at.wall_secs, |run| run.summary.wall_secs, &|secs| {
+                    Clock(secs).to_string()
+                }),
+            );
+            for of_run in [
+                RunResult::final_walls_passed,
+                RunResult::final_return,
+                RunResult::volatility,
+            ] {
+                let estimate = self.estimate(number, of_run);
+                row.push(estimate.map_or(NOTHING.to_owned(), |estimate| {
+                    with_interval(estimate, |value| format!("{value:.2}"))
+                }));
+            }
+            rows.push(row);
+        }
+        let window = evaluation.window_flights;
+        let header = [
+            "arm".to_owned(),
+            "seeds".to_owned(),
+            format!("R ≥ {} reached", evaluation.trained_rate),
+            "after flights".to_owned(),
+            "steps".to_owned(),
+            "updates".to_owned(),
+            "time".to_owned(),
+            format!("walls passed, last {window}"),
+            format!("return, last {window}"),
+            "volatility".to_owned(),
+        ];
+        Titled {
+            title: format!(
+                "Learning: when R ≥ {} was first confirmed in {} evaluation flights on the first course, and the last {window} training flights",
+                evaluation.trained_rate, evaluation.confirm_flights
+            ),
+            table: grid(header.to_vec(), rows, 1),
+        }
+    }
+
+    /// When the runs of an arm were trained. A run that never was counts with all that it took, which is the least it would have taken.
+    fn until_trained(
+        &self,
+        arm: usize,
+        at: impl Fn(&Trained) -> f64,
+        whole: impl Fn(&RunResult) -> f64,
+        show: &dyn Fn(f64) -> String,
+    ) -> String {
+        let all_trained = self.of_arm(arm).all(|result| result.summary.trained.is_some());
+        let value = |result: &RunResult| Some(result.summary.trained.as_ref().map_or(whole(result), &at));
+        match self.estimate(arm, value) {
+            None => NOTHING.to_owned(),
+            Some(estimate) if all_trained => with_interval(estimate, show),
+            Some(estimate) => format!("≥ {}", with_interval(estimate, show)),
+        }
+    }
+
+    fn cost(&self) -> Titled {
+        let mut rows = Vec::new();
+        for (number, arm) in self.experiment.arms.iter().enumerate() {
+            let mean = |of: &dyn Fn(&RunResult) -> f64| {
+                let values: Vec<_> = self.of_arm(number).map(of).collect();
+                interquartile_mean(&values)
+            };
+            let count =
+                |of: &dyn Fn(&RunResult) -> f64| mean(of).map_or(NOTHING.to_owned(), |value| format!("{value:.0}"));
+            let mut row = self.head(number, arm);
+            row.push(count(&|run| run.summary.flights as f64));
+            row.push(count(&|run| run.summary.steps as f64));
+            row.push(count(&|run| run.summary.updates as f64));
+            row.push(count(&|run| run.summary.vae_updates as f64));
+            row.push(mean(&|run| run.summary.wall_secs).map_or(NOTHING.to_owned(), |secs| Clock(secs).to_string()));
+            rows.push(row);
+        }
+        let header = ["arm", "seeds", "flights", "steps", "updates", "VAE steps", "wall time"];
+        Titled {
+            title: "What a run took, side by side with others".to_owned(),
+            table: grid(header.map(str::to_owned).to_vec(), rows, 1),
+        }
+    }
+
+    /// The first cells of an arm's row: its label, and how many of its runs are complete.
+    fn head(&self, number: usize, arm: &Arm) -> Vec<String> {
+        let (complete, planned) = (self.of_arm(number).count() as u64, self.plan.seeds);
+        let seeds = match complete == planned {
+            true => planned.to_string(),
+            false => format!("{complete} of {planned}"),
+        };
+        vec![arm.label.clone(), seeds]
+    }
+
+    /// The estimate of what `of_run` says of the complete runs of an arm; `None` when it says nothing of one of them.
+    fn estimate(&self, arm: usize, of_run: impl Fn(&RunResult) -> Option<f64>) -> Option<Estimate> {
+        let values: Option<Vec<f64>> = self.of_arm(arm).map(of_run).collect();
+        self.bootstrap(arm, RESAMPLES).estimate(&values?)
+    }
+
+    /// Names of the evaluation courses.
+    fn courses(&self) -> Vec<String> {
+        let first = self.results.first();
+        first.map_or(Vec::new(), |result| {
+            let courses = result.evaluation.courses.iter();
+            courses.map(|course| course.course.clone()).collect()
+        })
+    }
+}
+
+fn course_of<'a>(result: &'a RunResult, name: &str) -> Option<&'a CourseEvaluation> {
+    result.evaluation.courses.iter().find(|course| course.course == name)
+}
+
+/// `IQM [low, high]`.
+fn with_interval(estimate: Estimate, show: impl Fn(f64) -> String) -> String {
+    let iqm = show(estimate.iqm);
+    match estimate.interval {
+        None => iqm,
+        Some((low, high)) => format!("{iqm} [{}, {}]", show(low), show(high)),
+    }
+}
+
+/// A Markdown table whose first `left` columns are aligned left, all others right.
+fn grid(header: Vec<String>, rows: Vec<Vec<String>>, left: usize) -> String {
+    let mut table = Table::new();
+    table.load_preset(ASCII_MARKDOWN).set_header(header);
+    for row in rows {
+        table.add_row(row);
+    }
+    for column in table.column_iter_mut().skip(left) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    let text = table.to_string();
+    let mut lines: Vec<_> = text.lines().map(str::to_owned).collect();
+    // Those who render Markdown learn of the alignment from the line under the header alone.
+    if let Some(rule) = lines.get_mut(1) {
+        let mut column = 0;
+        *rule = rule
+            .split_inclusive('|')
+            .map(|dashes| {
+                column += 1;
+                match column > left + 1 {
+                    true => dashes.replace("-|", ":|"),
+                    false => dashes.to_owned(),
+                }
+            })
+            .collect();
+    }
+    lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_of_figures_are_aligned_right_for_those_who_render_it_too() {
+        let row = |cells: [&str; 3]| cells.map(str::to_owned).to_vec();
+        let text = grid(row(["arm", "seeds", "R"]), vec![row(["one", "3", "0.5 [0.4, 0.6]"])], 1);
+        assert_eq!(
+            text,
+            "| arm | seeds |              R |\n|-----|------:|---------------:|\n| one |     3 | 0.5 [0.4, 0.6] |"
+        );
+    }
+
+    #[test]
+    fn an_interval_is_shown_where_there_is_one() {
+        let show = |value: f64| format!("{value:.1}");
+        let of = |interval| with_interval(Estimate { iqm: 0.5, interval }, show);
+        assert_eq!(
+            (of(None), of(Some((0.25, 1.0)))),
+            ("0.5".to_owned(), "0.5 [0.2, 1.0]".to_owned())
+        );
+    }
+}

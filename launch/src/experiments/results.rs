@@ -1,0 +1,139 @@
+//! What the runs of an experiment came to, read from their directories.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use skein_protocol::config::Config;
+use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::summary::Summary;
+
+use super::definition::{Axis, Measure};
+use super::plan::{Plan, PlannedRun, State};
+use super::statistics::volatility;
+use crate::reports::ReportError;
+use crate::reports::curves::{FlightRow, read_flights, trailing_mean};
+
+/// A run that is complete.
+#[derive(Debug)]
+pub struct RunResult {
+    /// Its arm's place in the experiment.
+    pub arm: usize,
+    /// Its seed.
+    pub seed: u64,
+    /// Its counts.
+    pub summary: Summary,
+    /// How its best snapshot flew.
+    pub evaluation: EvaluationReport,
+    /// Its training flights, in order.
+    pub(super) flights: Vec<FlightRow>,
+    window: usize,
+    warmup_steps: u64,
+}
+
+/// Why a complete run cannot be reported.
+#[derive(Debug, thiserror::Error)]
+pub enum ResultError {
+    /// A file is not there, or not what it should be.
+    #[error("{}: {problem}; to have the run done again, move its directory away", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// Its flights cannot be read.
+    #[error(transparent)]
+    Flights(#[from] ReportError),
+}
+
+/// The runs of `plan` that are complete, in its order.
+///
+/// # Errors
+/// [`ResultError`] names the file.
+pub fn read(plan: &Plan) -> Result<Vec<RunResult>, ResultError> {
+    plan.runs
+        .iter()
+        .filter(|run| run.state == State::Complete)
+        .map(RunResult::of)
+        .collect()
+}
+
+impl RunResult {
+    pub(super) fn of(run: &PlannedRun) -> Result<Self, ResultError> {
+        let Config {
+            evaluation, learning, ..
+        } = &run.config;
+        Ok(Self {
+            arm: run.arm,
+            seed: run.seed,
+            summary: json(&run.directory.summary_json())?,
+            evaluation: json(&run.directory.evaluation_json())?,
+            flights: read_flights(&run.directory.flights_csv())?,
+            window: evaluation.window_flights as usize,
+            warmup_steps: learning.warmup_steps as u64,
+        })
+    }
+
+    /// Walls passed a flight over the last window of training flights; `None` if there were none.
+    pub fn final_walls_passed(&self) -> Option<f64> {
+        trailing_mean(&self.values(Measure::WallsPassed), self.window).pop()
+    }
+
+    /// Return of a flight over the last window of training flights; `None` if there were none.
+    pub fn final_return(&self) -> Option<f64> {
+        trailing_mean(&self.values(Measure::Return), self.window).pop()
+    }
+
+    /// How restless its walls passed were once they had risen; see [`volatility`].
+    pub fn volatility(&self) -> Option<f64> {
+        volatility(&self.values(Measure::WallsPassed), self.window)
+    }
+
+    /// The average of `measure` over each whole window of training flights, at the flights, steps or updates that were behind it then.
+    pub fn curve(&self, measure: Measure, over: Axis) -> Vec<(f64, f64)> {
+        let means = trailing_mean(&self.values(measure), self.window);
+        self.places(over)
+            .into_iter()
+            .zip(means)
+            .skip(self.window.saturating_sub(1))
+            .collect()
+    }
+
+    fn values(&self, measure: Measure) -> Vec<f64> {
+        self.flights
+            .iter()
+            .map(|flight| match measure {
+                Measure::WallsPassed => f64::from(flight.walls_passed),
+                Measure::Return => flight.episode_return,
+            })
+            .collect()
+    }
+
+    /// What was behind the run after each of its flights. Updates follow from steps: each step after the warm-up brings the same number of them.
+    fn places(&self, over: Axis) -> Vec<f64> {
+        let mut steps = 0;
+        let learned_steps = self.summary.steps.saturating_sub(self.warmup_steps).max(1);
+        let updates_per_step = self.summary.updates as f64 / learned_steps as f64;
+        self.flights
+            .iter()
+            .enumerate()
+            .map(|(number, flight)| {
+                steps += u64::from(flight.steps);
+                match over {
+                    Axis::Flights => (number + 1) as f64,
+                    Axis::Steps => steps as f64,
+                    Axis::Updates => steps.saturating_sub(self.warmup_steps) as f64 * updates_per_step,
+                }
+            })
+            .collect()
+    }
+}
+
+fn json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, ResultError> {
+    let problem = |problem: String| ResultError::File {
+        path: path.to_owned(),
+        problem,
+    };
+    let bytes = fs::read(path).map_err(|error| problem(error.to_string()))?;
+    serde_json::from_slice(&bytes).map_err(|error| problem(error.to_string()))
+}

@@ -1,0 +1,227 @@
+//! A few numbers, one a seed, summed up honestly: interquartile mean and a bootstrap interval; and how restless a curve is.
+//!
+//! Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv:2108.13264, which recommends both for few runs.
+
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use skein_protocol::seeds::{Purpose, derive};
+
+/// Resamples for a figure of a table.
+pub const RESAMPLES: usize = 10_000;
+/// The interval leaves out this share of the resamples at either end: 95 % remain.
+const TAIL: f64 = 0.025;
+/// The rise of a curve is over when it first reaches this share of the level that it comes to.
+const RISEN: f64 = 0.9;
+
+/// A statement about all seeds from a few of them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    /// Interquartile mean.
+    pub iqm: f64,
+    /// 95 % bootstrap interval; `None` of a single value, which says nothing about others.
+    pub interval: Option<(f64, f64)>,
+}
+
+/// Mean of the middle half of `values`: a quarter of their weight is left out at either end, and a value on the border counts with the part that lies
+/// inside. Of three values, the middle one counts four times as much as each other. `None` of none.
+pub fn interquartile_mean(values: &[f64]) -> Option<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    mean_of_middle_half(&sorted)
+}
+
+fn mean_of_middle_half(sorted: &[f64]) -> Option<f64> {
+    let count = sorted.len() as f64;
+    let (from, to) = (count / 4.0, count * 3.0 / 4.0);
+    // The value of rank i covers [i, i + 1).
+    let inside = |rank: usize| (to.min(rank as f64 + 1.0) - from.max(rank as f64)).max(0.0);
+    let sum: f64 = sorted
+        .iter()
+        .enumerate()
+        .map(|(rank, value)| inside(rank) * value)
+        .sum();
+    (!sorted.is_empty()).then(|| sum / (to - from))
+}
+
+/// Resamples of so many seeds, drawn once: all measures of an experiment are resampled alike, and a report drawn again is the same.
+#[derive(Debug)]
+pub struct Bootstrap {
+    seeds: usize,
+    /// For each resample, which seeds are in it.
+    resamples: Vec<Vec<usize>>,
+}
+
+impl Bootstrap {
+    /// `resamples` samples of `seeds` values each, drawn with replacement.
+    pub fn new(seeds: usize, resamples: usize) -> Self {
+        let mut rng = Pcg64Mcg::seed_from_u64(derive(seeds as u64, Purpose::Bootstrap, resamples as u64));
+        let mut resample = || (0..seeds).map(|_| rng.random_range(0..seeds)).collect();
+        Self {
+            seeds,
+            resamples: if seeds < 2 {
+                Vec::new()
+            } else {
+                (0..resamples).map(|_| resample()).collect()
+            },
+        }
+    }
+
+    /// Interquartile mean of `values`, one a seed, with the interval between the 2.5th and the 97.5th percentile of the resamples' interquartile means.
+    /// `None` of no values.
+    ///
+    /// # Panics
+    /// When there are not as many values as seeds.
+    pub fn estimate(&self, values: &[f64]) -> Option<Estimate> {
+        assert_eq!(values.len(), self.seeds, "one value a seed");
+        let iqm = interquartile_mean(values)?;
+        let mut drawn = Vec::with_capacity(values.len());
+        let mut means: Vec<f64> = self
+            .resamples
+            .iter()
+            .filter_map(|resample| {
+                drawn.clear();
+                drawn.extend(resample.iter().map(|&seed| values[seed]));
+                drawn.sort_by(f64::total_cmp);
+                mean_of_middle_half(&drawn)
+            })
+            .collect();
+        means.sort_by(f64::total_cmp);
+        let interval = (!means.is_empty()).then(|| (quantile(&means, TAIL), quantile(&means, 1.0 - TAIL)));
+        Some(Estimate { iqm, interval })
+    }
+}
+
+/// The `share` quantile of values in ascending order, linear between two of them.
+fn quantile(sorted: &[f64], share: f64) -> f64 {
+    let place = share * (sorted.len() - 1) as f64;
+    let (below, part) = (place.floor() as usize, place.fract());
+    let above = (below + 1).min(sorted.len() - 1);
+    sorted[below] + part * (sorted[above] - sorted[below])
+}
+
+/// How restless a curve is once it has risen: the root mean square of the differences between the averages over successive windows of `window` values
+/// that do not overlap. What is left of a slow trend in it is small, as differences of neighbours hardly see one.
+///
+/// The curve has risen when a window first averages 0.9 of the level that it comes to, which is the median of the averages in its second half.
+/// `None` when fewer than three windows follow.
+///
+/// Where start levels are flown in turn, a window should be whole turns of them (50 flights of 5 levels, 10 each): otherwise the turns themselves show.
+pub fn volatility(values: &[f64], window: usize) -> Option<f64> {
+    let averages: Vec<f64> = values
+        .chunks_exact(window.max(1))
+        .map(|chunk| chunk.iter().sum::<f64>() / chunk.len() as f64)
+        .collect();
+    let mut second_half = averages[averages.len() / 2..].to_vec();
+    second_half.sort_by(f64::total_cmp);
+    let level = second_half.get(second_half.len() / 2)?;
+    let risen = averages.iter().position(|average| *average >= RISEN * level)?;
+    let after = &averages[risen..];
+    if after.len() < 3 {
+        return None;
+    }
+    let squares: f64 = after.windows(2).map(|pair| (pair[1] - pair[0]).powi(2)).sum();
+    Some((squares / (after.len() - 1) as f64).sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_interquartile_mean_is_that_of_the_textbook() {
+        let of = |values: &[f64]| interquartile_mean(values).unwrap();
+        // Twelve values: the middle six, 5 to 8.
+        assert_eq!(of(&[5.0, 8.0, 4.0, 38.0, 8.0, 6.0, 9.0, 7.0, 7.0, 3.0, 1.0, 6.0]), 6.5);
+        // Nine: the middle three, and three quarters of their neighbours.
+        assert_eq!(of(&[1.0, 3.0, 5.0, 7.0, 9.0, 11.0, 13.0, 15.0, 17.0]), 9.0);
+        assert_eq!(of(&[0.0, 1.0, 5.0]), (0.25 * 0.0 + 1.0 + 0.25 * 5.0) / 1.5);
+        assert_eq!(of(&[0.0, 1.0, 2.0, 3.0, 100.0]), (0.75 * 1.0 + 2.0 + 0.75 * 3.0) / 2.5);
+        assert_eq!((of(&[4.0]), of(&[1.0, 2.0])), (4.0, 1.5));
+        assert_eq!(interquartile_mean(&[]), None);
+    }
+
+    #[test]
+    fn an_interval_holds_its_mean_and_is_the_same_each_time() {
+        let values = [0.91, 0.97, 0.88, 0.99, 0.95];
+        let estimate = Bootstrap::new(5, RESAMPLES).estimate(&values).unwrap();
+        assert_eq!(Bootstrap::new(5, RESAMPLES).estimate(&values).unwrap(), estimate);
+        let (low, high) = estimate.interval.unwrap();
+        assert!(
+            0.88 <= low && low < estimate.iqm && estimate.iqm < high && high <= 0.99,
+            "{estimate:?}"
+        );
+    }
+
+    /// Of two values a and b, a resample is (a, a), (a, b), (b, a) or (b, b): with a quarter of the resamples at each end, the interval is [a, b].
+    #[test]
+    fn the_interval_of_two_values_reaches_from_one_to_the_other() {
+        let estimate = Bootstrap::new(2, 1000).estimate(&[3.0, 1.0]).unwrap();
+        assert_eq!(
+            estimate,
+            Estimate {
+                iqm: 2.0,
+                interval: Some((1.0, 3.0))
+            }
+        );
+    }
+
+    /// Values that are equally likely anywhere in [0, 1]: the influence of x on their interquartile mean is 2 (x - 1/2) with x bounded to [1/4, 3/4], whose
+    /// variance is 1/6.
+    #[test]
+    fn the_interval_of_many_values_is_the_asymptotic_one() {
+        let n = 400;
+        let values: Vec<f64> = (0..n).map(|i| (f64::from(i) + 0.5) / f64::from(n)).collect();
+        let estimate = Bootstrap::new(values.len(), 2000).estimate(&values).unwrap();
+        let (low, high) = estimate.interval.unwrap();
+        let expected = 2.0 * 1.96 * (1.0 / 6.0 / f64::from(n)).sqrt();
+        assert!((estimate.iqm - 0.5).abs() < 1e-9);
+        assert!(
+            ((high - low) / expected - 1.0).abs() < 0.1,
+            "{} instead of {expected}",
+            high - low
+        );
+    }
+
+    #[test]
+    fn one_value_has_no_interval_and_none_no_mean() {
+        let one = Bootstrap::new(1, RESAMPLES).estimate(&[2.5]);
+        assert_eq!(
+            one,
+            Some(Estimate {
+                iqm: 2.5,
+                interval: None
+            })
+        );
+        assert_eq!(Bootstrap::new(0, RESAMPLES).estimate(&[]), None);
+    }
+
+    #[test]
+    fn a_quantile_lies_between_its_neighbours() {
+        let sorted = [0.0, 10.0, 20.0, 30.0, 40.0];
+        assert_eq!(
+            [0.0, 0.25, 0.375, 1.0].map(|share| quantile(&sorted, share)),
+            [0.0, 10.0, 15.0, 40.0]
+        );
+    }
+
+    #[test]
+    fn volatility_looks_behind_the_rise_alone() {
+        let of = |averages: &[f64]| {
+            let values: Vec<f64> = averages
+                .iter()
+                .flat_map(|&average| [average - 1.0, average + 1.0])
+                .collect();
+            volatility(&values, 2)
+        };
+        // A steady curve has none, however it rose, and noise within a window is none.
+        assert_eq!(of(&[0.0, 0.5, 1.0, 2.0, 2.0, 2.0, 2.0, 2.0]), Some(0.0));
+        // Up and down by 0.2 after the rise; the drop counts, the rise does not.
+        let swinging = of(&[0.0, 0.1, 2.0, 1.8, 2.0, 1.8, 2.0, 1.8]).unwrap();
+        assert!((swinging - 0.2).abs() < 1e-9, "{swinging}");
+        let fallen = of(&[0.0, 2.0, 2.0, 2.0, 0.0, 2.0, 2.0, 2.0]).unwrap();
+        assert!((fallen - (8.0_f64 / 6.0).sqrt()).abs() < 1e-9, "{fallen}");
+        // Too few windows to say anything.
+        assert_eq!(of(&[1.0, 1.0]), None);
+        assert_eq!(of(&[]), None);
+    }
+}
