@@ -101,10 +101,7 @@ pub fn gradient(team: &mut Team, isa: Isa, left: Matrix<'_>, right: Terms<'_>, o
             left,
             right,
             columns,
-            output: Output {
-                data: shared.pointer(),
-                stride: right.columns(),
-            },
+            output: shared.pointer(),
         };
         job.run();
     });
@@ -116,7 +113,7 @@ struct Job<'a> {
     left: Matrix<'a>,
     right: Terms<'a>,
     columns: Range<usize>,
-    output: Output,
+    output: *mut f32,
 }
 
 /// Memory of one thread, kept from product to product.
@@ -153,7 +150,7 @@ impl Job<'_> {
         for row in 0..self.left.columns() {
             for column in self.columns.clone() {
                 // SAFETY: inside the output, in this member's columns.
-                unsafe { *self.output.data.add(row * self.output.stride + column) = 0.0 };
+                unsafe { *self.output.add(row * self.right.columns() + column) = 0.0 };
             }
         }
     }
@@ -213,7 +210,8 @@ unsafe fn block<S: Simd<Term = f32>>(job: &Job<'_>, terms: Range<usize>, scratch
                 right: right.as_ptr(),
                 panel,
                 begin,
-                output: job.output.down(row * job.output.stride + panel.first),
+                output: job.output.wrapping_add(row * job.right.columns() + panel.first),
+                stride: job.right.columns(),
             };
             // SAFETY: as the caller says.
             unsafe { of_height!(S, (rows - row).min(S::ROWS), tile_of(tile)) };
@@ -227,7 +225,8 @@ struct Tile {
     right: *const f32,
     panel: Panel,
     begin: Begin,
-    output: Output,
+    output: *mut f32,
+    stride: usize,
 }
 
 #[inline(always)]
@@ -241,7 +240,7 @@ unsafe fn tile_of<S: Simd<Term = f32>, const M: usize>(tile: Tile) {
             tile.panel,
             tile.begin,
             End::Plain,
-            tile.output,
+            Output::even(tile.output, tile.stride),
         );
     }
 }

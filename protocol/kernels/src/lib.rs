@@ -18,6 +18,7 @@ mod product;
 mod team;
 mod tile;
 mod windows;
+mod work;
 
 pub use adam::AdamStep;
 pub use gradient::{Terms, gradient};

@@ -197,12 +197,6 @@ impl<T: Term> Panels<T> {
         }))
     }
 
-    /// Whether these columns are those of whole, full panels.
-    pub(crate) fn are_whole(&self, columns: &Range<usize>) -> bool {
-        let width = self.isa.panel_width();
-        columns.start.is_multiple_of(width) && columns.end.is_multiple_of(width)
-    }
-
     /// Where `panel` begins at `term`.
     pub(crate) fn at(&self, panel: Panel, term: usize) -> *const T {
         debug_assert!(term < self.terms.max(1));

@@ -1,16 +1,14 @@
 //! Rows times packed panels: every forward pass, and what flows back to a layer's input.
 
 use std::cell::RefCell;
-use std::ops::Range;
 
-use crate::isa::{Isa, Simd};
+use crate::isa::Isa;
 use crate::pair::Term;
-use crate::panels::{Matrix, Panel, Panels};
-use crate::tile::{Begin, End, InPlace, MOST_ROWS, Output, ROW_PANELS, Run, of_height, panel_tile, row_of_panels};
+use crate::panels::{Matrix, Panels};
+use crate::tile::{Begin, End, MOST_ROWS, ROW_PANELS, Run};
 use crate::windows::Windows;
+use crate::work::{Starts, TERMS_AT_ONCE, Work, do_work};
 
-/// Terms of a panel that all rows meet before the next ones' turn: they stay in the first cache meanwhile.
-const TERMS_AT_ONCE: usize = 256;
 /// Rows that meet all panels before the next ones' turn, and numbers of a matrix's rows: they stay in the second cache meanwhile.
 const ROWS_AT_ONCE: usize = 192;
 const NUMBERS_AT_ONCE: usize = 80 << 10;
@@ -58,7 +56,13 @@ pub fn product<T: Term>(
     finish: Finish<'_>,
     output: &mut [f32],
 ) {
-    product_part(rows, panels, 0..panels.columns(), start, finish, output);
+    let columns = panels.columns();
+    check_lens(rows, panels.terms(), columns, start, finish, output.len());
+    let place = Place {
+        stride: columns,
+        first: 0,
+    };
+    multiply(rows, panels, place, start, finish, output);
 }
 
 thread_local! {
@@ -79,7 +83,7 @@ pub fn product_once(
     output: &mut [f32],
 ) {
     let (rows, columns) = (Rows::Matrix(rows), right.columns());
-    check_lens(rows, right.rows(), columns, columns, start, finish, output.len());
+    check_lens(rows, right.rows(), columns, start, finish, output.len());
     PANEL.with_borrow_mut(|panels| {
         for panel in crate::panels::panels(isa, columns) {
             let own = panel.first..panel.first + panel.columns;
@@ -88,31 +92,9 @@ pub fn product_once(
                 stride: columns,
                 first: own.start,
             };
-            multiply(rows, panels, 0..own.len(), place, start, finish, output);
+            multiply(rows, panels, place, start, finish, output);
         }
     });
-}
-
-/// [`product`] for some columns only, from the first of a panel to the last of one: `output` and a gate hold these alone, a bias is that of all.
-pub(crate) fn product_part<T: Term>(
-    rows: Rows<'_, T>,
-    panels: &Panels<T>,
-    part: Range<usize>,
-    start: Start<'_>,
-    finish: Finish<'_>,
-    output: &mut [f32],
-) {
-    let terms = panels.terms();
-    assert!(
-        part.end <= panels.columns() && (part == (0..panels.columns()) || panels.are_whole(&part)),
-        "columns {part:?} are not those of whole panels"
-    );
-    check_lens(rows, terms, part.len(), panels.columns(), start, finish, output.len());
-    let place = Place {
-        stride: part.len(),
-        first: 0,
-    };
-    multiply(rows, panels, part, place, start, finish, output);
 }
 
 /// Where the first column of a product lies in its output.
@@ -123,18 +105,17 @@ struct Place {
     first: usize,
 }
 
-/// The product for these columns of `panels`, all lengths looked at. A bias begins with that of the column at `place`, but for a part of the panels with that of their first.
+/// The product, all lengths looked at. A bias begins with that of the column at `place`.
 fn multiply<T: Term>(
     rows: Rows<'_, T>,
     panels: &Panels<T>,
-    part: Range<usize>,
     place: Place,
     start: Start<'_>,
     finish: Finish<'_>,
     output: &mut [f32],
 ) {
     assert!(panels.isa().is_available(), "{} is not to be had here", panels.isa());
-    let (columns, count) = (part.len(), rows.count(panels.terms()));
+    let count = rows.count(panels.terms());
     let single;
     let (data, starts, runs) = match rows {
         Rows::Matrix(data) => {
@@ -147,7 +128,7 @@ fn multiply<T: Term>(
         Rows::Windows(windows, image) => (image, Starts::Listed(windows.starts()), windows.runs()),
     };
     // A single row meets a number only once, and needs as many sums under way as there are registers.
-    let (terms_at_once, panels_at_once) = if count == 1 && columns == panels.columns() {
+    let (terms_at_once, panels_at_once) = if count == 1 {
         (usize::MAX, ROW_PANELS)
     } else {
         (TERMS_AT_ONCE, 1)
@@ -159,11 +140,8 @@ fn multiply<T: Term>(
         Rows::Windows(..) => ROWS_AT_ONCE,
     };
     for first in (0..count).step_by(rows_at_once) {
-        for panel in panels
-            .groups(panels_at_once)
-            .filter(|panel| part.contains(&panel.first))
-        {
-            let corner = first * place.stride + place.first + panel.first - part.start;
+        for panel in panels.groups(panels_at_once) {
+            let column = place.first + panel.first;
             for (index, block) in blocks.iter().enumerate() {
                 let work = Work {
                     left: data.as_ptr(),
@@ -177,18 +155,16 @@ fn multiply<T: Term>(
                     begin: match start {
                         _ if index > 0 => Begin::Output,
                         Start::Zero => Begin::Zero,
-                        Start::Bias(bias) => Begin::Bias(bias[place.first + panel.first..].as_ptr()),
+                        Start::Bias(bias) => Begin::Bias(bias[column..].as_ptr()),
                     },
                     end: match finish {
                         _ if index < last_block => End::Plain,
                         Finish::Plain => End::Plain,
                         Finish::Rectified => End::Rectified,
-                        Finish::Gated(by) => End::Gated(by[corner..].as_ptr()),
+                        Finish::Gated(by) => End::Gated(by[column..].as_ptr()),
                     },
-                    output: Output {
-                        data: output[corner..].as_mut_ptr(),
-                        stride: place.stride,
-                    },
+                    output: output[column..].as_mut_ptr(),
+                    output_starts: Starts::Even(place.stride),
                 };
                 // SAFETY: `check` has seen to it that every row has all terms, bias, gate and output all columns of all rows; `panels` was packed for
                 // its instructions, which `Isa` has looked for.
@@ -198,12 +174,11 @@ fn multiply<T: Term>(
     }
 }
 
-/// Looks at all lengths: those of an output of `columns` columns, and of a bias for each of `all`.
+/// Looks at all lengths.
 fn check_lens<T: Term>(
     rows: Rows<'_, T>,
     terms: usize,
     columns: usize,
-    all: usize,
     start: Start<'_>,
     finish: Finish<'_>,
     output: usize,
@@ -227,7 +202,7 @@ fn check_lens<T: Term>(
         "a place for each of {count} x {columns} elements"
     );
     if let Start::Bias(bias) = start {
-        assert_eq!(bias.len(), all, "a bias for each column");
+        assert_eq!(bias.len(), columns, "a bias for each column");
     }
     if let Finish::Gated(by) = finish {
         assert_eq!(by.len(), output, "a gate for each element");
@@ -275,115 +250,4 @@ fn blocks(runs: &[Run], most: usize) -> Vec<Block> {
         }
     }
     blocks
-}
-
-/// Where rows begin.
-#[derive(Clone, Copy)]
-enum Starts<'a> {
-    /// So far apart.
-    Even(usize),
-    /// Here.
-    Listed(&'a [usize]),
-}
-
-/// Some rows, some terms, one panel or several.
-struct Work<'a, T> {
-    left: *const T,
-    starts: Starts<'a>,
-    first: usize,
-    rows: usize,
-    runs: &'a [Run],
-    right: *const T,
-    /// All terms of the product: so far apart are the columns of one panel and the next.
-    terms: usize,
-    /// One panel, or as many full ones side by side as a single row meets at once.
-    panel: Panel,
-    begin: Begin,
-    end: End,
-    /// Of the first row and the panel's first column; a gate likewise.
-    output: Output,
-}
-
-impl<T> Work<'_, T> {
-    /// Where a row begins.
-    #[inline(always)]
-    fn row(&self, row: usize) -> *const T {
-        let row = self.first + row;
-        self.left.wrapping_add(match self.starts {
-            Starts::Even(stride) => row * stride,
-            Starts::Listed(starts) => starts[row],
-        })
-    }
-}
-
-/// # Safety
-/// The instructions are there; pointers and numbers of `work` belong together.
-unsafe fn do_work<T: Term>(isa: Isa, work: &Work<'_, T>) {
-    // SAFETY: as the caller says.
-    unsafe {
-        match isa {
-            #[cfg(target_arch = "x86_64")]
-            Isa::Avx512Bf16 => avx512_bf16::<T::Avx512Bf16>(work),
-            #[cfg(target_arch = "x86_64")]
-            Isa::Avx512 => avx512::<T::Avx512>(work),
-            #[cfg(target_arch = "x86_64")]
-            Isa::Avx2 => avx2::<T::Avx2>(work),
-            _ => all_tiles::<T::Portable>(work),
-        }
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq,avx512bf16")]
-unsafe fn avx512_bf16<S: Simd>(work: &Work<'_, S::Term>) {
-    // SAFETY: as the caller says.
-    unsafe { all_tiles::<S>(work) }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq")]
-unsafe fn avx512<S: Simd>(work: &Work<'_, S::Term>) {
-    // SAFETY: as the caller says.
-    unsafe { all_tiles::<S>(work) }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma")]
-unsafe fn avx2<S: Simd>(work: &Work<'_, S::Term>) {
-    // SAFETY: as the caller says.
-    unsafe { all_tiles::<S>(work) }
-}
-
-#[inline(always)]
-unsafe fn all_tiles<S: Simd>(work: &Work<'_, S::Term>) {
-    if work.panel.width == ROW_PANELS * 2 * S::LANES {
-        let panels = std::array::from_fn(|panel| work.right.wrapping_add(panel * work.terms * 2 * S::LANES));
-        // SAFETY: as the caller says: the panels lie one behind the other.
-        return unsafe { row_of_panels::<S>(work.row(0), work.runs, panels, work.begin, work.end, work.output) };
-    }
-    let mut row = 0;
-    while row < work.rows {
-        let rows = (work.rows - row).min(S::ROWS);
-        // SAFETY: as the caller says.
-        unsafe { of_height!(S, rows, tile_of(work, row)) };
-        row += rows;
-    }
-}
-
-#[inline(always)]
-unsafe fn tile_of<S: Simd, const M: usize>(work: &Work<'_, S::Term>, row: usize) {
-    let left = InPlace::<S::Term, M>(std::array::from_fn(|index| work.row(row + index)));
-    let down = row * work.output.stride;
-    // SAFETY: as the caller says.
-    unsafe {
-        panel_tile::<S, _, M>(
-            left,
-            work.runs,
-            work.right,
-            work.panel,
-            work.begin,
-            work.end.down(down),
-            work.output.down(down),
-        );
-    }
 }

@@ -73,30 +73,20 @@ impl LeftTile<f32> for Packed {
     }
 }
 
-/// The place of a tile in the output, row-major.
+/// The place of a tile in the output.
 #[derive(Clone, Copy)]
-pub(crate) struct Output {
+pub(crate) struct Output<const M: usize> {
     pub(crate) data: *mut f32,
-    pub(crate) stride: usize,
+    /// Where each row begins.
+    pub(crate) rows: [usize; M],
 }
 
-impl Output {
-    /// So many numbers further on.
-    pub(crate) fn down(self, numbers: usize) -> Self {
-        Self {
-            data: self.data.wrapping_add(numbers),
-            ..self
-        }
-    }
-}
-
-impl End {
-    /// For an output so many numbers further on.
-    pub(crate) fn down(self, numbers: usize) -> Self {
-        match self {
-            Self::Gated(by) => Self::Gated(by.wrapping_add(numbers)),
-            end => end,
-        }
+impl<const M: usize> Output<M> {
+    /// Rows that begin `stride` numbers apart.
+    #[inline(always)]
+    pub(crate) fn even(data: *mut f32, stride: usize) -> Self {
+        let rows = std::array::from_fn(|row| row * stride);
+        Self { data, rows }
     }
 }
 
@@ -137,7 +127,7 @@ pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile<S::Term>, const M: usize>(
     panel: Panel,
     begin: Begin,
     end: End,
-    output: Output,
+    output: Output<M>,
 ) {
     // SAFETY: as the caller says; where columns are missing, the tile works on memory of its own, which has them all.
     unsafe {
@@ -149,22 +139,19 @@ pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile<S::Term>, const M: usize>(
             };
         }
         let mut whole = [0.0; MOST_ROWS * MOST_COLUMNS];
-        let aside = Output {
-            data: whole.as_mut_ptr(),
-            stride: panel.width,
-        };
-        let row_of = |row: usize| output.data.add(row * output.stride);
+        let aside = Output::<M>::even(whole.as_mut_ptr(), panel.width);
+        let row_of = |row: usize| output.data.add(output.rows[row]);
         let begin = match begin {
             Begin::Zero => Begin::Zero,
             Begin::Output => {
                 for row in 0..M {
-                    aside.data.add(row * aside.stride).copy_from(row_of(row), panel.columns);
+                    aside.data.add(aside.rows[row]).copy_from(row_of(row), panel.columns);
                 }
                 Begin::Output
             }
             Begin::Bias(bias) => {
                 for row in 0..M {
-                    aside.data.add(row * aside.stride).copy_from(bias, panel.columns);
+                    aside.data.add(aside.rows[row]).copy_from(bias, panel.columns);
                 }
                 Begin::Output
             }
@@ -180,9 +167,9 @@ pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile<S::Term>, const M: usize>(
         }
         for row in 0..M {
             for column in 0..panel.columns {
-                let open = gate.is_none_or(|by| *by.add(row * output.stride + column) > 0.0);
+                let open = gate.is_none_or(|by| *by.add(output.rows[row] + column) > 0.0);
                 *row_of(row).add(column) = if open {
-                    *aside.data.add(row * aside.stride + column)
+                    *aside.data.add(aside.rows[row] + column)
                 } else {
                     0.0
                 };
@@ -204,7 +191,7 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N
     panel_width: usize,
     begin: Begin,
     end: End,
-    output: Output,
+    output: Output<M>,
 ) {
     // SAFETY: all pointers are offset within what the caller vouches for.
     unsafe {
@@ -215,7 +202,7 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N
             Begin::Output => {
                 for (row, sums) in sums.iter_mut().enumerate() {
                     for (part, sum) in sums.iter_mut().enumerate() {
-                        *sum = S::load(output.data.add(row * output.stride + part * S::LANES));
+                        *sum = S::load(output.data.add(output.rows[row] + part * S::LANES));
                     }
                 }
             }
@@ -268,9 +255,9 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N
 
 /// Asks for the memory that a tile ends at, when it begins: it has often left the nearer caches, and would be waited for when the sums are done.
 #[inline(always)]
-unsafe fn fetch_ahead<S: Simd, const M: usize, const N: usize>(end: End, output: Output) {
+unsafe fn fetch_ahead<S: Simd, const M: usize, const N: usize>(end: End, output: Output<M>) {
     let places = |from: *const f32| {
-        (0..M * N).map(move |place| from.wrapping_add(place / N * output.stride + place % N * S::LANES))
+        (0..M * N).map(move |place| from.wrapping_add(output.rows[place / N] + place % N * S::LANES))
     };
     // SAFETY: any address may be asked for.
     unsafe {
@@ -293,12 +280,12 @@ unsafe fn fetch_ahead<S: Simd, const M: usize, const N: usize>(end: End, output:
 #[inline(always)]
 unsafe fn put<S: Simd, const M: usize, const N: usize>(
     sums: [[S::Vector; N]; M],
-    output: Output,
+    output: Output<M>,
     finish: impl Fn(S::Vector, usize) -> S::Vector,
 ) {
     for (row, sums) in sums.into_iter().enumerate() {
         for (part, sum) in sums.into_iter().enumerate() {
-            let at = row * output.stride + part * S::LANES;
+            let at = output.rows[row] + part * S::LANES;
             // SAFETY: the output has a place for each sum.
             unsafe { S::store(output.data.add(at), finish(sum, at)) };
         }
@@ -316,7 +303,7 @@ pub(crate) unsafe fn row_of_panels<S: Simd>(
     panels: [*const S::Term; ROW_PANELS],
     begin: Begin,
     end: End,
-    output: Output,
+    output: *mut f32,
 ) {
     // SAFETY: all pointers are offset within what the caller vouches for.
     unsafe {
@@ -326,7 +313,7 @@ pub(crate) unsafe fn row_of_panels<S: Simd>(
             for (part, sum) in sums.iter_mut().enumerate() {
                 match begin {
                     Begin::Zero => {}
-                    Begin::Output => *sum = S::load(output.data.add(at(panel, part))),
+                    Begin::Output => *sum = S::load(output.add(at(panel, part))),
                     Begin::Bias(bias) => *sum = S::load(bias.add(at(panel, part))),
                 }
             }
@@ -350,7 +337,7 @@ pub(crate) unsafe fn row_of_panels<S: Simd>(
                     End::Rectified => S::rectified(*sum),
                     End::Gated(by) => S::gated(*sum, S::load(by.add(at(panel, part)))),
                 };
-                S::store(output.data.add(at(panel, part)), value);
+                S::store(output.add(at(panel, part)), value);
             }
         }
     }

@@ -7,13 +7,15 @@ use std::ops::Range;
 
 use crate::isa::Isa;
 use crate::panels::Panels;
-use crate::product::{Finish, Rows, Start, product_part};
-use crate::tile::Run;
+use crate::product::{Finish, Rows, Start, product};
+use crate::tile::{Begin, End, Run};
+use crate::work::{Starts, TERMS_AT_ONCE, Work, do_work};
 
 /// All positions of a kernel on an image `[height, width, channels]`, row by row, without padding.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Windows {
     image_len: usize,
+    channels: usize,
     positions: [usize; 2],
     /// Where in the image each window begins.
     starts: Vec<usize>,
@@ -46,6 +48,7 @@ impl Windows {
             .collect();
         Self {
             image_len: size[0] * row_len,
+            channels,
             positions,
             starts,
             runs,
@@ -87,13 +90,20 @@ impl Windows {
         let mut pieces = Vec::new();
         let mut number = numbers.start;
         while number < numbers.end {
-            let (row, inside) = (number / row_len, number % row_len);
-            let len = (row_len - inside).min(numbers.end - number);
-            let offset = self.runs[row].offset + inside;
-            pieces.push(Run { offset, len });
+            let len = (row_len - number % row_len).min(numbers.end - number);
+            pieces.push(Run {
+                offset: self.offset(number),
+                len,
+            });
             number += len;
         }
         pieces
+    }
+
+    /// Where a number of a window lies, from where it begins.
+    fn offset(&self, number: usize) -> usize {
+        let row_len = self.runs[0].len;
+        self.runs[number / row_len].offset + number % row_len
     }
 
     /// Adds each window's numbers, `[windows, window_len]`, to where they belong in `image`. The adjoint of looking through the windows.
@@ -101,29 +111,25 @@ impl Windows {
     /// # Panics
     /// When a length is off.
     pub fn add_back(&self, isa: Isa, numbers: &[f32], image: &mut [f32]) {
-        self.add_back_part(isa, 0..self.count(), 0..self.runs.len(), numbers, image);
+        self.add_back_part(isa, 0..self.count(), numbers, image);
     }
 
-    /// Adds some rows of some windows back, kernel row by kernel row. `numbers`: `[windows, kernel rows, numbers of a row]`.
-    fn add_back_part(
-        &self,
-        isa: Isa,
-        windows: Range<usize>,
-        kernel_rows: Range<usize>,
-        numbers: &[f32],
-        image: &mut [f32],
-    ) {
-        let (starts, runs) = (&self.starts[windows], &self.runs[kernel_rows]);
-        let (run_len, len) = (self.runs[0].len, self.runs[0].len * runs.len());
+    /// Adds some windows back, kernel row by kernel row.
+    fn add_back_part(&self, isa: Isa, windows: Range<usize>, numbers: &[f32], image: &mut [f32]) {
+        let starts = &self.starts[windows];
         assert_eq!(image.len(), self.image_len, "the image the windows are of");
-        assert_eq!(numbers.len(), starts.len() * len, "all numbers of each window");
+        assert_eq!(
+            numbers.len(),
+            starts.len() * self.window_len,
+            "all numbers of each window"
+        );
         isa.vectorised(
             #[inline(always)]
             || {
-                for (row, run) in runs.iter().enumerate() {
-                    for (&start, numbers) in starts.iter().zip(numbers.chunks_exact(len)) {
-                        let from = &numbers[row * run_len..][..run_len];
-                        let into = &mut image[start + run.offset..][..run_len];
+                for (row, run) in self.runs.iter().enumerate() {
+                    for (&start, numbers) in starts.iter().zip(numbers.chunks_exact(self.window_len)) {
+                        let from = &numbers[row * run.len..][..run.len];
+                        let into = &mut image[start + run.offset..][..run.len];
                         for (into, from) in into.iter_mut().zip(from) {
                             *into += from;
                         }
@@ -134,39 +140,78 @@ impl Windows {
     }
 }
 
-/// Rows that a product is not done for fewer of, if there are: every panel that is fetched meets them all.
-const ROWS_AT_ONCE: usize = 24;
-
 /// Adds `rows · panels`, a window's numbers for each row, to where they belong in `image`: a transposed convolution forward, and what flows back through a
 /// convolution. `scratch` is used again from call to call.
 ///
-/// Some rows of windows and one row of the kernel at a time, so that what is made is added back from the first cache. An element of the image is the sum of what
-/// it held, and then of its windows, by rows of windows in groups, by rows of the kernel, and from left to right.
+/// Where channels are a multiple of 32, an element of the image is what it held, to which each window's terms are added, one fused multiply-add each; windows in the order
+/// of where they see the element, by rows of the kernel and from left to right. With other channels it is the sum of what it held and of its windows' sums, by rows of windows
+/// in groups, by rows of the kernel, and by windows from left to right.
 ///
 /// # Panics
 /// When lengths do not belong together.
 pub fn spread(rows: &[f32], panels: &Panels, windows: &Windows, scratch: &mut Vec<f32>, image: &mut [f32]) {
-    let (terms, kernel_rows, run_len) = (panels.terms(), windows.runs.len(), windows.runs[0].len);
+    let terms = panels.terms();
     assert_eq!(
         panels.columns(),
         windows.window_len,
         "a column for each number of a window"
     );
     assert_eq!(rows.len(), windows.count() * terms, "a row for each window");
+    assert_eq!(image.len(), windows.image_len, "the image the windows are of");
+    if windows.channels.is_multiple_of(WHOLE_PANELS) {
+        spread_in_place(rows, panels, windows, image);
+    } else {
+        spread_by_scratch(rows, panels, windows, scratch, image);
+    }
+}
+
+/// So many columns are whole panels of all instruction sets: what is added in which order depends on none of them.
+const WHOLE_PANELS: usize = 32;
+
+/// Panel by panel, sums that begin with what is in the image. A panel's columns are channels of one place in the kernel, where no two windows see the same pixel.
+fn spread_in_place(rows: &[f32], panels: &Panels, windows: &Windows, image: &mut [f32]) {
+    let (isa, terms) = (panels.isa(), panels.terms());
+    assert!(isa.is_available(), "{isa} is not to be had here");
+    for panel in panels.groups(1) {
+        for first_term in (0..terms).step_by(TERMS_AT_ONCE) {
+            let work = Work {
+                left: rows.as_ptr(),
+                starts: Starts::Even(terms),
+                first: 0,
+                rows: windows.count(),
+                runs: &[Run {
+                    offset: first_term,
+                    len: (terms - first_term).min(TERMS_AT_ONCE),
+                }],
+                right: panels.at(panel, first_term),
+                terms,
+                panel,
+                begin: Begin::Output,
+                end: End::Plain,
+                output: image[windows.offset(panel.first)..].as_mut_ptr(),
+                output_starts: Starts::Listed(windows.starts()),
+            };
+            // SAFETY: the instructions are there; there is a row of all terms for each window, and each window, seen from the panel's first number on, has the
+            // panel's columns side by side, apart from those of the others.
+            unsafe { do_work(isa, &work) };
+        }
+    }
+}
+
+/// Rows that a product is not done for fewer of, if there are: every panel that is fetched meets them all.
+const ROWS_AT_ONCE: usize = 24;
+
+/// Some rows of windows at a time, so that what is made is added back from a near cache.
+fn spread_by_scratch(rows: &[f32], panels: &Panels, windows: &Windows, scratch: &mut Vec<f32>, image: &mut [f32]) {
+    let terms = panels.terms();
     let across = windows.positions[1];
     let at_once = across * ROWS_AT_ONCE.div_ceil(across);
-    // By a rule that no instruction set changes: 32 columns are whole panels of all.
-    let kernel_rows_at_once = if run_len.is_multiple_of(32) { 1 } else { kernel_rows };
     for first in (0..windows.count()).step_by(at_once) {
         let some = first..(first + at_once).min(windows.count());
         let left = Rows::Matrix(&rows[some.start * terms..some.end * terms]);
-        for row in (0..kernel_rows).step_by(kernel_rows_at_once) {
-            let runs = row..row + kernel_rows_at_once;
-            let columns = runs.start * run_len..runs.end * run_len;
-            scratch.resize(some.len() * columns.len(), 0.0);
-            product_part(left, panels, columns, Start::Zero, Finish::Plain, scratch);
-            windows.add_back_part(panels.isa(), some.clone(), runs, scratch, image);
-        }
+        scratch.resize(some.len() * windows.window_len, 0.0);
+        product(left, panels, Start::Zero, Finish::Plain, scratch);
+        windows.add_back_part(panels.isa(), some, scratch, image);
     }
 }
 
