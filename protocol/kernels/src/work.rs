@@ -37,12 +37,15 @@ pub(crate) struct Work<'a, T> {
 }
 
 impl Starts<'_> {
-    /// Where this row begins.
+    /// Where each row of a tile begins. Asked once for all of them: row by row, a tile of few terms would take longer to begin than to do.
     #[inline(always)]
-    fn of(self, row: usize) -> usize {
+    fn of<const M: usize>(self, row: usize) -> [usize; M] {
         match self {
-            Self::Even(stride) => row * stride,
-            Self::Listed(starts) => starts[row],
+            Self::Even(stride) => std::array::from_fn(|index| (row + index) * stride),
+            Self::Listed(starts) => {
+                let starts = &starts[row..row + M];
+                std::array::from_fn(|index| starts[index])
+            }
         }
     }
 }
@@ -88,7 +91,8 @@ unsafe fn avx2<S: Simd>(work: &Work<'_, S::Term>) {
 #[inline(always)]
 unsafe fn all_tiles<S: Simd>(work: &Work<'_, S::Term>) {
     if work.panel.width == ROW_PANELS * 2 * S::LANES {
-        let left = work.left.wrapping_add(work.starts.of(work.first));
+        let [start] = work.starts.of(work.first);
+        let left = work.left.wrapping_add(start);
         let panels = std::array::from_fn(|panel| work.right.wrapping_add(panel * work.terms * 2 * S::LANES));
         // SAFETY: as the caller says: the panels lie one behind the other.
         return unsafe { row_of_panels::<S>(left, work.runs, panels, work.begin, work.end, work.output) };
@@ -104,10 +108,10 @@ unsafe fn all_tiles<S: Simd>(work: &Work<'_, S::Term>) {
 
 #[inline(always)]
 unsafe fn tile_of<S: Simd, const M: usize>(work: &Work<'_, S::Term>, row: usize) {
-    let left = std::array::from_fn(|index| work.left.wrapping_add(work.starts.of(row + index)));
+    let left = work.starts.of(row).map(|start| work.left.wrapping_add(start));
     let output = Output {
         data: work.output,
-        rows: std::array::from_fn(|index| work.output_starts.of(row + index)),
+        rows: work.output_starts.of(row),
     };
     // SAFETY: as the caller says.
     unsafe {
