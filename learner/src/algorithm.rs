@@ -1,7 +1,7 @@
 //! What a learning algorithm is to the rest of the learner, and which there are.
 //!
 //! It gets minibatches and noise, and gives a policy; replay, transport and actors know nothing of it. Another one is a module beside [`crate::sac`] and [`crate::td3`] that
-//! implements [`Algorithm`], a section of its settings, and an entry in each of two lists: [`new`] here, and the names in `skein_protocol::config::AlgorithmName`.
+//! implements [`Algorithm`], a section of settings that `skein_protocol::config` reads and checks, and a name in `AlgorithmName`, after which the compiler says where else it is asked for.
 
 use std::fmt;
 

@@ -2,7 +2,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use skein_protocol::config::Config;
+use skein_protocol::config::{Config, ConfirmOn};
 use skein_protocol::ids::{Attempt, Epoch, FlightId, PolicyVersion, RunId};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
@@ -65,6 +65,18 @@ pub fn evaluation(
     (0..).zip(flown).map(ticket).collect()
 }
 
+/// Tickets of the flights that confirm a candidate for the best snapshot. Generated courses are the same ones for each candidate, and none of them is trained on.
+pub fn confirmation(config: &Config, run: RunId, number: u64, version: PolicyVersion) -> Vec<Ticket> {
+    let mut tickets = evaluation(config, run, number, version, 0..1, config.evaluation.confirm_flights);
+    if config.evaluation.confirm_on == ConfirmOn::Generated {
+        for (flight, ticket) in (0..).zip(&mut tickets) {
+            let course = derive(config.run.seed, Purpose::ConfirmationCourse, flight);
+            ticket.course = CourseChoice::Generated(course);
+        }
+    }
+    tickets
+}
+
 /// The level training flight `flight` starts at: the next one every few flights, then the first again (paper, section 4.2).
 fn start_level(config: &Config, flight: u64) -> u8 {
     let step = flight / config.learning.flights_per_level;
@@ -83,6 +95,8 @@ fn training_course(config: &Config, flight: u64) -> CourseChoice {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::HashSet;
+
     use super::*;
 
     fn tickets(config: &Config) -> Vec<Ticket> {
@@ -139,6 +153,26 @@ mod tests {
             "{} distinct courses",
             generated.len()
         );
+    }
+
+    #[test]
+    fn candidates_are_confirmed_on_the_same_generated_courses_which_are_not_trained_on() {
+        let mut config = Config::default();
+        (config.run.flights, config.courses.generated_share) = (1000, 1.0);
+        let courses = |tickets: &[Ticket]| tickets.iter().map(|ticket| ticket.course).collect::<HashSet<_>>();
+        let confirmed = |config: &Config, number| confirmation(config, RunId(1), number, PolicyVersion(number));
+        assert_eq!(
+            courses(&confirmed(&config, 0)),
+            HashSet::from([CourseChoice::Evaluation(0)])
+        );
+        config.evaluation.confirm_on = ConfirmOn::Generated;
+        let (first, second) = (confirmed(&config, 0), confirmed(&config, 1));
+        assert_eq!(courses(&first).len(), 20);
+        assert_eq!(courses(&first), courses(&second));
+        assert!(courses(&tickets(&config)).is_disjoint(&courses(&first)));
+        let is_flown_to_be_judged =
+            |ticket: &Ticket| ticket.exploration == Exploration::Mode && ticket.start_level == 1;
+        assert!(first.iter().all(is_flown_to_be_judged));
     }
 
     #[test]

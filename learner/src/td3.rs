@@ -1,7 +1,7 @@
 //! Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477): what the paper compares SAC with (its Fig. 11).
 //!
 //! On the kernels alone, forward and backward written out. The critic is that of [`crate::sac`], one network with two estimates, so that the algorithms differ in nothing else; its
-//! second estimate only ever steadies the targets.
+//! second estimate only ever steadies the targets. tanh is the C library's, as in actors: bits are equal on any processor with the same one.
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::ACTION;
@@ -79,7 +79,7 @@ impl Td3 {
         }
     }
 
-    /// The critic's gradient: both estimates are drawn towards r + γ (1 - terminated) min Q̄(s', a'), where a' is what the target policy would do, give or take some noise (eq. 14).
+    /// The critic's gradient: both estimates are drawn towards r + γ (1 - terminated) min Q̄(s', a'), where a' is what the target policy would do, give or take some noise (eq. 14 and 15).
     /// Returns the loss and the mean of the smaller estimate.
     fn criticise(&mut self, team: &mut Team, columns: Columns<'_>, noise: &mut Noise) -> [f32; 2] {
         let Td3Section {
@@ -132,7 +132,7 @@ impl Td3 {
         [loss, value].map(|sum| (sum / *rows as f64) as f32)
     }
 
-    /// The policy's gradient: it moves towards actions of which the first estimate thinks more (eq. 15 of algorithm 1). Returns its loss, -Q₁.
+    /// The policy's gradient: it moves towards actions of which the first estimate thinks more (the deterministic policy gradient, eq. 1). Returns its loss, -Q₁.
     fn improve(&mut self, team: &mut Team, columns: Columns<'_>) -> f32 {
         let Work {
             rows,
@@ -196,7 +196,7 @@ impl Td3 {
 impl Algorithm for Td3 {
     /// One step of the critic, and each `td3.policy_period` of them one of the policy and of both targets. Both gradients are taken before anything moves.
     ///
-    /// Source: arXiv:1802.09477, algorithm 1.
+    /// Source: arXiv:1802.09477, algorithm 1, which moves the critic before it takes the policy's gradient.
     fn update(
         &mut self,
         team: &mut Team,

@@ -35,6 +35,8 @@ pub enum Purpose {
     Disturbances = 12,
     /// Resamples of the runs of an experiment, from which the uncertainty of what it found is told; the seed is their number, the index that of the resamples.
     Bootstrap = 13,
+    /// Generated course on which a candidate for the best snapshot is confirmed; indexed by flight.
+    ConfirmationCourse = 14,
 }
 
 /// The seed for the `index`-th use of `purpose` in the run seeded `run_seed`.

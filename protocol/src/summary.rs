@@ -86,13 +86,13 @@ impl Summary {
 /// When a policy first did what it was trained for: what is behind it then.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Trained {
-    /// Share R of walls passed in its evaluation flights, without exploration noise, from the start of level 1.
+    /// Share R of walls passed in its evaluation flights, without exploration noise, from the start of level 1, where `evaluation.confirm_on` says.
     pub rate: f64,
     /// Training flights committed.
     pub flights: u64,
     /// Environment steps of training flights.
     pub steps: u64,
-    /// SAC updates.
+    /// Policy updates.
     pub updates: u64,
     /// Seconds from the learner's start until its evaluation flights were flown, over all lives; what a death undid is not counted.
     pub wall_secs: f64,

@@ -65,6 +65,10 @@ pub async fn run(
     board: &mut Board,
 ) -> Session {
     let mut session = Session::default();
+    // Of an earlier session that was killed before it came to it.
+    for run in plan.runs.iter().filter(|run| run.state == State::Complete) {
+        remove_checkpoints(run, board);
+    }
     let incomplete = |(_, run): &(usize, &PlannedRun)| run.state != State::Complete;
     let mut waiting: VecDeque<_> = plan.runs.iter().enumerate().filter(incomplete).collect();
     let mut under_way: Vec<UnderWay<'_>> = Vec::new();
@@ -198,11 +202,7 @@ impl Session {
         });
         let wall = Clock(result.summary.wall_secs);
         board.say(&format!("{} is complete after {wall}{flown}", run.name));
-        // Nothing goes on from a run that is complete, and its checkpoints are most of what it takes of the disk.
-        let checkpoints = run.directory.checkpoints();
-        if let Err(error) = fs::remove_dir_all(&checkpoints) {
-            board.say(&format!("{} cannot be removed: {error}", checkpoints.display()));
-        }
+        remove_checkpoints(run, board);
         State::Complete
     }
 
@@ -268,4 +268,15 @@ fn flown(run: &RunDirectory) -> Vec<f64> {
         .map_while(|row: Result<FlightRow, _>| row.ok())
         .map(|flight| f64::from(flight.walls_passed))
         .collect()
+}
+
+/// Nothing goes on from a run that is complete, and its checkpoints are most of what it takes of the disk.
+fn remove_checkpoints(run: &PlannedRun, board: &Board) {
+    let checkpoints = run.directory.checkpoints();
+    match fs::remove_dir_all(&checkpoints) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            board.say(&format!("{} cannot be removed: {error}", checkpoints.display()));
+        }
+        _ => {}
+    }
 }

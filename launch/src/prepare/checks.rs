@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use skein_protocol::config::{Config, culprit};
+use skein_protocol::config::{Config, ConfirmOn, culprit};
 use skein_simulator::course::Course;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 
@@ -34,12 +34,15 @@ pub(crate) fn check(config_file: &Path, config: &Config, actors: usize) -> Resul
         &Course::load(&config.courses.training)?,
         &config.courses.training.display(),
     )?;
-    if config.courses.generated_share > 0.0 {
+    let trains_on_generated = config.courses.generated_share > 0.0;
+    if trains_on_generated || config.evaluation.confirm_on == ConfirmOn::Generated {
         let course = Course::generate(0, &settings.generator).map_err(|source| PrepareError::Ranges {
             config: in_file(),
             source,
         })?;
-        check_level_count(config_file, config, &course, &"[simulator.generator] wall_x_m")?;
+        if trains_on_generated {
+            check_level_count(config_file, config, &course, &"[simulator.generator] wall_x_m")?;
+        }
     }
     let records = config.transport.max_records_per_flight;
     if settings.max_steps as usize + 1 > records {

@@ -120,6 +120,12 @@ fn what_cannot_run_is_refused_before_anything_is_created() {
             vec!["learning.levels = 5", "2 walls", "wall_x_m"],
         ),
         (
+            "[simulator.generator]\nclearance_m = [3.4, 3.4]",
+            "evaluation.confirm_on=generated",
+            1,
+            vec!["generator", "nothing drawn for wall 1"],
+        ),
+        (
             "[transport]\nmax_actors = 3",
             "",
             4,

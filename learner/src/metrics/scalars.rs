@@ -39,7 +39,7 @@ scalars! {
     WindowWallsPassed => "window/walls_passed",
     /// Half the squared distance of the two Q outputs from their target. It rises with the returns: watch it for explosions, not for progress.
     CriticLoss => "policy/critic_loss",
-    /// What the policy minimises: minus Q, and with SAC temperature times log-probability.
+    /// SAC: what the policy minimises, temperature times log-probability minus Q.
     PolicyLoss => "policy/policy_loss",
     /// SAC: weight of the entropy against the reward, the price of certainty.
     Temperature => "policy/temperature",

@@ -7,6 +7,7 @@ use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::Phase;
 use skein_protocol::stages::Stage;
 use skein_protocol::summary::Trained;
+use skein_protocol::ticket::Ticket;
 
 use super::{Training, TrainingError};
 use crate::best::{is_better, is_candidate};
@@ -26,7 +27,9 @@ impl Training<'_> {
             return Ok(());
         }
         let version = self.progress.version();
-        let flown = self.evaluate(version, 0..1, self.config.evaluation.confirm_flights, Keep::Latents)?;
+        let (run, number) = (self.identity.run, self.progress.evaluations);
+        let tickets = curriculum::confirmation(self.config, run, number, version);
+        let flown = self.evaluate(tickets, Keep::Latents)?;
         pass(FaultPoint::LearnerCandidateFlown);
         self.note_trained(&flown);
         let passed: f64 = flown.iter().map(|flight| f64::from(flight.walls_passed)).sum();
@@ -96,16 +99,21 @@ impl Training<'_> {
     }
 
     /// Flies `flights` evaluation flights on each of `courses` with a published snapshot.
-    fn evaluate(
+    fn evaluate_on(
         &mut self,
         version: PolicyVersion,
         courses: Range<u32>,
         flights: u64,
         keep: Keep,
     ) -> Result<Vec<CommittedFlight>, TrainingError> {
-        self.timer.lap(Stage::OtherTraining, 0);
         let (run, number) = (self.identity.run, self.progress.evaluations);
         let tickets = curriculum::evaluation(self.config, run, number, version, courses, flights);
+        self.evaluate(tickets, keep)
+    }
+
+    /// Flies `tickets` of the next evaluation, whose snapshot is published.
+    fn evaluate(&mut self, tickets: Vec<Ticket>, keep: Keep) -> Result<Vec<CommittedFlight>, TrainingError> {
+        self.timer.lap(Stage::OtherTraining, 0);
         let total = tickets.len() as u64;
         self.reporter.update(|progress| {
             progress.phase = Phase::Evaluating;
@@ -138,8 +146,8 @@ impl Training<'_> {
         let sha256 = best.sha256();
         self.reception.publish(best)?;
         let courses = self.config.courses.evaluation.len() as u32;
-        let flown = self.evaluate(version, 0..courses, self.config.evaluation.flights, Keep::Latents)?;
-        let pictured = self.evaluate(version, 0..1, 1, Keep::Depth)?;
+        let flown = self.evaluate_on(version, 0..courses, self.config.evaluation.flights, Keep::Latents)?;
+        let pictured = self.evaluate_on(version, 0..1, 1, Keep::Depth)?;
         pass(FaultPoint::LearnerEvaluated);
         Ok(self.disk.with_room(self.directory.root(), || {
             evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;

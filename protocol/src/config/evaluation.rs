@@ -10,8 +10,11 @@ use super::{Invalid, require};
 pub struct EvaluationSection {
     /// Flights per course in the final evaluation (paper: 100). Default 100.
     pub flights: u64,
-    /// Flights that confirm a candidate for the best snapshot, on the first evaluation course. Default 20.
+    /// Flights that confirm a candidate for the best snapshot. Default 20.
     pub confirm_flights: u64,
+    /// Where they are flown: on the `first-course` of the evaluation, or each on a `generated` course of its own that no training flight flies. A policy that shall fly courses it
+    /// has never seen must not be chosen on one of them. Default `first-course`.
+    pub confirm_on: ConfirmOn,
     /// Training flights over which walls passed are averaged to find candidates (paper: 50). Default 50.
     pub window_flights: u64,
     /// Training flights between two candidates at least. Default 50.
@@ -23,11 +26,22 @@ pub struct EvaluationSection {
     pub trained_rate: f64,
 }
 
+/// Where candidates for the best snapshot are confirmed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ConfirmOn {
+    /// On the first evaluation course.
+    FirstCourse,
+    /// On generated courses, the same ones for each candidate.
+    Generated,
+}
+
 impl Default for EvaluationSection {
     fn default() -> Self {
         Self {
             flights: 100,
             confirm_flights: 20,
+            confirm_on: ConfirmOn::FirstCourse,
             window_flights: 50,
             every_flights: 50,
             candidate_margin: 0.3,

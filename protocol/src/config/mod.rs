@@ -18,7 +18,7 @@ mod vae;
 use serde::{Deserialize, Serialize};
 
 pub use courses::CoursesSection;
-pub use evaluation::EvaluationSection;
+pub use evaluation::{ConfirmOn, EvaluationSection};
 pub use file::{ConfigError, culprit};
 pub use learning::{AlgorithmName, LearningSection, Observation};
 pub use replay::{ReplaySection, SuccessRule};

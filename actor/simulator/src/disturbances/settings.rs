@@ -66,7 +66,7 @@ pub struct DepthNoiseSettings {
     /// Distance between the two lenses, metres, 0 to 0.5. Default 0.05. What the left one sees and the right one does not has no reading: a band at the left edge of every
     /// near object, and of the image, focal length · baseline · (1 / near − 1 / far) pixels wide. 0: no such bands. Source: Intel, D400 series data sheet, "invalid depth band".
     pub baseline_m: f32,
-    /// Share of the image without a reading in patches anywhere (reflections, no texture), 0 to 0.5. Default 0.02: twice what the data sheet allows on a white wall, a fill
+    /// Share of the image without a reading in patches anywhere (reflections, no texture), 0 to 0.5; patches that overlap count each. Default 0.02: twice what the data sheet allows on a white wall, a fill
     /// rate of 99 %.
     pub dropout_share: f32,
     /// Largest side of such a patch, pixels, 1 to 64; each side is drawn uniformly from 1 up. Default 12: a tenth of the image's width.
@@ -214,6 +214,13 @@ impl DepthNoiseSettings {
             if !value.is_finite() {
                 return Err(fault(key, value, "is no number".to_owned()));
             }
+        }
+        if !(range_m > 0.0 && range_m.is_finite()) {
+            return Err(fault(
+                "depth.model",
+                range_m,
+                "cannot be drawn up to such a camera.range_m: give it a positive number".to_owned(),
+            ));
         }
         // The vertex of the parabola, where σ is least or greatest, and both ends.
         let vertex_m = (-self.sigma_linear / (2.0 * self.sigma_quadratic_per_m)).clamp(0.0, range_m);

@@ -2,6 +2,7 @@
 
 use comfy_table::presets::ASCII_MARKDOWN;
 use comfy_table::{CellAlignment, Table};
+use skein_protocol::config::ConfirmOn;
 use skein_protocol::evaluation::CourseEvaluation;
 use skein_protocol::summary::Trained;
 
@@ -169,8 +170,13 @@ impl Findings<'_> {
         ];
         Titled {
             title: format!(
-                "Learning: when R ≥ {} was first confirmed in {} evaluation flights on the first course, and the last {window} training flights",
-                evaluation.trained_rate, evaluation.confirm_flights
+                "Learning: when R ≥ {} was first confirmed in {} evaluation flights on {}, and the last {window} training flights",
+                evaluation.trained_rate,
+                evaluation.confirm_flights,
+                match evaluation.confirm_on {
+                    ConfirmOn::FirstCourse => "the first course",
+                    ConfirmOn::Generated => "generated courses",
+                }
             ),
             table: grid(header.to_vec(), rows, 1),
         }
