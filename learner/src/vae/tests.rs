@@ -50,7 +50,8 @@ fn state(vae: &mut NativeVae) -> Vec<crate::state::NamedTensor> {
 
 #[test]
 fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_precision() {
-    for (seed, count) in [(1, 1), (2, 3), (3, 16)] {
+    // Seeds of which no sum lies so near nought that rounding takes it across: a ReLU would then be open in one and shut in the other.
+    for (seed, count) in [(1, 1), (2, 3), (4, 16), (5, 16)] {
         let images = synthetic_bytes(count, seed);
         let mut noise = vec![0.0; count * LATENT];
         Noise::new(seed).fill_normal(&mut noise);
