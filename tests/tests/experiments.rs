@@ -132,6 +132,7 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
         "| one part |",
         "`replay.success_share=0.0`",
         "non_rectangular",
+        "| hit wall 1, 2, … | hit the corridor | timed out |",
         "2 seeds an arm",
     ] {
         assert!(text.contains(part), "`{part}` is missing in\n{text}");

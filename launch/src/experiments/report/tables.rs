@@ -79,7 +79,6 @@ impl Findings<'_> {
                     of_course.iter().map(|course| count(course)).sum::<u64>()
                 };
                 let flights = sum(&|course| course.flights);
-                let completed = flights - sum(&|course| course.collided + course.timed_out);
                 let walls = of_course
                     .iter()
                     .map(|course| course.walls_passed.len())
@@ -88,6 +87,10 @@ impl Findings<'_> {
                 let passed: Vec<u64> = (0..walls)
                     .map(|wall| sum(&|course| course.walls_passed.get(wall).copied().unwrap_or(0)))
                     .collect();
+                let hit: Vec<String> = (0..passed.len())
+                    .map(|at| sum(&|course| course.failures.get(at).map_or(0, |there| there.hit_wall)).to_string())
+                    .collect();
+                let hit_corridor = |course: &CourseEvaluation| course.failures.iter().map(|at| at.hit_corridor).sum();
                 let share = |part: u64, whole: u64| match whole {
                     0 => NOTHING.to_owned(),
                     whole => format!("{:.3}", part as f64 / whole as f64),
@@ -101,8 +104,9 @@ impl Findings<'_> {
                     flights.to_string(),
                     r,
                     by_wall.join(" "),
-                    completed.to_string(),
-                    sum(&|course| course.collided).to_string(),
+                    sum(&|course| course.reached_end).to_string(),
+                    hit.join(" "),
+                    sum(&hit_corridor).to_string(),
                     sum(&|course| course.timed_out).to_string(),
                 ]);
             }
@@ -115,7 +119,8 @@ impl Findings<'_> {
             "R",
             "passed wall 1, 2, …",
             "completed",
-            "collided",
+            "hit wall 1, 2, …",
+            "hit the corridor",
             "timed out",
         ];
         Titled {
