@@ -29,18 +29,19 @@ enum Surface {
     Plain { last: Option<(Instant, Phase)> },
 }
 
+/// A progress bar, if standard error is a terminal.
+pub(crate) fn bar_on_terminal() -> Option<ProgressBar> {
+    std::io::stderr().is_terminal().then(|| {
+        let style =
+            ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}").expect("the template is well-formed");
+        ProgressBar::new(0).with_style(style.progress_chars("━━─"))
+    })
+}
+
 impl Display {
     /// A display for this process's standard error.
     pub fn new() -> Self {
-        let surface = if std::io::stderr().is_terminal() {
-            let bar = ProgressBar::new(0);
-            let style =
-                ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}").expect("the template is well-formed");
-            bar.set_style(style.progress_chars("━━─"));
-            Surface::Terminal(bar)
-        } else {
-            Surface::Plain { last: None }
-        };
+        let surface = bar_on_terminal().map_or(Surface::Plain { last: None }, Surface::Terminal);
         Self {
             surface,
             pace: Pace::default(),

@@ -11,6 +11,7 @@ pub mod display;
 pub mod experiments;
 pub mod inspection;
 pub mod interrupts;
+pub mod orphans;
 pub mod prepare;
 pub mod reports;
 pub mod resume;

@@ -13,6 +13,7 @@ pub mod oracle;
 pub mod reward;
 pub mod simulator;
 pub mod suite;
+mod text;
 pub mod vehicle;
 
 mod world;

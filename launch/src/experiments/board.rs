@@ -4,12 +4,11 @@
 //! to a file beside its directory.
 
 use std::fmt::Write;
-use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 
-use crate::display::Clock;
+use crate::display::{Clock, bar_on_terminal};
 
 /// Between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
@@ -58,15 +57,7 @@ enum Surface {
 impl Board {
     /// A board on this process's standard error.
     pub fn new() -> Self {
-        let surface = if std::io::stderr().is_terminal() {
-            let bar = ProgressBar::new(0);
-            let style =
-                ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}").expect("the template is well-formed");
-            bar.set_style(style.progress_chars("━━─"));
-            Surface::Terminal(bar)
-        } else {
-            Surface::Plain { last: None }
-        };
+        let surface = bar_on_terminal().map_or(Surface::Plain { last: None }, Surface::Terminal);
         Self {
             surface,
             started: Instant::now(),

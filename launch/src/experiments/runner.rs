@@ -10,7 +10,7 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
-use rustix::process::{Pid, Signal, getppid, kill_process, set_parent_process_death_signal};
+use rustix::process::{Pid, Signal, kill_process};
 use skein_protocol::run::RunDirectory;
 use tokio::process::{Child, Command};
 use tokio::sync::mpsc;
@@ -22,6 +22,7 @@ use super::plan::{ACTORS, Plan, PlannedRun, State};
 use crate::display::Clock;
 use crate::experiments::results::RunResult;
 use crate::interrupts::INTERRUPTED;
+use crate::orphans::signal_when_orphaned;
 use crate::reports::curves::{FlightRow, trailing_mean};
 use crate::supervisor::log_tail::log_tail;
 
@@ -137,18 +138,7 @@ fn start(experiment: &Experiment, run: &PlannedRun, skein: &Path) -> io::Result<
         .stdout(log.try_clone()?)
         .stderr(log)
         .process_group(0);
-    let this = rustix::process::getpid();
-    // SAFETY: between fork and exec only system calls are made (prctl, getppid), no memory is allocated and no lock is taken.
-    unsafe {
-        command.pre_exec(move || {
-            set_parent_process_death_signal(Some(Signal::INT))?;
-            if getppid() == Some(this) {
-                Ok(())
-            } else {
-                Err(io::ErrorKind::NotConnected.into())
-            }
-        });
-    }
+    signal_when_orphaned(command.as_std_mut(), Signal::INT);
     command.spawn()
 }
 

@@ -8,10 +8,12 @@ use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
-use rustix::process::{Pid, Signal, getppid, kill_process, set_parent_process_death_signal};
+use rustix::process::{Pid, Signal, kill_process};
 use skein_protocol::failure::{EXIT_LEARNER_GONE, EXIT_START_AGAIN};
 use tokio::process::{Child, Command};
 use tokio::sync::watch;
+
+use crate::orphans::signal_when_orphaned;
 
 /// Status of a Rust program that panicked.
 const PANICKED: i32 = 101;
@@ -120,7 +122,6 @@ impl Launch<'_> {
             Output::Piped => Stdio::piped(),
             Output::Logged => log.try_clone()?.into(),
         };
-        let supervisor = rustix::process::getpid();
         let mut command = Command::new(self.program);
         command
             .args(&self.arguments)
@@ -135,18 +136,7 @@ impl Launch<'_> {
             .stderr(log)
             .process_group(0)
             .kill_on_drop(true);
-        // SAFETY: between fork and exec only system calls are made (prctl, getppid), no memory is allocated and no lock is taken.
-        unsafe {
-            command.pre_exec(move || {
-                set_parent_process_death_signal(Some(Signal::KILL))?;
-                // The supervisor may have died before the call above: then no signal would ever come.
-                if getppid() == Some(supervisor) {
-                    Ok(())
-                } else {
-                    Err(io::ErrorKind::NotConnected.into())
-                }
-            });
-        }
+        signal_when_orphaned(command.as_std_mut(), Signal::KILL);
         command.spawn()
     }
 }

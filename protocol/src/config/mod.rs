@@ -145,6 +145,41 @@ pub struct Invalid {
     pub problem: String,
 }
 
+/// The check of a network's width.
+pub(crate) fn require_width(key: &'static str, width: usize) -> Result<(), Invalid> {
+    require((1..=4096).contains(&width), key, width, "is outside 1..=4096")
+}
+
+/// The check of a minibatch of transitions.
+pub(crate) fn require_batch_size(key: &'static str, transitions: usize) -> Result<(), Invalid> {
+    require(
+        (1..=65_536).contains(&transitions),
+        key,
+        transitions,
+        "is outside 1..=65536",
+    )
+}
+
+/// The check of Adam's step size.
+pub(crate) fn require_learning_rate(key: &'static str, rate: f64) -> Result<(), Invalid> {
+    require(
+        rate > 0.0 && rate <= 1.0,
+        key,
+        rate,
+        "is outside (0, 1]: the optimizer would stand still or blow up",
+    )
+}
+
+/// The check of γ.
+pub(crate) fn require_discount(key: &'static str, discount: f64) -> Result<(), Invalid> {
+    require(
+        (0.0..1.0).contains(&discount),
+        key,
+        discount,
+        "is outside [0, 1): returns would not converge",
+    )
+}
+
 /// One check of one key: reads as "require that … holds".
 #[allow(clippy::fn_params_excessive_bools)] // the condition is the point
 pub(crate) fn require(

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require};
+use super::{Invalid, require, require_batch_size, require_discount, require_learning_rate, require_width};
 use crate::ACTION;
 
 /// `[sac]`: soft actor-critic with learned temperature (arXiv:1812.05905). The paper leaves every value here open.
@@ -47,36 +47,16 @@ impl Default for SacSection {
 
 impl SacSection {
     pub(super) fn validate(&self) -> Result<(), Invalid> {
-        require(
-            (1..=4096).contains(&self.hidden_width),
-            "sac.hidden_width",
-            self.hidden_width,
-            "is outside 1..=4096",
-        )?;
-        require(
-            (1..=65_536).contains(&self.batch_size),
-            "sac.batch_size",
-            self.batch_size,
-            "is outside 1..=65536",
-        )?;
+        require_width("sac.hidden_width", self.hidden_width)?;
+        require_batch_size("sac.batch_size", self.batch_size)?;
         for (key, rate) in [
             ("sac.policy_learning_rate", self.policy_learning_rate),
             ("sac.critic_learning_rate", self.critic_learning_rate),
             ("sac.temperature_learning_rate", self.temperature_learning_rate),
         ] {
-            require(
-                rate > 0.0 && rate <= 1.0,
-                key,
-                rate,
-                "is outside (0, 1]: the optimizer would stand still or blow up",
-            )?;
+            require_learning_rate(key, rate)?;
         }
-        require(
-            (0.0..1.0).contains(&self.discount),
-            "sac.discount",
-            self.discount,
-            "is outside [0, 1): returns would not converge",
-        )?;
+        require_discount("sac.discount", self.discount)?;
         require(
             self.target_rate > 0.0 && self.target_rate <= 1.0,
             "sac.target_rate",

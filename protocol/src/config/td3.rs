@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require};
+use super::{Invalid, require, require_batch_size, require_discount, require_learning_rate, require_width};
 
 /// `[td3]`: twin delayed deep deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477), which the paper compares with (its Fig. 11) without saying any of these
 /// values. Networks are as wide and minibatches as large as in `[sac]` by default, so that the two are compared on equal terms.
@@ -50,35 +50,15 @@ impl Default for Td3Section {
 
 impl Td3Section {
     pub(super) fn validate(&self) -> Result<(), Invalid> {
-        require(
-            (1..=4096).contains(&self.hidden_width),
-            "td3.hidden_width",
-            self.hidden_width,
-            "is outside 1..=4096",
-        )?;
-        require(
-            (1..=65_536).contains(&self.batch_size),
-            "td3.batch_size",
-            self.batch_size,
-            "is outside 1..=65536",
-        )?;
+        require_width("td3.hidden_width", self.hidden_width)?;
+        require_batch_size("td3.batch_size", self.batch_size)?;
         for (key, rate) in [
             ("td3.policy_learning_rate", self.policy_learning_rate),
             ("td3.critic_learning_rate", self.critic_learning_rate),
         ] {
-            require(
-                rate > 0.0 && rate <= 1.0,
-                key,
-                rate,
-                "is outside (0, 1]: the optimizer would stand still or blow up",
-            )?;
+            require_learning_rate(key, rate)?;
         }
-        require(
-            (0.0..1.0).contains(&self.discount),
-            "td3.discount",
-            self.discount,
-            "is outside [0, 1): returns would not converge",
-        )?;
+        require_discount("td3.discount", self.discount)?;
         require(
             self.target_rate > 0.0 && self.target_rate <= 1.0,
             "td3.target_rate",

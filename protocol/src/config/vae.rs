@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require};
+use super::{Invalid, require, require_learning_rate};
 
 /// `[vae]`: the variational auto-encoder (paper, section 3.3), trained together with the agent and then frozen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -64,12 +64,7 @@ impl VaeSection {
             self.batch_size,
             "is outside 1..=4096",
         )?;
-        require(
-            self.learning_rate > 0.0 && self.learning_rate <= 1.0,
-            "vae.learning_rate",
-            self.learning_rate,
-            "is outside (0, 1]: the optimizer would stand still or blow up",
-        )?;
+        require_learning_rate("vae.learning_rate", self.learning_rate)?;
         require(
             self.kl_weight >= 0.0 && self.kl_weight.is_finite(),
             "vae.kl_weight",

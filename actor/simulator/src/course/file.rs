@@ -9,6 +9,7 @@ use serde::Deserialize;
 
 use super::whereabouts::Whereabouts;
 use super::{Corridor, Course, CourseFault, CourseLayout, Opening, Place, Shape, StartArea, WallLabel, WallLayout};
+use crate::text::read_text;
 
 /// Why a course file cannot be flown.
 #[derive(Debug, thiserror::Error)]
@@ -43,9 +44,6 @@ pub enum CourseError {
     },
 }
 
-/// Bytes of a course file: far more than the walls of any course take.
-const LONGEST: u64 = 1 << 20;
-
 impl Course {
     /// Reads a course file.
     ///
@@ -53,19 +51,10 @@ impl Course {
     /// [`CourseError`] names the file, the wall and the key, and says what to change.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, CourseError> {
         let path = path.as_ref();
-        let is_a_file = std::fs::metadata(path).and_then(|about| match about.is_file() && about.len() <= LONGEST {
-            true => Ok(()),
-            // Of a pipe or a device, the end might never come.
-            false => Err(std::io::Error::other(format!(
-                "is no text file of at most {LONGEST} bytes"
-            ))),
-        });
-        let text = is_a_file
-            .and_then(|()| std::fs::read_to_string(path))
-            .map_err(|source| CourseError::Read {
-                path: path.to_owned(),
-                source,
-            })?;
+        let text = read_text(path).map_err(|source| CourseError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
         Self::parse(&text, path)
     }
 

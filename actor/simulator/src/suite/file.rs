@@ -8,15 +8,13 @@ use serde::Deserialize;
 use super::{EntryCourses, MOST_WALLS_TO_ORDER, Suite, SuiteEntry, orders};
 use crate::course::{Course, CourseError, CourseFault, GeneratorRanges, RangesError};
 use crate::disturbances::DisturbanceSettings;
+use crate::text::read_text;
 
 /// Most flights of an entry.
 const MOST_FLIGHTS: u64 = 1_000_000;
 
 /// Most entries of a suite.
 const MOST_ENTRIES: usize = 64;
-
-/// Bytes of a suite file: far more than its entries take.
-const LONGEST: u64 = 1 << 20;
 
 /// Why a suite cannot be flown.
 #[derive(Debug, thiserror::Error)]
@@ -133,19 +131,10 @@ impl Suite {
     /// [`SuiteError`] names the file, the entry and the key, and says what to change.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, SuiteError> {
         let path = path.as_ref();
-        let is_a_file = std::fs::metadata(path).and_then(|about| match about.is_file() && about.len() <= LONGEST {
-            true => Ok(()),
-            // Of a pipe or a device, the end might never come.
-            false => Err(std::io::Error::other(format!(
-                "is no text file of at most {LONGEST} bytes"
-            ))),
-        });
-        let text = is_a_file
-            .and_then(|()| std::fs::read_to_string(path))
-            .map_err(|source| SuiteError::Read {
-                path: path.to_owned(),
-                source,
-            })?;
+        let text = read_text(path).map_err(|source| SuiteError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
         Self::parse(&text, path)
     }
 

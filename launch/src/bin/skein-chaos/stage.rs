@@ -2,15 +2,15 @@
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom};
-use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
-use rustix::process::{Signal, getppid, set_parent_process_death_signal};
+use rustix::process::Signal;
 use skein_launch::inspection::{Process, processes_of};
+use skein_launch::orphans::signal_when_orphaned;
 use skein_protocol::fault::FAULTS;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::summary::{Ending, Summary};
@@ -115,18 +115,7 @@ impl Stage {
 
     /// Starts `command` so that it is interrupted when this program dies: nobody would end a run that is made to last for ever.
     fn spawn(&self, mut command: Command) -> Result<Child> {
-        let this = rustix::process::getpid();
-        // SAFETY: between fork and exec only system calls are made (prctl, getppid), no memory is allocated and no lock is taken.
-        unsafe {
-            command.pre_exec(move || {
-                set_parent_process_death_signal(Some(Signal::INT))?;
-                if getppid() == Some(this) {
-                    Ok(())
-                } else {
-                    Err(io::ErrorKind::NotConnected.into())
-                }
-            });
-        }
+        signal_when_orphaned(&mut command, Signal::INT);
         command
             .spawn()
             .with_context(|| format!("cannot start {}", self.skein.display()))
