@@ -132,6 +132,12 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_level_of_an_even_number_of_windows_lies_between_the_middle_two() {
+        // Risen at 0.9 of 10, with the second value; of 11 it would be with the last but one, and too few would follow.
+        assert!(volatility(&[0.0, 9.2, 9.2, 9.2, 9.0, 9.0, 11.0, 11.0], 1).is_some());
+    }
+
+    #[test]
     fn the_interquartile_mean_is_that_of_the_textbook() {
         let of = |values: &[f64]| interquartile_mean(values).unwrap();
         // Twelve values: the middle six, 5 to 8.
