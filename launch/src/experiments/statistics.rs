@@ -112,12 +112,11 @@ pub fn volatility(values: &[f64], window: usize) -> Option<f64> {
         .map(|chunk| chunk.iter().sum::<f64>() / chunk.len() as f64)
         .collect();
     let mut second_half = averages[averages.len() / 2..].to_vec();
+    if second_half.is_empty() {
+        return None;
+    }
     second_half.sort_by(f64::total_cmp);
-    let (below, above) = (
-        second_half.get(second_half.len().saturating_sub(1) / 2)?,
-        second_half[second_half.len() / 2],
-    );
-    let level = (below + above) / 2.0;
+    let level = quantile(&second_half, 0.5);
     let risen = averages.iter().position(|average| *average >= RISEN * level)?;
     let after = &averages[risen..];
     if after.len() < 3 {
