@@ -307,7 +307,7 @@ impl Means {
         self.count += 1;
     }
 
-    /// None if there was no update.
+    /// Nothing if there was no update.
     fn finish(self) -> Vec<(Scalar, f64)> {
         let mean = |(scalar, sum)| (scalar, sum / self.count as f64);
         self.sums.into_iter().map(mean).collect()

@@ -59,9 +59,13 @@ pub struct Config {
 impl Config {
     /// Transitions in a minibatch of the algorithm that is used.
     pub fn batch_size(&self) -> usize {
+        self.batch_size_by_key().1
+    }
+
+    fn batch_size_by_key(&self) -> (&'static str, usize) {
         match self.learning.algorithm {
-            AlgorithmName::Sac => self.sac.batch_size,
-            AlgorithmName::Td3 => self.td3.batch_size,
+            AlgorithmName::Sac => ("sac.batch_size", self.sac.batch_size),
+            AlgorithmName::Td3 => ("td3.batch_size", self.td3.batch_size),
         }
     }
 
@@ -105,14 +109,11 @@ impl Config {
                 self.learning.algorithm
             ),
         )?;
-        let batch_size = match self.learning.algorithm {
-            AlgorithmName::Sac => "sac.batch_size",
-            AlgorithmName::Td3 => "td3.batch_size",
-        };
+        let (key, batch_size) = self.batch_size_by_key();
         require(
-            self.batch_size() <= self.learning.warmup_steps.max(1),
+            batch_size <= self.learning.warmup_steps.max(1),
+            key,
             batch_size,
-            self.batch_size(),
             format!(
                 "exceeds learning.warmup_steps = {}: the first update would have too few transitions to draw from",
                 self.learning.warmup_steps
