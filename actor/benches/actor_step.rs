@@ -18,6 +18,7 @@ use skein_actor::agent::Agent;
 use skein_actor::courses::{Courses, Simulators};
 use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
 use skein_inference::{Network, Scratch};
+use skein_protocol::config::View;
 use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
@@ -46,7 +47,7 @@ fn main() {
         ACTOR,
         INCARNATION,
         Simulators::new(Arc::clone(&courses)),
-        Agent::new(OBSERVATION),
+        Agent::new(View::present(OBSERVATION)),
     );
     let flights: Vec<Vec<TransitionRecord>> = tickets
         .iter()

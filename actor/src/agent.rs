@@ -2,7 +2,7 @@
 
 use rand::{Rng, RngExt};
 use skein_protocol::ACTION;
-use skein_protocol::config::Observation;
+use skein_protocol::config::View;
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Exploration;
 use skein_protocol::transition::TransitionRecord;
@@ -13,18 +13,21 @@ use skein_inference::{Network, Scratch};
 /// Working memory of one thread that looks and acts.
 #[derive(Debug)]
 pub struct Agent {
-    observation: Observation,
-    /// The policy's input, `[Observation::len]`.
+    view: View,
+    /// What was seen of each moment of the flight so far, `[steps, Observation::len]`.
+    moments: Vec<f32>,
+    /// The policy's input, `[View::len]`.
     observed: Vec<f32>,
     scratch: Scratch,
 }
 
 impl Agent {
-    /// An agent whose policy sees `observation`.
-    pub fn new(observation: Observation) -> Self {
+    /// An agent whose policy sees `view`.
+    pub fn new(view: View) -> Self {
         Self {
-            observation,
-            observed: vec![0.0; observation.len()],
+            moments: Vec::new(),
+            observed: vec![0.0; view.len()],
+            view,
             scratch: Scratch::default(),
         }
     }
@@ -47,7 +50,8 @@ impl Agent {
         lap(Stage::Encoder);
     }
 
-    /// Chooses an action on the observation in `record`, each command in [-1, 1]. `noise` is drawn from unless the policy's mode is asked for.
+    /// Chooses an action on the observation in `record`, each command in [-1, 1]. `noise` is drawn from unless the policy's mode is asked for. Called for each step
+    /// of a flight, in order; the record of step 0 begins another one.
     pub fn act(
         &mut self,
         exploration: Exploration,
@@ -56,13 +60,18 @@ impl Agent {
         previous_action: &[f32; ACTION],
         noise: &mut impl Rng,
     ) -> [f32; ACTION] {
+        self.remember(record, previous_action);
         let mut distribution = || {
             let Self {
-                observation,
+                view,
+                moments,
                 observed,
                 scratch,
             } = self;
-            observation.write(&record.latent, &record.velocity_mps, previous_action, observed);
+            let len = view.moment.len();
+            view.write(record.step as usize, observed, |step, into| {
+                into.copy_from_slice(&moments[step * len..][..len]);
+            });
             network.distribution(observed, scratch)
         };
         match exploration {
@@ -70,5 +79,13 @@ impl Agent {
             Exploration::Sample => distribution().sample(noise),
             Exploration::Mode => distribution().mode(),
         }
+    }
+
+    /// Keeps what is seen of the moment in `record`, and forgets what was seen in an earlier flight.
+    fn remember(&mut self, record: &TransitionRecord, previous_action: &[f32; ACTION]) {
+        let moment = self.view.moment;
+        let first = record.step as usize * moment.len();
+        self.moments.resize(first + moment.len(), 0.0);
+        moment.write(&record.latent, &record.velocity_mps, previous_action, &mut self.moments[first..]);
     }
 }

@@ -78,7 +78,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
         actor,
         Incarnation(0),
         simulators,
-        Agent::new(config.learning.observation),
+        Agent::new(config.learning.view()),
     );
     Ok(Service::new(&identity, &config, actor, &told_to_end).serve(&mut pilot)?)
 }

@@ -106,7 +106,7 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
         ActorId(0),
         Incarnation(0),
         simulators,
-        Agent::new(config.learning.observation),
+        Agent::new(config.learning.view()),
     );
     let mut watched = Watched {
         ports: &actor,

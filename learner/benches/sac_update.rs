@@ -41,7 +41,7 @@ fn update(criterion: &mut Criterion, engine: Engine, width: usize, columns: Colu
         hidden_width: width,
         ..SacSection::default()
     };
-    let mut sac = Sac::new(&section, OBSERVATION, 1, engine, Device::Cpu);
+    let mut sac = Sac::new(&section, OBSERVATION.len(), 1, engine, Device::Cpu);
     let (mut team, mut noise) = (Team::new(1), Noise::new(2));
     let mut group = criterion.benchmark_group("sac_update");
     group.throughput(Throughput::Elements(operations(columns.rewards.len(), width)));

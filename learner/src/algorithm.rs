@@ -52,7 +52,7 @@ pub trait Algorithm: Stateful + fmt::Debug {
 
 /// The algorithm that a configuration names, untrained. `device`: libtorch's; the native engine is on the processor.
 pub fn new(config: &Config, device: Device) -> Box<dyn Algorithm> {
-    let (observation, seed) = (config.learning.observation, config.run.seed);
+    let (observation, seed) = (config.learning.view().len(), config.run.seed);
     match config.learning.algorithm {
         AlgorithmName::Sac => Box::new(Sac::new(&config.sac, observation, seed, config.run.engine(), device)),
         AlgorithmName::Td3 => Box::new(Td3::new(&config.td3, observation, seed, Isa::best())),

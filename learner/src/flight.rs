@@ -3,7 +3,7 @@
 //! The assembler builds it from streamed records; metrics and replay take it from there. It holds one observation more than it has steps: the closing
 //! observation is what the last step led to, and a flight that was cut off bootstraps from it.
 
-use skein_protocol::config::Observation;
+use skein_protocol::config::{Observation, View};
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
@@ -92,7 +92,11 @@ impl CommittedFlight {
     }
 
     /// Writes the observation vector at the beginning of `step`, at most T, as the actor saw it.
-    pub fn write_observation(&self, step: usize, observation: Observation, into: &mut [f32]) {
+    pub fn write_observation(&self, step: usize, view: &View, into: &mut [f32]) {
+        view.write(step, into, |step, into| self.write_moment(step, view.moment, into));
+    }
+
+    fn write_moment(&self, step: usize, observation: Observation, into: &mut [f32]) {
         let previous_action = step
             .checked_sub(1)
             .map_or([0.0; ACTION], |previous| self.actions[previous]);
@@ -214,11 +218,30 @@ mod tests {
     fn the_previous_action_is_zero_at_take_off_and_then_the_one_before() {
         let flight = samples::flight(3, 5, Outcome::Collided);
         let mut vector = [f32::NAN; LATENT + 2 + ACTION];
-        flight.write_observation(0, Observation::LatentVelocityAction, &mut vector);
+        let view = View::present(Observation::LatentVelocityAction);
+        flight.write_observation(0, &view, &mut vector);
         assert_eq!(vector[LATENT + 2..], [0.0, 0.0]);
-        flight.write_observation(5, Observation::LatentVelocityAction, &mut vector);
+        flight.write_observation(5, &view, &mut vector);
         assert_eq!(vector[LATENT + 2..], flight.actions[4]);
         assert_eq!(vector[..LATENT], flight.observations[5].latent);
+    }
+
+    #[test]
+    fn earlier_moments_follow_the_present_and_before_take_off_all_was_as_at_take_off() {
+        let flight = samples::flight(3, 5, Outcome::Collided);
+        let view = View {
+            moment: Observation::LatentVelocity,
+            history_steps: vec![1, 4],
+        };
+        let mut vector = vec![f32::NAN; view.len()];
+        for (step, moments) in [(5, [5, 4, 1]), (2, [2, 1, 0]), (0, [0, 0, 0])] {
+            flight.write_observation(step, &view, &mut vector);
+            for (seen, moment) in vector.chunks_exact(LATENT + 2).zip(moments) {
+                let observation = &flight.observations[moment];
+                assert_eq!(seen[..LATENT], observation.latent);
+                assert_eq!(seen[LATENT..], observation.velocity_mps[1..]);
+            }
+        }
     }
 
     #[test]

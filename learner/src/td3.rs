@@ -5,7 +5,7 @@
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::ACTION;
-use skein_protocol::config::{Observation, Td3Section};
+use skein_protocol::config::Td3Section;
 use skein_protocol::seeds::{Purpose, derive};
 
 use crate::algorithm::{Algorithm, Columns};
@@ -56,8 +56,8 @@ struct Work {
 
 impl Td3 {
     /// Untrained networks whose parameters depend on the run's seed alone.
-    pub fn new(section: &Td3Section, observation: Observation, run_seed: u64, isa: Isa) -> Self {
-        let (inputs, width) = (observation.len() as i64, section.hidden_width as i64);
+    pub fn new(section: &Td3Section, observation: usize, run_seed: u64, isa: Isa) -> Self {
+        let (inputs, width) = (observation as i64, section.hidden_width as i64);
         let mut policy_layout = Layout::default();
         Policy::with_outputs(&mut policy_layout, inputs, width, ACTION as i64);
         let policy = policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
@@ -66,7 +66,7 @@ impl Td3 {
         let critic = critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
         Self {
             isa,
-            observation: observation.len(),
+            observation,
             settings: section.clone(),
             policy: Dense::new(isa, &policy_layout),
             policy_layout,

@@ -100,7 +100,7 @@ impl SnapshotLayout {
                 PolicyHead::Noisy(config.td3.exploration_noise as f32),
             ),
         };
-        Self::with_head(config.learning.observation.len(), hidden_width, head)
+        Self::with_head(config.learning.view().len(), hidden_width, head)
     }
 
     /// What the policy's numbers are.
@@ -197,7 +197,7 @@ pub enum SnapshotError {
         expected: u64,
     },
     /// Its tensors are not ours.
-    #[error("the snapshot has another layout: learning.algorithm, its hidden_width or learning.observation differ")]
+    #[error("the snapshot has another layout: learning.algorithm, its hidden_width, learning.observation or learning.history_steps differ")]
     OtherLayout,
     /// Its length is not that of the layout.
     #[error("the snapshot has {found} bytes where its layout has {expected}")]

@@ -2,7 +2,7 @@ use std::sync::Arc;
 
 use bytemuck::Zeroable;
 use skein_protocol::IMAGE_PIXELS;
-use skein_protocol::config::{Observation, Precision};
+use skein_protocol::config::{Observation, Precision, View};
 use skein_protocol::ids::{Attempt, FlightId, RunId};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::ticket::{CourseChoice, Exploration};
@@ -72,7 +72,7 @@ fn pilot(simulator: &str) -> Pilot {
         ACTOR,
         LIFE,
         Simulators::new(Arc::new(courses)),
-        Agent::new(Observation::LatentVelocityAction),
+        Agent::new(View::present(Observation::LatentVelocityAction)),
     )
 }
 
@@ -259,6 +259,37 @@ fn a_disturbed_flight_is_a_function_of_its_ticket_too() {
     let (_, calm) = flown(&mut pilot(""), &ticket(Exploration::Sample, 1));
     assert_eq!(first.sent[0].position_m, calm.sent[0].position_m);
     assert_ne!(first.sent[0].depth, calm.sent[0].depth);
+}
+
+#[test]
+fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
+    const MOMENT: Observation = Observation::LatentVelocityAction;
+    let view = View {
+        moment: MOMENT,
+        history_steps: vec![1, 3],
+    };
+    let layout = SnapshotLayout::new(view.len(), 16);
+    let network = Network::new(&random_snapshot(&layout, NETWORK.0), &layout, Precision::F32);
+    let courses = Arc::new(Courses::of_run(&config("")).unwrap());
+    let mut pilot = Pilot::new(ACTOR, LIFE, Simulators::new(courses), Agent::new(view.clone()));
+    // The second flight must not remember the first.
+    for seed in [1, 2] {
+        let mut tape = Tape::default();
+        pilot.fly(&ticket(Exploration::Mode, seed), &network, &mut tape).unwrap();
+        let steps = tape.sent.len() - 1;
+        assert!(steps > 4, "too short to have a history");
+        for (step, record) in tape.sent[..steps].iter().enumerate() {
+            let mut observed = Vec::new();
+            for moment in [step, step.max(1) - 1, step.max(3) - 3] {
+                let seen = &tape.sent[moment];
+                observed.extend(seen.latent);
+                observed.extend(&seen.velocity_mps[1..]);
+                observed.extend(if moment == 0 { [0.0; 2] } else { tape.sent[moment - 1].action });
+            }
+            let action = network.distribution(&observed, &mut Scratch::default()).mode();
+            assert_eq!(record.action, action, "step {step}");
+        }
+    }
 }
 
 #[test]

@@ -101,8 +101,17 @@ impl ImageStore {
         Ok(latents)
     }
 
+    /// The number of the first image of the flight that image `number` is of.
+    pub(super) fn first_of_flight(&self, number: u32) -> u32 {
+        self.first[self.flight_of(number)]
+    }
+
+    fn flight_of(&self, number: u32) -> usize {
+        self.first.partition_point(|&first| first <= number) - 1
+    }
+
     fn image(&self, number: u32) -> &[u8] {
-        let flight = self.first.partition_point(|&first| first <= number) - 1;
+        let flight = self.flight_of(number);
         let start = (number - self.first[flight]) as usize * IMAGE_PIXELS;
         &self.flights[flight][start..start + IMAGE_PIXELS]
     }

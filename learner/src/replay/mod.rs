@@ -17,7 +17,7 @@ mod tests;
 use std::sync::Arc;
 
 use rand::{Rng, RngExt};
-use skein_protocol::config::{Config, Observation, ReplaySection};
+use skein_protocol::config::{Config, ReplaySection, View};
 use skein_protocol::ids::FlightId;
 use skein_protocol::{ACTION, LATENT};
 
@@ -33,7 +33,7 @@ use success::success_steps;
 #[derive(Debug)]
 pub struct Replay {
     section: ReplaySection,
-    observation: Observation,
+    view: View,
     success: Ring,
     regular: Ring,
     /// Until the VAE is frozen.
@@ -90,13 +90,14 @@ pub enum InsertError {
 impl Replay {
     /// An empty buffer for the run configured by `config`.
     pub fn new(config: &Config) -> Self {
+        let view = config.learning.view();
         let layout = RowLayout {
-            observation: config.learning.observation.len(),
+            observation: view.len(),
         };
         let (success, regular) = capacities(&config.replay);
         Self {
             section: config.replay.clone(),
-            observation: config.learning.observation,
+            view,
             success: Ring::new(success, layout),
             regular: Ring::new(regular, layout),
             images: Some(ImageStore::new(image_limit(config))),
@@ -136,8 +137,8 @@ impl Replay {
         for (step, &success) in success.iter().enumerate() {
             let ring = if success { &mut self.success } else { &mut self.regular };
             let row = ring.claim(first_image.map(|first| first + step as u32));
-            flight.write_observation(step, self.observation, row.observation);
-            flight.write_observation(step + 1, self.observation, row.next_observation);
+            flight.write_observation(step, &self.view, row.observation);
+            flight.write_observation(step + 1, &self.view, row.next_observation);
             row.action.copy_from_slice(&flight.actions[step]);
             *row.reward = flight.rewards[step];
             *row.terminated = f32::from(step == last && flight.terminated());
@@ -185,8 +186,9 @@ impl Replay {
     ) -> Result<(), E> {
         if let Some(images) = &self.images {
             let latents = images.encode(chunk, encode)?;
-            self.success.replace_latents(&latents);
-            self.regular.replace_latents(&latents);
+            for ring in [&mut self.success, &mut self.regular] {
+                ring.replace_latents(&self.view, &latents, |image| images.first_of_flight(image));
+            }
             self.images = None;
         }
         Ok(())

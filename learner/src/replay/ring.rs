@@ -3,6 +3,7 @@
 //! A row holds everything an update needs of one transition, observation and next observation both, contiguous in memory: a minibatch of random rows
 //! is bound by cache misses, and a row costs one run of neighbouring cache lines where a table per quantity would cost one miss each.
 
+use skein_protocol::config::View;
 use skein_protocol::{ACTION, LATENT};
 
 /// Where the parts of a row lie: `[observation | next observation | action | reward | terminated]`, all `f32`.
@@ -153,13 +154,25 @@ impl Ring {
         &self.images
     }
 
-    /// Rewrites the latent part of both observations of every row from `latents`, one per image, and forgets the images.
-    pub(super) fn replace_latents(&mut self, latents: &[[f32; LATENT]]) {
+    /// Rewrites the latent parts of both observations of every row from `latents`, one per image, and forgets the images. `first_of_flight` says which image
+    /// of an image's flight was the first.
+    pub(super) fn replace_latents(
+        &mut self,
+        view: &View,
+        latents: &[[f32; LATENT]],
+        first_of_flight: impl Fn(u32) -> u32,
+    ) {
         let images = std::mem::take(&mut self.images);
         for (values, image) in self.rows.chunks_exact_mut(self.layout.width()).zip(images) {
             let row = self.layout.row_mut(values);
-            row.observation[..LATENT].copy_from_slice(&latents[image as usize]);
-            row.next_observation[..LATENT].copy_from_slice(&latents[image as usize + 1]);
+            let first = first_of_flight(image);
+            let (flight, step) = (&latents[first as usize..], (image - first) as usize);
+            for (step, observation) in [(step, row.observation), (step + 1, row.next_observation)] {
+                let moments = observation.chunks_exact_mut(view.moment.len());
+                for (moment, seen) in view.moments(step).zip(moments) {
+                    seen[..LATENT].copy_from_slice(&flight[moment]);
+                }
+            }
         }
     }
 }

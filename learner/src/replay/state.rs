@@ -47,7 +47,7 @@ impl Replay {
     pub fn restore(config: &Config, state: ReplayState) -> Result<Self, RestoreError> {
         let mut replay = Self::new(config);
         let layout = super::RowLayout {
-            observation: config.learning.observation.len(),
+            observation: config.learning.view().len(),
         };
         let (success, regular) = capacities(&config.replay);
         let fail = |part| move |problem| RestoreError { part, problem };

@@ -9,7 +9,7 @@ mod native;
 mod torch;
 
 use skein_kernels::{Isa, Team};
-use skein_protocol::config::{Engine, Observation, SacSection};
+use skein_protocol::config::{Engine, SacSection};
 use tch::Device;
 
 use crate::algorithm::{Algorithm, Columns};
@@ -48,7 +48,7 @@ pub struct SacMetrics {
 
 impl Sac {
     /// Untrained networks whose parameters depend on the run's seed alone. `device`: libtorch's; the native engine is on the processor.
-    pub fn new(section: &SacSection, observation: Observation, run_seed: u64, engine: Engine, device: Device) -> Self {
+    pub fn new(section: &SacSection, observation: usize, run_seed: u64, engine: Engine, device: Device) -> Self {
         match engine {
             Engine::Native => {
                 let sac = NativeSac::new(section, observation, run_seed, Isa::best());

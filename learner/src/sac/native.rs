@@ -7,7 +7,7 @@ mod sample;
 
 use skein_kernels::{Isa, Team, exp};
 use skein_protocol::ACTION;
-use skein_protocol::config::{Observation, SacSection};
+use skein_protocol::config::SacSection;
 use skein_protocol::seeds::{Purpose, derive};
 
 use self::sample::Sample;
@@ -79,8 +79,8 @@ impl NativeSac {
     ///
     /// # Panics
     /// At the first update, when this machine lacks the instructions.
-    pub fn new(section: &SacSection, observation: Observation, run_seed: u64, isa: Isa) -> Self {
-        let (inputs, width) = (observation.len() as i64, section.hidden_width as i64);
+    pub fn new(section: &SacSection, observation: usize, run_seed: u64, isa: Isa) -> Self {
+        let (inputs, width) = (observation as i64, section.hidden_width as i64);
         let mut policy_layout = Layout::default();
         Policy::describe(&mut policy_layout, inputs, width);
         let policy_values = policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
@@ -90,7 +90,7 @@ impl NativeSac {
         let log_temperature = vec![section.initial_temperature.ln() as f32];
         Self {
             isa,
-            observation: observation.len(),
+            observation,
             policy: Dense::new(isa, &policy_layout),
             policy_layout,
             policy_parameters: Learned::new(policy_values, section.policy_learning_rate),

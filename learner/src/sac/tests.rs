@@ -24,7 +24,7 @@ fn small() -> SacSection {
 
 fn sac(engine: Engine, section: &SacSection, seed: u64) -> Sac {
     crate::device::use_threads(1);
-    Sac::new(section, OBSERVATION, seed, engine, Device::Cpu)
+    Sac::new(section, OBSERVATION.len(), seed, engine, Device::Cpu)
 }
 
 fn update(sac: &mut Sac, transitions: &Transitions, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {

@@ -1,7 +1,7 @@
 //! One SAC update with libtorch's automatic gradients, in reading order: the reference, and the way to a CUDA device.
 
 use skein_protocol::ACTION;
-use skein_protocol::config::{Observation, SacSection};
+use skein_protocol::config::SacSection;
 use skein_protocol::seeds::{Purpose, derive};
 use tch::{Device, Tensor, no_grad_guard};
 
@@ -37,8 +37,8 @@ pub struct TorchSac {
 
 impl TorchSac {
     /// Untrained networks whose parameters depend on the run's seed alone.
-    pub fn new(section: &SacSection, observation: Observation, run_seed: u64, device: Device) -> Self {
-        let (inputs, width) = (observation.len() as i64, section.hidden_width as i64);
+    pub fn new(section: &SacSection, observation: usize, run_seed: u64, device: Device) -> Self {
+        let (inputs, width) = (observation as i64, section.hidden_width as i64);
         let mut layout = Layout::default();
         let policy = Policy::describe(&mut layout, inputs, width);
         let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 0), device);
@@ -49,7 +49,7 @@ impl TorchSac {
             .to_device(device)
             .set_requires_grad(true);
         Self {
-            observation: observation.len(),
+            observation,
             policy,
             policy_optimizer: Adam::new(policy_parameters.flat(), section.policy_learning_rate),
             policy_parameters,

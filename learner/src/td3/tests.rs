@@ -17,7 +17,7 @@ fn section() -> Td3Section {
 }
 
 fn td3(section: &Td3Section, seed: u64) -> Td3 {
-    Td3::new(section, OBSERVATION, seed, Isa::best())
+    Td3::new(section, OBSERVATION.len(), seed, Isa::best())
 }
 
 /// The same algorithm on libtorch, in reading order.
@@ -217,7 +217,7 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
 #[test]
 fn neither_threads_nor_instructions_change_a_bit() {
     let run = |isa: Isa, members: usize| {
-        let mut algorithm = Td3::new(&section(), OBSERVATION, 1, isa);
+        let mut algorithm = Td3::new(&section(), OBSERVATION.len(), 1, isa);
         let (mut data, mut noise, mut team) = (Noise::new(1), Noise::new(2), Team::new(members));
         for _ in 0..4 {
             let transitions = Transitions::random(OBSERVATION, 37, &mut data);

@@ -56,7 +56,7 @@ impl Policy {
         Self { layers, head }
     }
 
-    /// The distribution of actions for an observation, `[Observation::len]`.
+    /// The distribution of actions for an observation, `[View::len]`.
     ///
     /// # Panics
     /// When `observation` has not the length the policy was trained on.

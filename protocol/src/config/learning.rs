@@ -25,8 +25,11 @@ pub struct LearningSection {
     pub flights_per_level: u64,
     /// Start levels that training goes through before it returns to the first (paper: 5); at most the walls of the training course. Default 5.
     pub levels: u8,
-    /// What the policy sees. Default `latent`, as in the paper.
+    /// What the policy sees of a moment. Default `latent`, as in the paper.
     pub observation: Observation,
+    /// Earlier moments that it sees beside the present one, by how many steps they lie back, rising; before take-off all was as at take-off. What was in view a second ago no longer is when
+    /// the drone is in an opening. Default none, as in the paper.
+    pub history_steps: Vec<usize>,
 }
 
 impl Default for LearningSection {
@@ -40,6 +43,7 @@ impl Default for LearningSection {
             flights_per_level: 10,
             levels: 5,
             observation: Observation::Latent,
+            history_steps: Vec::new(),
         }
     }
 }
@@ -75,9 +79,33 @@ impl LearningSection {
             "learning.levels",
             self.levels,
             "is below 1: no flight could start",
+        )?;
+        let rising = |steps: &[usize]| steps.is_sorted_by(|earlier, later| earlier < later) && !steps.starts_with(&[0]);
+        require(
+            rising(&self.history_steps),
+            "learning.history_steps",
+            format!("{:?}", self.history_steps),
+            "does not rise from 1 or more: each is a number of steps back from the present, which is always seen",
+        )?;
+        require(
+            self.history_steps.len() <= MOST_HISTORY,
+            "learning.history_steps",
+            format!("{:?}", self.history_steps),
+            format!("names more than {MOST_HISTORY} moments: each is kept with every transition"),
         )
     }
+
+    /// What the policy sees, with what came before.
+    pub fn view(&self) -> View {
+        View {
+            moment: self.observation,
+            history_steps: self.history_steps.clone(),
+        }
+    }
 }
+
+/// Earlier moments that can be seen at most.
+const MOST_HISTORY: usize = 16;
 
 /// A learning algorithm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -98,7 +126,7 @@ impl fmt::Display for AlgorithmName {
     }
 }
 
-/// What the policy and the critic see of the world, in this order.
+/// What the policy and the critic see of the world at a moment, in this order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Observation {
     /// The latent code of the depth image alone (the paper's state).
@@ -127,9 +155,9 @@ impl Observation {
         false
     }
 
-    /// Writes the observation vector: `latent` `[32]`, `velocity_mps` the vehicle's forward, left and up velocity, `previous_action` zero at take-off.
+    /// Writes what is seen of a moment: `latent` `[32]`, `velocity_mps` the vehicle's forward, left and up velocity, `previous_action` zero at take-off.
     ///
-    /// Actor and learner both build observations with this function only.
+    /// Actor and learner both build observations with this function and [`View::write`] only.
     ///
     /// # Panics
     /// When `into` is not [`Observation::len`] long.
@@ -147,6 +175,53 @@ impl Observation {
         }
         if self == Self::LatentVelocityAction {
             into[LATENT + 2..].copy_from_slice(previous_action);
+        }
+    }
+}
+
+/// What the policy and the critic see: the present moment, then earlier ones.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct View {
+    /// What is seen of each.
+    pub moment: Observation,
+    /// How many steps back the earlier ones lie.
+    pub history_steps: Vec<usize>,
+}
+
+impl View {
+    /// The present moment alone.
+    pub fn present(moment: Observation) -> Self {
+        Self {
+            moment,
+            history_steps: Vec::new(),
+        }
+    }
+
+    /// Length of the observation vector.
+    pub fn len(&self) -> usize {
+        self.moment.len() * (1 + self.history_steps.len())
+    }
+
+    /// Never: the present is always seen.
+    pub fn is_empty(&self) -> bool {
+        false
+    }
+
+    /// The moments seen at `step` of a flight, by their steps, in the vector's order; before take-off there was the take-off.
+    pub fn moments(&self, step: usize) -> impl Iterator<Item = usize> {
+        std::iter::once(0)
+            .chain(self.history_steps.iter().copied())
+            .map(move |back| step.saturating_sub(back))
+    }
+
+    /// Writes the observation vector at `step` of a flight, of which `write_moment` writes what is seen of a step's moment.
+    ///
+    /// # Panics
+    /// When `into` is not [`View::len`] long.
+    pub fn write(&self, step: usize, into: &mut [f32], write_moment: impl Fn(usize, &mut [f32])) {
+        assert_eq!(into.len(), self.len(), "an observation has a fixed length");
+        for (moment, into) in self.moments(step).zip(into.chunks_exact_mut(self.moment.len())) {
+            write_moment(moment, into);
         }
     }
 }

@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 pub use courses::CoursesSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
 pub use file::{ConfigError, culprit};
-pub use learning::{AlgorithmName, LearningSection, Observation};
+pub use learning::{AlgorithmName, LearningSection, Observation, View};
 pub use replay::{ReplaySection, SuccessRule};
 pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};

@@ -7,6 +7,7 @@ use std::convert::Infallible;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::IMAGE_PIXELS;
+use skein_protocol::config::Observation;
 use skein_protocol::transition::Outcome;
 
 use super::*;

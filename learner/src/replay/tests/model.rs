@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use proptest::prelude::*;
-use skein_protocol::config::SuccessRule;
+use skein_protocol::config::{Observation, SuccessRule};
 use skein_protocol::transition::Outcome;
 
 use super::super::*;
@@ -23,7 +23,7 @@ struct Transition {
 /// The model: both parts as queues of owned transitions, the oldest in front.
 struct Model {
     parts: [(VecDeque<Transition>, usize); 2],
-    observation: Observation,
+    view: View,
     section: ReplaySection,
 }
 
@@ -33,20 +33,27 @@ impl Model {
         let parts = [(VecDeque::new(), success), (VecDeque::new(), regular)];
         Self {
             parts,
-            observation: config.learning.observation,
+            view: config.learning.view(),
             section: config.replay.clone(),
         }
     }
 
     fn insert(&mut self, flight: &CommittedFlight) {
         for step in 0..flight.steps() {
-            let observed = |step: usize| {
+            let moment = |step: usize| {
                 let mut vector = flight.observations[step].latent.to_vec();
-                if self.observation != Observation::Latent {
+                if self.view.moment != Observation::Latent {
                     vector.extend(&flight.observations[step].velocity_mps[1..]);
                 }
-                if self.observation == Observation::LatentVelocityAction {
+                if self.view.moment == Observation::LatentVelocityAction {
                     vector.extend(if step == 0 { [0.0; 2] } else { flight.actions[step - 1] });
+                }
+                vector
+            };
+            let observed = |step: usize| {
+                let mut vector = moment(step);
+                for back in &self.view.history_steps {
+                    vector.extend(moment(step.max(*back) - back));
                 }
                 vector
             };
@@ -75,8 +82,10 @@ impl Model {
     fn set_latents(&mut self, latent: impl Fn(&[f32]) -> [f32; LATENT]) {
         for transition in self.parts.iter_mut().flat_map(|(part, _)| part) {
             for vector in [&mut transition.observation, &mut transition.next_observation] {
-                let made = latent(vector);
-                vector[..LATENT].copy_from_slice(&made);
+                for moment in vector.chunks_exact_mut(self.view.moment.len()) {
+                    let made = latent(moment);
+                    moment[..LATENT].copy_from_slice(&made);
+                }
             }
         }
     }
@@ -137,11 +146,13 @@ proptest! {
         observation in prop::sample::select(vec![
             Observation::Latent, Observation::LatentVelocity, Observation::LatentVelocityAction,
         ]),
+        history in prop::sample::subsequence(vec![1_usize, 2, 5], 0..=3),
         rule in prop::sample::select(vec![SuccessRule::LevelUp, SuccessRule::Approach]),
         chunk in 1..9_usize,
         share in prop::sample::select(vec![0.0, 0.25]),
     ) {
         let mut config = config(capacity, observation);
+        config.learning.history_steps = history;
         config.replay.success_share = share;
         config.replay.success = rule;
         config.replay.approach_steps = 3;

@@ -25,8 +25,8 @@ fn section(hidden_width: usize) -> SacSection {
 fn both(section: &SacSection, observation: Observation, seed: u64) -> (NativeSac, TorchSac) {
     crate::device::use_threads(1);
     (
-        NativeSac::new(section, observation, seed, Isa::best()),
-        TorchSac::new(section, observation, seed, Device::Cpu),
+        NativeSac::new(section, observation.len(), seed, Isa::best()),
+        TorchSac::new(section, observation.len(), seed, Device::Cpu),
     )
 }
 
@@ -172,7 +172,7 @@ fn neither_threads_nor_instructions_change_a_bit() {
     let observation = Observation::LatentVelocityAction;
     for (width, rows) in [(40, 131), (16, 5)] {
         let run = |isa: Isa, members: usize| {
-            let mut sac = NativeSac::new(&section(width), observation, 1, isa);
+            let mut sac = NativeSac::new(&section(width), observation.len(), 1, isa);
             let (mut data, mut noise, mut team) = (Noise::new(1), Noise::new(2), Team::new(members));
             let metrics: Vec<_> = (0..5)
                 .map(|_| {
@@ -198,9 +198,9 @@ fn batches_of_changing_size_are_what_they_are_alone() {
     let (mut team, section) = (Team::new(1), section(16));
     let large = Transitions::random(observation, 50, &mut Noise::new(1));
     let little = Transitions::random(observation, 3, &mut Noise::new(2));
-    let mut sac = NativeSac::new(&section, observation, 1, Isa::best());
+    let mut sac = NativeSac::new(&section, observation.len(), 1, Isa::best());
     sac.update(&mut team, large.columns(), &mut Noise::new(3)).unwrap();
-    let mut fresh = NativeSac::new(&section, observation, 2, Isa::best());
+    let mut fresh = NativeSac::new(&section, observation.len(), 2, Isa::best());
     fresh.load_named(&sac.named_tensors()).unwrap();
     let run = |sac: &mut NativeSac, team: &mut Team| sac.update(team, little.columns(), &mut Noise::new(4)).unwrap();
     assert_eq!(run(&mut sac, &mut team), run(&mut fresh, &mut team));
@@ -213,6 +213,6 @@ fn columns_that_do_not_belong_together_are_refused() {
     let observation = Observation::Latent;
     let mut transitions = Transitions::random(observation, 5, &mut Noise::new(1));
     transitions.next_observations.truncate(4 * observation.len());
-    let mut sac = NativeSac::new(&section(8), observation, 1, Isa::best());
+    let mut sac = NativeSac::new(&section(8), observation.len(), 1, Isa::best());
     let _ = sac.update(&mut Team::new(1), transitions.columns(), &mut Noise::new(1));
 }
