@@ -3,6 +3,8 @@
 
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 readonly repository
+# Where the default courses are, for whoever writes a configuration elsewhere.
+export SKEIN_CONFIGS="$repository/configs"
 
 # Prints the help text (standard input) and ends the script if one of the arguments asks for it: help must not need a build.
 help_if_asked() {

@@ -86,6 +86,11 @@ impl Agent {
         let moment = self.view.moment;
         let first = record.step as usize * moment.len();
         self.moments.resize(first + moment.len(), 0.0);
-        moment.write(&record.latent, &record.velocity_mps, previous_action, &mut self.moments[first..]);
+        moment.write(
+            &record.latent,
+            &record.velocity_mps,
+            previous_action,
+            &mut self.moments[first..],
+        );
     }
 }

@@ -12,7 +12,8 @@ use crate::algorithm::{Algorithm, Columns};
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::networks::native::{
-    Dense, ESTIMATES, Layers, Learned, follow, join, output, output_mut, pair, smaller, squared_norm,
+    CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output, output_mut, pair, smaller,
+    squared_norm,
 };
 use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
@@ -28,7 +29,7 @@ pub struct Td3 {
     policy: Dense,
     policy_parameters: Learned,
     target_policy: Vec<f32>,
-    critic: Dense,
+    critic: NativeCritic,
     critic_parameters: Learned,
     target_critic: Vec<f32>,
     work: Work,
@@ -46,8 +47,8 @@ struct Work {
     joined: Vec<f32>,
     /// `[rows, 2]`.
     target_values: Vec<f32>,
-    critic: Layers,
-    critic_flowing: Layers,
+    critic: CriticLayers,
+    critic_flowing: CriticLayers,
     /// Of the values of the policy's actions, `[rows, 2]`.
     value_flowing: Vec<f32>,
     policy: Layers,
@@ -62,17 +63,17 @@ impl Td3 {
         Policy::with_outputs(&mut policy_layout, inputs, width, ACTION as i64);
         let policy = policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         let mut critic_layout = Layout::default();
-        Critic::describe(&mut critic_layout, inputs, width);
+        Critic::describe(&mut critic_layout, inputs, width, section.critic_networks);
         let critic = critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
         Self {
             isa,
             observation,
             settings: section.clone(),
-            policy: Dense::new(isa, &policy_layout),
+            policy: Dense::new(isa, policy_layout.tensors()),
             policy_layout,
             target_policy: policy.clone(),
             policy_parameters: Learned::new(policy, section.policy_learning_rate),
-            critic: Dense::new(isa, &critic_layout),
+            critic: NativeCritic::new(isa, &critic_layout, section.critic_networks),
             target_critic: critic.clone(),
             critic_parameters: Learned::new(critic, section.critic_learning_rate),
             work: Work::default(),
@@ -114,11 +115,11 @@ impl Td3 {
         self.critic.forward(team, critic, joined, given);
         let (mut loss, mut value) = (0.0, 0.0);
         let share = 1.0 / *rows as f32;
-        let flowing = output_mut(critic_flowing);
+        let flowing = &mut critic_flowing.values;
         for row in 0..*rows {
             let next = (1.0 - columns.terminated[row]) * smaller(pair(target_values, row));
             let target = columns.rewards[row] + next * discount as f32;
-            let values = pair(output(given), row);
+            let values = pair(&given.values, row);
             for (value, flowing) in values.iter().zip(&mut flowing[row * ESTIMATES..]) {
                 let error = value - target;
                 loss += 0.5 * f64::from(error * error);
@@ -126,9 +127,8 @@ impl Td3 {
             }
             value += f64::from(smaller(values));
         }
-        self.critic.backward(team, critic, given, critic_flowing);
         let into = &mut self.critic_parameters.gradient;
-        self.critic.gradient(team, joined, given, critic_flowing, into);
+        self.critic.gradient(team, critic, joined, given, critic_flowing, into);
         [loss, value].map(|sum| (sum / *rows as f64) as f32)
     }
 
@@ -154,7 +154,7 @@ impl Td3 {
         let share = 1.0 / *rows as f32;
         let mut loss = 0.0;
         for (row, flowing) in value_flowing.chunks_exact_mut(ESTIMATES).enumerate() {
-            loss -= f64::from(pair(output(given), row)[0]);
+            loss -= f64::from(pair(&given.values, row)[0]);
             flowing.copy_from_slice(&[-share, 0.0]);
         }
         let (action, flowing) = (self.observation..self.observation + ACTION, output_mut(policy_flowing));

@@ -197,7 +197,9 @@ pub enum SnapshotError {
         expected: u64,
     },
     /// Its tensors are not ours.
-    #[error("the snapshot has another layout: learning.algorithm, its hidden_width, learning.observation or learning.history_steps differ")]
+    #[error(
+        "the snapshot has another layout: learning.algorithm, its hidden_width, learning.observation or learning.history_steps differ"
+    )]
     OtherLayout,
     /// Its length is not that of the layout.
     #[error("the snapshot has {found} bytes where its layout has {expected}")]

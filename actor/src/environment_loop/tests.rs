@@ -275,7 +275,9 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
     // The second flight must not remember the first.
     for seed in [1, 2] {
         let mut tape = Tape::default();
-        pilot.fly(&ticket(Exploration::Mode, seed), &network, &mut tape).unwrap();
+        pilot
+            .fly(&ticket(Exploration::Mode, seed), &network, &mut tape)
+            .unwrap();
         let steps = tape.sent.len() - 1;
         assert!(steps > 4, "too short to have a history");
         for (step, record) in tape.sent[..steps].iter().enumerate() {
@@ -284,7 +286,11 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
                 let seen = &tape.sent[moment];
                 observed.extend(seen.latent);
                 observed.extend(&seen.velocity_mps[1..]);
-                observed.extend(if moment == 0 { [0.0; 2] } else { tape.sent[moment - 1].action });
+                observed.extend(if moment == 0 {
+                    [0.0; 2]
+                } else {
+                    tape.sent[moment - 1].action
+                });
             }
             let action = network.distribution(&observed, &mut Scratch::default()).mode();
             assert_eq!(record.action, action, "step {step}");

@@ -250,8 +250,11 @@ mod tests {
         let process = &found[0];
         assert!(process.runs("sh") && process.role() == Role::Other && process.is_alive());
         assert_eq!(process.parent(), Some(std::process::id()));
-        let usage = process.usage().unwrap();
-        assert!(usage.threads == 1 && usage.descriptors >= 3 && usage.resident_bytes > usage.anonymous_bytes);
+        // Just after exec it has hardly a page yet.
+        until(|| {
+            let usage = process.usage().unwrap();
+            usage.threads == 1 && usage.descriptors >= 3 && usage.resident_bytes > usage.anonymous_bytes
+        });
         process.signal(Signal::STOP);
         until(|| process.is_frozen());
         process.signal(Signal::CONT);

@@ -5,32 +5,43 @@ use tch::Tensor;
 
 use super::{Layout, Linear, Parameters};
 
-/// Three fully connected layers with ReLU between; the last gives two estimates of Q, of which the smaller one is used (paper, section 3.4).
-#[derive(Debug, Clone, Copy)]
+/// Three fully connected layers with ReLU between. One network whose last layer gives two estimates of Q, of which the smaller one is used (paper, section 3.4), or two networks with an
+/// estimate each (arXiv:1812.05905), whose errors have less in common.
+#[derive(Debug, Clone)]
 pub struct Critic {
-    layers: [Linear; 3],
+    networks: Vec<[Linear; 3]>,
 }
 
 impl Critic {
-    /// Describes the layers.
-    pub fn describe(layout: &mut Layout, observation: i64, hidden_width: i64) -> Self {
-        Self {
-            layers: [
-                Linear::describe(layout, "critic.layer1", observation + ACTION as i64, hidden_width),
-                Linear::describe(layout, "critic.layer2", hidden_width, hidden_width),
-                Linear::describe(layout, "critic.layer3", hidden_width, 2),
-            ],
-        }
+    /// Describes the layers of `networks`, one or two.
+    pub fn describe(layout: &mut Layout, observation: i64, hidden_width: i64, networks: usize) -> Self {
+        let mut network = |name: &str| {
+            let mut layer = |number: u8, inputs, outputs| {
+                Linear::describe(layout, &format!("{name}.layer{number}"), inputs, outputs)
+            };
+            [
+                layer(1, observation + ACTION as i64, hidden_width),
+                layer(2, hidden_width, hidden_width),
+                layer(3, hidden_width, 2 / networks as i64),
+            ]
+        };
+        let networks = match networks {
+            1 => vec![network("critic")],
+            _ => vec![network("critic1"), network("critic2")],
+        };
+        Self { networks }
     }
 
     /// Both estimates of Q, `[n, 2]`. `observations`: `[n, observation]`, `actions`: `[n, 2]`.
     pub fn forward(&self, parameters: &Parameters, observations: &Tensor, actions: &Tensor) -> Tensor {
-        let [hidden @ .., last] = &self.layers;
-        let mut features = Tensor::cat(&[observations, actions], 1);
-        for layer in hidden {
-            features = layer.forward(parameters, &features).relu_();
-        }
-        last.forward(parameters, &features)
+        let joined = Tensor::cat(&[observations, actions], 1);
+        let estimates = self.networks.iter().map(|[hidden @ .., last]| {
+            let features = hidden.iter().fold(joined.shallow_clone(), |features, layer| {
+                layer.forward(parameters, &features).relu()
+            });
+            last.forward(parameters, &features)
+        });
+        Tensor::cat(&estimates.collect::<Vec<_>>(), 1)
     }
 
     /// The smaller estimate, `[n]`.

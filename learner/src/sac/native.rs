@@ -15,7 +15,8 @@ use super::SacMetrics;
 use crate::algorithm::Columns;
 use crate::error::UpdateError;
 use crate::networks::native::{
-    Dense, ESTIMATES, Layers, Learned, follow, join, output, output_mut, pair, smaller, squared_norm,
+    CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output, output_mut, pair, smaller,
+    squared_norm,
 };
 use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
@@ -29,7 +30,7 @@ pub struct NativeSac {
     policy_layout: Layout,
     policy: Dense,
     policy_parameters: Learned,
-    critic: Dense,
+    critic: NativeCritic,
     critic_parameters: Learned,
     /// Of a critic that follows the learned one slowly, and steadies the targets.
     target_parameters: Vec<f32>,
@@ -53,9 +54,9 @@ struct Work {
     /// The target's, `[rows, 2]`.
     target_values: Vec<f32>,
     /// Of the actions replayed, then of those drawn.
-    critic: Layers,
+    critic: CriticLayers,
     /// Of the actions replayed.
-    critic_flowing: Layers,
+    critic_flowing: CriticLayers,
     /// Of the values of the actions drawn, `[rows, 2]`.
     drawn_flowing: Vec<f32>,
     /// `[rows, 2]`.
@@ -85,16 +86,16 @@ impl NativeSac {
         Policy::describe(&mut policy_layout, inputs, width);
         let policy_values = policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         let mut critic_layout = Layout::default();
-        Critic::describe(&mut critic_layout, inputs, width);
+        Critic::describe(&mut critic_layout, inputs, width, section.critic_networks);
         let critic_values = critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
         let log_temperature = vec![section.initial_temperature.ln() as f32];
         Self {
             isa,
             observation,
-            policy: Dense::new(isa, &policy_layout),
+            policy: Dense::new(isa, policy_layout.tensors()),
             policy_layout,
             policy_parameters: Learned::new(policy_values, section.policy_learning_rate),
-            critic: Dense::new(isa, &critic_layout),
+            critic: NativeCritic::new(isa, &critic_layout, section.critic_networks),
             target_parameters: critic_values.clone(),
             critic_parameters: Learned::new(critic_values, section.critic_learning_rate),
             log_temperature: Learned::new(log_temperature, section.temperature_learning_rate),
@@ -168,11 +169,11 @@ impl NativeSac {
         join(observations, actions, joined);
         self.critic.forward(team, critic, joined, critic_given);
         let mut sums = Sums::default();
-        let flowing = output_mut(critic_flowing);
+        let flowing = &mut critic_flowing.values;
         for row in 0..rows {
             let soft_value = smaller(pair(target_values, row)) - temperature * next_log_prob[row];
             let target = columns.rewards[row] + (1.0 - columns.terminated[row]) * soft_value * self.discount;
-            let values = pair(output(critic_given), row);
+            let values = pair(&critic_given.values, row);
             for (value, flowing) in values.iter().zip(&mut flowing[row * ESTIMATES..]) {
                 let error = value - target;
                 sums.critic_loss += 0.5 * f64::from(error * error);
@@ -180,15 +181,15 @@ impl NativeSac {
             }
             sums.value += f64::from(smaller(values));
         }
-        self.critic.backward(team, critic, critic_given, critic_flowing);
         let into = &mut self.critic_parameters.gradient;
-        self.critic.gradient(team, joined, critic_given, critic_flowing, into);
+        self.critic
+            .gradient(team, critic, joined, critic_given, critic_flowing, into);
 
         // The policy moves towards actions of higher value, as far as its entropy is worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7).
         join(observations, drawn_actions, joined);
         self.critic.forward(team, critic, joined, critic_given);
         for (row, &log_prob) in drawn_log_prob.iter().enumerate() {
-            let values = pair(output(critic_given), row);
+            let values = pair(&critic_given.values, row);
             sums.log_prob += f64::from(log_prob);
             sums.policy_loss += f64::from(temperature * log_prob - smaller(values));
             drawn_flowing[row * ESTIMATES..][..ESTIMATES]

@@ -43,7 +43,7 @@ impl TorchSac {
         let policy = Policy::describe(&mut layout, inputs, width);
         let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 0), device);
         let mut layout = Layout::default();
-        let critic = Critic::describe(&mut layout, inputs, width);
+        let critic = Critic::describe(&mut layout, inputs, width, section.critic_networks);
         let critic_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 1), device);
         let log_temperature = Tensor::from_slice(&[section.initial_temperature.ln() as f32])
             .to_device(device)

@@ -1,5 +1,6 @@
 //! The update against automatic gradients, and that it learns.
 
+use skein_protocol::config::Observation;
 use tch::{Device, Tensor, no_grad_guard};
 
 use super::*;
@@ -36,7 +37,7 @@ impl Reference {
         let (inputs, width) = (OBSERVATION.len() as i64, section.hidden_width as i64);
         let (mut policy_layout, mut critic_layout) = (Layout::default(), Layout::default());
         let policy = Policy::with_outputs(&mut policy_layout, inputs, width, ACTION as i64);
-        let critic = Critic::describe(&mut critic_layout, inputs, width);
+        let critic = Critic::describe(&mut critic_layout, inputs, width, section.critic_networks);
         let parameters = |layout: Layout, index| {
             Parameters::initialise(layout, derive(seed, Purpose::PolicyParameters, index), Device::Cpu)
         };
@@ -113,7 +114,11 @@ fn forty_updates_stay_close_to_automatic_gradients() {
         target_noise_bound: 0.3,
         ..section()
     };
-    for (seed, section) in [(1, section()), (2, section()), (3, section()), (4, cut_off)] {
+    let apart = Td3Section {
+        critic_networks: 2,
+        ..section()
+    };
+    for (seed, section) in [(1, section()), (2, section()), (3, apart), (4, cut_off)] {
         let (mut native, mut reference) = (td3(&section, seed), Reference::new(&section, seed));
         let (mut data, mut noise, mut same_noise) = (Noise::new(seed), Noise::new(9), Noise::new(9));
         let before = native.policy_parameters.values.clone();

@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require};
 
-/// `[courses]`: what is flown through. Paths are relative to the configuration file; given with `--set`, to the working directory.
+/// `[courses]`: what is flown through. Paths are relative to the configuration file; given with `--set`, to the working directory. Courses that are not named are those that come with
+/// Skein, in `configs/courses/`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoursesSection {

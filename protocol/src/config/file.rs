@@ -77,6 +77,10 @@ pub fn culprit(overrides: &[String], attempt: impl Fn(&[String]) -> Option<Strin
         .map(|count| &overrides[count])
 }
 
+/// Names the folder of the configurations that come with Skein, whose `courses/` holds the default courses; the scripts in `launch/` set it. Without it they are looked for beside the
+/// configuration file.
+const SHIPPED_CONFIGS: &str = "SKEIN_CONFIGS";
+
 impl Config {
     /// Reads `path`, applies `overrides` (`section.key=value`, the value in TOML's notation or a bare word) and validates the result. Course paths
     /// become relative to the working directory: in the file they are relative to the file, in an override to the working directory.
@@ -118,6 +122,8 @@ impl Config {
         for text in overrides {
             apply_override(&mut table, text)?;
         }
+        let named = |key: &str| table.get("courses").is_some_and(|courses| courses.get(key).is_some());
+        let named = [named("training"), named("evaluation")];
         let mut config = from_table(table).map_err(|message| ConfigError::Key {
             path: path.to_owned(),
             message,
@@ -127,8 +133,13 @@ impl Config {
             source,
         })?;
         let directory = path.parent().unwrap_or(Path::new(""));
-        for course in config.courses.paths_mut() {
-            *course = directory.join(&*course);
+        let shipped = std::env::var_os(SHIPPED_CONFIGS).map_or(directory.to_owned(), PathBuf::from);
+        let [training, evaluation] = named.map(|named| if named { directory } else { &shipped });
+        config.courses.training = training.join(&config.courses.training);
+        for course in &mut config.courses.evaluation {
+            *course = evaluation.join(&*course);
+        }
+        for course in config.courses.paths() {
             if course.to_str().is_none() {
                 let message = format!(
                     "[courses] {} is not UTF-8, so it could not be written into the files of a run; rename the folder",

@@ -161,6 +161,16 @@ pub(crate) fn require_batch_size(key: &'static str, transitions: usize) -> Resul
     )
 }
 
+/// One network for both estimates, or one each.
+pub(crate) fn require_critic_networks(key: &'static str, networks: usize) -> Result<(), Invalid> {
+    require(
+        (1..=2).contains(&networks),
+        key,
+        networks,
+        "is neither 1 nor 2: a critic gives two estimates, from one network or from one each",
+    )
+}
+
 /// The check of Adam's step size.
 pub(crate) fn require_learning_rate(key: &'static str, rate: f64) -> Result<(), Invalid> {
     require(

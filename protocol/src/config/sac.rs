@@ -2,7 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require, require_batch_size, require_discount, require_learning_rate, require_width};
+use super::{
+    Invalid, require, require_batch_size, require_critic_networks, require_discount, require_learning_rate,
+    require_width,
+};
 use crate::ACTION;
 
 /// `[sac]`: soft actor-critic with learned temperature (arXiv:1812.05905). The paper leaves every value here open.
@@ -11,6 +14,9 @@ use crate::ACTION;
 pub struct SacSection {
     /// Width of the hidden layers of policy (three) and critic (two). Default 256, as in arXiv:1812.05905.
     pub hidden_width: usize,
+    /// Networks that give the critic's two estimates of Q: 1, with two outputs (paper), or 2, with one each, whose errors have less in common, so that the smaller estimate is
+    /// one of a value that both overrate less often. Default 1.
+    pub critic_networks: usize,
     /// Transitions in a minibatch. Default 256, as in arXiv:1812.05905.
     pub batch_size: usize,
     /// Adam's step size for the policy. Default 3e-4, as in arXiv:1812.05905.
@@ -33,6 +39,7 @@ impl Default for SacSection {
     fn default() -> Self {
         Self {
             hidden_width: 256,
+            critic_networks: 1,
             batch_size: 256,
             policy_learning_rate: 3e-4,
             critic_learning_rate: 3e-4,
@@ -48,6 +55,7 @@ impl Default for SacSection {
 impl SacSection {
     pub(super) fn validate(&self) -> Result<(), Invalid> {
         require_width("sac.hidden_width", self.hidden_width)?;
+        require_critic_networks("sac.critic_networks", self.critic_networks)?;
         require_batch_size("sac.batch_size", self.batch_size)?;
         for (key, rate) in [
             ("sac.policy_learning_rate", self.policy_learning_rate),

@@ -2,7 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require, require_batch_size, require_discount, require_learning_rate, require_width};
+use super::{
+    Invalid, require, require_batch_size, require_critic_networks, require_discount, require_learning_rate,
+    require_width,
+};
 
 /// `[td3]`: twin delayed deep deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477), which the paper compares with (its Fig. 11) without saying any of these
 /// values. Networks are as wide and minibatches as large as in `[sac]` by default, so that the two are compared on equal terms.
@@ -11,6 +14,9 @@ use super::{Invalid, require, require_batch_size, require_discount, require_lear
 pub struct Td3Section {
     /// Width of the hidden layers of policy (three) and critic (two). Default 256.
     pub hidden_width: usize,
+    /// Networks that give the critic's two estimates of Q: 1, with two outputs (paper), or 2, with one each, whose errors have less in common, so that the smaller estimate is
+    /// one of a value that both overrate less often. Default 1.
+    pub critic_networks: usize,
     /// Transitions in a minibatch. Default 256.
     pub batch_size: usize,
     /// Adam's step size for the policy. Default 3e-4.
@@ -35,6 +41,7 @@ impl Default for Td3Section {
     fn default() -> Self {
         Self {
             hidden_width: 256,
+            critic_networks: 1,
             batch_size: 256,
             policy_learning_rate: 3e-4,
             critic_learning_rate: 3e-4,
@@ -51,6 +58,7 @@ impl Default for Td3Section {
 impl Td3Section {
     pub(super) fn validate(&self) -> Result<(), Invalid> {
         require_width("td3.hidden_width", self.hidden_width)?;
+        require_critic_networks("td3.critic_networks", self.critic_networks)?;
         require_batch_size("td3.batch_size", self.batch_size)?;
         for (key, rate) in [
             ("td3.policy_learning_rate", self.policy_learning_rate),

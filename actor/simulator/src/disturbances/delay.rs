@@ -5,26 +5,23 @@ use std::collections::VecDeque;
 /// Holds each action back for a number of control periods. Until the first one arrives, nothing is commanded sideways or up.
 #[derive(Debug, Clone)]
 pub(crate) struct Delay {
-    periods: usize,
     on_the_way: VecDeque<[f32; 2]>,
 }
 
 impl Delay {
     /// A way of `periods` control periods on which nothing is yet.
     pub(crate) fn new(periods: u32) -> Self {
-        let periods = periods as usize;
         let mut delay = Self {
-            periods,
-            on_the_way: VecDeque::with_capacity(periods + 1),
+            on_the_way: VecDeque::with_capacity(periods as usize + 1),
         };
-        delay.clear();
+        delay.begin(periods);
         delay
     }
 
-    /// Forgets what was on the way.
-    pub(crate) fn clear(&mut self) {
+    /// Forgets what was on the way, which takes `periods` from now on.
+    pub(crate) fn begin(&mut self, periods: u32) {
         self.on_the_way.clear();
-        self.on_the_way.resize(self.periods, [0.0, 0.0]);
+        self.on_the_way.resize(periods as usize, [0.0, 0.0]);
     }
 
     /// Takes `action` in and gives the one out that takes effect now.

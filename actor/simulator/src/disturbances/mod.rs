@@ -21,6 +21,8 @@ pub use settings::{DepthModel, DepthNoiseSettings, DisturbanceFault, Disturbance
 /// What was drawn for one flight.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Drawn {
+    /// Whether it is disturbed at all.
+    pub(crate) disturbed: bool,
     /// Mass and inertia of the body, as a share of what they nominally are.
     pub(crate) mass_factor: f32,
     /// Seed of its gusts.
@@ -33,10 +35,17 @@ impl Drawn {
     /// Draws for one flight, always as much and in the same order.
     pub(crate) fn draw(settings: &DisturbanceSettings, rng: &mut impl Rng) -> Self {
         let deviation: f32 = rng.random_range(-1.0..=1.0);
+        let [gust_seed, depth_seed] = [rng.random(), rng.random()];
+        let disturbed = rng.random::<f32>() < settings.share;
         Self {
-            mass_factor: 1.0 + settings.mass_spread * deviation,
-            gust_seed: rng.random(),
-            depth_seed: rng.random(),
+            disturbed,
+            mass_factor: if disturbed {
+                1.0 + settings.mass_spread * deviation
+            } else {
+                1.0
+            },
+            gust_seed,
+            depth_seed,
         }
     }
 }

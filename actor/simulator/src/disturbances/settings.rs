@@ -6,9 +6,12 @@ use crate::camera::CameraSettings;
 use crate::vehicle::{Preset, VehicleSettings};
 
 /// What disturbs flights. Section `[simulator.disturbances]`; everything is off by default.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DisturbanceSettings {
+    /// Share of flights that are disturbed, 0 to 1, drawn for each; the others are calm in every respect. A pilot that met nothing but disturbed flights would know no calm
+    /// ones. Default 1.
+    pub share: f32,
     /// Largest deviation of a flight's mass from the nominal one, as a share of it, 0 to 0.5; drawn uniformly for each flight. Inertia goes along; rotors and
     /// controller know nothing of it and begin trimmed for the nominal mass. Default 0.
     pub mass_spread: f32,
@@ -73,6 +76,18 @@ pub struct DepthNoiseSettings {
     pub dropout_patch_px: u32,
 }
 
+impl Default for DisturbanceSettings {
+    fn default() -> Self {
+        Self {
+            share: 1.0,
+            mass_spread: 0.0,
+            latency_periods: 0,
+            gust: GustSettings::default(),
+            depth: DepthNoiseSettings::default(),
+        }
+    }
+}
+
 impl Default for GustSettings {
     fn default() -> Self {
         Self {
@@ -124,6 +139,7 @@ impl DisturbanceSettings {
     pub fn check(&self, vehicle: &VehicleSettings, camera: &CameraSettings) -> Result<(), DisturbanceFault> {
         let Self { gust, depth, .. } = self;
         for (key, value, least, most, consequence) in [
+            ("share", self.share, 0.0, 1.0, "it is a share of flights"),
             (
                 "mass_spread",
                 self.mass_spread,

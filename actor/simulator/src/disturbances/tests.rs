@@ -75,6 +75,22 @@ fn disturbed_flight_is_a_function_of_its_seeds_whatever_was_flown_before() {
 }
 
 #[test]
+fn share_of_flights_is_disturbed_and_the_others_are_calm_in_every_respect() {
+    let actions = [[0.5, 0.2]; 4];
+    let now_and_then = DisturbanceSettings { share: 0.3, ..stormy() };
+    let mut simulators = [DisturbanceSettings::default(), stormy(), now_and_then]
+        .map(|disturbances| simulator(Preset::Airsim, disturbances));
+    let mut disturbed = 0;
+    for seed in 0..100 {
+        let [calm, stormy, found] = simulators.each_mut().map(|simulator| flown(simulator, seed, &actions));
+        assert!(found == calm || found == stormy, "seed {seed}");
+        disturbed += usize::from(found == stormy);
+    }
+    // Four standard deviations of a binomial count.
+    assert!((12..=48).contains(&disturbed), "{disturbed} of 100");
+}
+
+#[test]
 fn calm_settings_leave_no_trace_of_the_disturbances_generator() {
     let actions = [[0.5, 0.2]; 8];
     for preset in [Preset::Airsim, Preset::Hummingbird, Preset::Point] {

@@ -47,7 +47,8 @@ struct Flight {
     /// Walls of the course whose back face the drone's centre has left behind, those before its start included.
     walls_behind: usize,
     walls_behind_at_start: usize,
-    depth_seed: u64,
+    /// Of what the camera gets wrong; `None` in a calm flight.
+    depth_seed: Option<u64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -93,7 +94,7 @@ impl Simulator {
                 steps: 0,
                 walls_behind: 0,
                 walls_behind_at_start: 0,
-                depth_seed: 0,
+                depth_seed: None,
             },
         })
     }
@@ -108,15 +109,26 @@ impl Simulator {
         let drawn = Drawn::draw(&self.disturbances, disturbances);
         self.vehicle = self.pristine_vehicle.clone();
         self.world.reset(&position_m, drawn.mass_factor);
-        self.commands.clear();
-        self.gust = Gust::new(&self.disturbances.gust, self.dt_secs, drawn.gust_seed);
+        let Drawn {
+            disturbed,
+            gust_seed,
+            depth_seed,
+            ..
+        } = drawn;
+        let gust = Gust::new(&self.disturbances.gust, self.dt_secs, gust_seed);
+        self.gust = gust.filter(|_| disturbed);
+        self.commands.begin(if disturbed {
+            self.disturbances.latency_periods
+        } else {
+            0
+        });
         let walls_behind = self.walls_behind(position_m.x);
         self.flight = Flight {
             phase: Phase::Flying,
             steps: 0,
             walls_behind,
             walls_behind_at_start: walls_behind,
-            depth_seed: drawn.depth_seed,
+            depth_seed: disturbed.then_some(depth_seed),
         };
         Ok(())
     }
@@ -156,8 +168,14 @@ impl Simulator {
 
     /// Draws what the depth camera sees now into `image`, row by row from the top. Its errors belong to the step: looking twice shows the same ones.
     pub fn render(&mut self, image: &mut [u8; IMAGE_PIXELS]) {
-        let key = self.flight.depth_seed ^ u64::from(self.flight.steps);
-        self.camera.render_with_noise(&self.world.state().pose(), key, image);
+        let pose = self.world.state().pose();
+        match self.flight.depth_seed {
+            Some(seed) => {
+                let key = seed ^ u64::from(self.flight.steps);
+                self.camera.render_with_noise(&pose, key, image);
+            }
+            None => self.camera.render(&pose, image),
+        }
     }
 
     /// Where the drone is and how it moves.

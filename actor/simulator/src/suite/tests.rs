@@ -34,12 +34,13 @@ fn generalist_suite_is_six_thousand_flights() {
         .collect();
     assert_eq!(disturbed.len(), 1);
     let DisturbanceSettings {
+        share,
         mass_spread,
         latency_periods,
         ref gust,
         ref depth,
     } = disturbed[0].disturbances;
-    assert_eq!((mass_spread, latency_periods), (0.2, 1));
+    assert_eq!((share, mass_spread, latency_periods), (1.0, 0.2, 1));
     assert!(gust.force_rms_n > 0.0 && depth.dropout_share > 0.0 && depth.sigma_quadratic_per_m > 0.0);
 }
 

@@ -9,7 +9,7 @@ use std::ops::Range;
 
 use skein_kernels::{Finish, Isa, Matrix, Start, Team, Terms, gradient, product_once};
 
-use crate::networks::Layout;
+use crate::networks::ParameterSpec;
 
 /// Rows that go through all layers together: all that one member has of a minibatch of 256.
 const ROWS_AT_ONCE: usize = 264;
@@ -50,14 +50,14 @@ impl Layer {
 }
 
 impl Dense {
-    /// The layers of a layout: a weight, `[outputs, inputs]`, and a bias for each.
-    pub fn new(isa: Isa, layout: &Layout) -> Self {
+    /// The layers of these tensors: a weight, `[outputs, inputs]`, and a bias for each.
+    pub fn new(isa: Isa, tensors: &[ParameterSpec]) -> Self {
         let mut start = 0;
         let mut place = |len: usize| {
             start += len;
             start - len..start
         };
-        let layers = layout.tensors().chunks_exact(2).map(|tensors| {
+        let layers = tensors.chunks_exact(2).map(|tensors| {
             let [weight, bias] = [&tensors[0], &tensors[1]];
             Layer {
                 outputs: weight.shape[0] as usize,

@@ -104,11 +104,18 @@ fn assert_one_update_is_equal(native: &mut NativeSac, torch: &mut TorchSac, tran
 #[test]
 fn gradients_and_one_update_are_the_references() {
     for (number, observation) in OBSERVATIONS.into_iter().enumerate() {
-        for (width, rows) in [(8, 1), (8, 33), (31, 7), (64, 50), (256, 256), (100, 201)] {
+        for (width, rows) in [(8, 1), (8, 33), (31, 7), (31, 8), (64, 50), (256, 256), (100, 201)] {
             let seed = (number + rows) as u64;
-            let (mut native, mut torch) = both(&section(width), observation, seed);
+            let section = SacSection {
+                critic_networks: 1 + rows % 2,
+                ..section(width)
+            };
+            let (mut native, mut torch) = both(&section, observation, seed);
             let transitions = Transitions::random(observation, rows, &mut Noise::new(seed));
-            let context = format!("{observation:?}, width {width}, {rows} rows");
+            let context = format!(
+                "{observation:?}, width {width}, {rows} rows, {} networks",
+                section.critic_networks
+            );
             assert_one_update_is_equal(&mut native, &mut torch, &transitions, &context);
         }
     }
