@@ -11,16 +11,18 @@ ratio, and the machine. Figures and their baselines are measured by the same run
 10 minutes beyond the build, on a machine that should do nothing else meanwhile.
 
 Options:
-  --quick       a fraction of a second for each, to see that they work: nothing is judged
+  --quick       a fraction of a second for each, to see that they work: no time is judged, and results lie in target/bench-quick/
   --only NAME   this benchmark alone; may be repeated. launch/benchmarks.toml names them
   --growth      measure as well how cost grows with the flights of an epoch, and draw all growth into launch/pictures/
   -h, --help    this text
 
 What was measured lies in target/bench/: table.md, table.json, criterion's samples, and what each benchmark printed.
 
-Exit status: 0 everything was measured, 1 a benchmark failed, 2 called wrongly.
+Exit status: 0 everything was measured, 1 a benchmark failed or did not tell a figure that launch/benchmarks.toml asks for, 2 called wrongly.
 END
 
+# Rows and pictures have no `name`.
+known=$(sed -n 's/^name = "\(.*\)"$/\1/p' "$repository/launch/benchmarks.toml")
 quick='' growth='' only=()
 while (($# > 0)); do
     case $1 in
@@ -29,6 +31,10 @@ while (($# > 0)); do
     --only)
         (($# > 1)) || {
             echo "bench.sh: --only takes a name: see launch/bench.sh --help" >&2
+            exit 2
+        }
+        grep -qxF "$2" <<<"$known" || {
+            echo "bench.sh: no benchmark is called \"$2\"; there are $(paste -sd ' ' <<<"$known")" >&2
             exit 2
         }
         only+=(--only "$2") && shift
@@ -45,7 +51,8 @@ build
 cd "$repository"
 target=$(target_directory)
 benches=$("$target/release/skein-bench" list ${growth:+"$growth"} "${only[@]}")
-readonly results=$target/bench
+# A trial leaves what was measured in earnest where it is.
+readonly results=$target/bench${quick:+-quick}
 rm -rf "$results"
 mkdir -p "$results"
 export CRITERION_HOME=$results/criterion
@@ -58,6 +65,8 @@ timing=(--warm-up-time 0.5 --measurement-time 3 --sample-size 60 --nresamples 10
 pin=()
 if command -v taskset >/dev/null; then
     pin=(taskset --cpu-list "$(taskset --cpu-list --pid $$ | grep -o '[0-9]*$')")
+else
+    echo "bench.sh: taskset (util-linux) is missing: nothing is pinned to a core, and times scatter" >&2
 fi
 
 named=()

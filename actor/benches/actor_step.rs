@@ -2,7 +2,8 @@
 //!
 //! An iteration is a training flight through real shared memory, no longer than it must be: the shorter, the more of them nobody disturbs. Every stage is
 //! given exactly what it was made of, so that whatever the whole takes beyond the sum of the stages is the loop's own. The learner's end is emptied after
-//! each flight, outside the time taken.
+//! each flight, outside the time taken. What an actor does for the learner's sake between two steps, to listen and to give signs of life (`control` in the table
+//! of a run), is in neither: it depends on what the learner says.
 
 mod common;
 

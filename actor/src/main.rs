@@ -12,11 +12,13 @@ use skein_actor::agent::Agent;
 use skein_actor::courses::{Courses, Simulators};
 use skein_actor::environment_loop::Pilot;
 use skein_actor::service::{Ending, Service};
+use skein_kernels::Isa;
 use skein_protocol::allocation::return_large_blocks;
 use skein_protocol::failure::{EXIT_LEARNER_GONE, with_causes};
 use skein_protocol::ids::{ActorId, Incarnation};
 use skein_protocol::logging::{LogFormat, log_to_file};
 use skein_protocol::run::{Presence, RunDirectory};
+use skein_simulator::camera::Instructions;
 use tracing::{error, info};
 
 /// Flies for a run, beside its learner and other actors, until the run is over.
@@ -69,8 +71,9 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
     let log = directory.actor_log(actor);
     log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
 
-    let isa = skein_kernels::Isa::best();
-    info!(%actor, pid = std::process::id(), run = %identity.run, %isa, "actor started");
+    let (isa, camera) = (Isa::best(), Instructions::best());
+    let encoder = config.vae.encoder_precision;
+    info!(%actor, pid = std::process::id(), run = %identity.run, %isa, %camera, %encoder, "actor started");
     let _presence = Presence::enter(&identity)?;
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config)?));
     // Each learner that is joined gives it an incarnation.

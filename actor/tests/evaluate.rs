@@ -259,6 +259,10 @@ fn more_threads_than_flights_are_not_started() {
     assert!(output.status.success(), "{output:?}");
     let announced = String::from_utf8(output.stderr).unwrap();
     assert!(announced.contains("on each of 2 courses, 6 threads"), "{announced}");
+    assert!(
+        announced.contains("the encoder in f32; images are drawn with "),
+        "{announced}"
+    );
 }
 
 #[test]

@@ -11,10 +11,12 @@ use clap::{Args, Parser};
 use skein_actor::courses::Courses;
 use skein_actor::evaluation::{Evaluation, Keep, MAX_THREADS};
 use skein_actor::recording::{COLUMNS, check_recordable, write_recording};
+use skein_kernels::Isa;
 use skein_protocol::config::Config;
 use skein_protocol::failure::with_causes;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::snapshot::Snapshot;
+use skein_simulator::camera::Instructions;
 use skein_simulator::suite::{EntryCourses, Suite, SuiteEntry};
 
 /// Flies a trained snapshot through courses and prints how it fares.
@@ -104,6 +106,12 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
         path.display(),
         what_is_flown(&courses),
         evaluation.threads()
+    );
+    eprintln!(
+        "networks are computed with {}, the encoder in {}; images are drawn with {}",
+        Isa::best(),
+        config.vae.encoder_precision,
+        Instructions::best()
     );
     for note in shapes_trained_on(&config, &courses) {
         eprintln!("{note}");

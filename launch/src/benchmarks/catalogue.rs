@@ -80,6 +80,8 @@ pub struct Row {
     pub baseline: Option<Baseline>,
     /// How many times better than the baseline it must be.
     pub ratio_at_least: Option<f64>,
+    /// Instruction set, as `/proc/cpuinfo` spells it, without which what is measured is emulated; the row then says so.
+    pub native_with: Option<String>,
 }
 
 /// What a figure is compared with.
@@ -153,6 +155,28 @@ impl Catalogue {
     }
 }
 
+impl Row {
+    /// The row on a machine with these instruction sets.
+    #[must_use]
+    pub fn on(mut self, instructions: &[&str]) -> Self {
+        if let Some(set) = &self.native_with
+            && !instructions.contains(&set.as_str())
+        {
+            self.stage.push_str(&format!(" (emulated: no {set})"));
+        }
+        self
+    }
+
+    /// How a figure that its baseline is made of is shown, and in what unit. Times add up, rates do not.
+    pub(super) fn part_shown(&self) -> (Show, &str) {
+        match self.show {
+            Show::Rate | Show::Time => (Show::Time, "s"),
+            Show::PeakShare => (Show::PeakShare, "s"),
+            Show::Value => (Show::Value, &self.unit),
+        }
+    }
+}
+
 /// Name of the benchmark that a figure is from.
 pub fn bench_of(figure: &str) -> &str {
     figure.split_once('/').map_or(figure, |(bench, _)| bench)
@@ -171,6 +195,10 @@ pub(super) fn per_second(unit: &str) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+    use std::fs;
+    use std::path::Path;
+
     use super::*;
 
     #[test]
@@ -201,5 +229,58 @@ mod tests {
         for growth in &catalogue.growths {
             assert!(growth.series.iter().all(|series| timed(series.show, &series.unit)));
         }
+        let named: BTreeSet<&str> = catalogue.benches.iter().map(|bench| bench.name.as_str()).collect();
+        let series = catalogue.growths.iter().flat_map(|growth| &growth.series);
+        let figures = catalogue
+            .rows
+            .iter()
+            .map(|row| &row.figure)
+            .chain(series.map(|series| &series.of));
+        for figure in figures {
+            assert!(named.contains(bench_of(figure)), "no benchmark measures {figure}");
+        }
+    }
+
+    /// Of a package's manifest, what is needed.
+    #[derive(Deserialize)]
+    struct Manifest {
+        #[serde(default)]
+        bench: Vec<Target>,
+        workspace: Option<Workspace>,
+    }
+
+    #[derive(Deserialize)]
+    struct Target {
+        name: String,
+    }
+
+    #[derive(Deserialize)]
+    struct Workspace {
+        members: Vec<String>,
+    }
+
+    #[test]
+    fn the_file_names_the_benchmarks_that_there_are_and_no_other() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        let manifest = |folder: &Path| -> Manifest {
+            toml::from_str(&fs::read_to_string(folder.join("Cargo.toml")).unwrap()).unwrap()
+        };
+        let members = manifest(&root).workspace.unwrap().members;
+        let there: BTreeSet<String> = members
+            .iter()
+            .flat_map(|member| manifest(&root.join(member)).bench)
+            .map(|target| target.name)
+            .collect();
+        let named: BTreeSet<String> = Catalogue::load().benches.into_iter().map(|bench| bench.name).collect();
+        assert_eq!(named, there);
+    }
+
+    #[test]
+    fn a_row_says_what_is_emulated() {
+        let catalogue = Catalogue::load();
+        let row = catalogue.rows.iter().find(|row| row.native_with.is_some()).unwrap();
+        assert_eq!(row.clone().on(&["avx512_bf16"]), *row);
+        let emulated = row.clone().on(&["avx2"]);
+        assert_eq!(emulated.stage, format!("{} (emulated: no avx512_bf16)", row.stage));
     }
 }

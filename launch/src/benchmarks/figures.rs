@@ -39,7 +39,7 @@ pub struct Told {
     pub name: String,
     /// The figure.
     pub figure: f64,
-    /// Its unit, which is that of its row.
+    /// Its unit, which must be that of its row.
     pub unit: String,
     /// What it is compared with.
     pub baseline: Option<String>,
@@ -68,6 +68,25 @@ pub enum FiguresError {
         #[source]
         source: serde_json::Error,
     },
+}
+
+/// Why a figure cannot be shown as it is asked for.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Unfit {
+    /// It has another unit.
+    #[error("is in {found}, not in {asked}")]
+    Unit {
+        /// Its own.
+        found: String,
+        /// The one asked for.
+        asked: String,
+    },
+    /// A time is asked for.
+    #[error("is a value that a benchmark told, not a time that criterion took")]
+    Told,
+    /// A value is asked for.
+    #[error("is a time that criterion took, not a value that a benchmark told")]
+    Timed,
 }
 
 /// Of criterion's `benchmark.json`, what is needed.
@@ -190,18 +209,40 @@ impl Samples {
 }
 
 impl Figure {
-    /// The number that is shown, in `unit` and `scale` times; of a share of the peak, the time. `None` when this kind of figure has no such number.
-    pub fn shown(&self, show: Show, unit: &str, scale: f64) -> Option<f64> {
+    /// The number that is shown, in `unit` and `scale` times; of a share of the peak, the time.
+    ///
+    /// # Errors
+    /// [`Unfit`] when this figure has no such number.
+    pub fn shown(&self, show: Show, unit: &str, scale: f64) -> Result<f64, Unfit> {
+        let foreign = |found: &str| Unfit::Unit {
+            found: found.to_owned(),
+            asked: unit.to_owned(),
+        };
+        let in_unit = |secs: f64| Ok(secs * per_second(unit).ok_or_else(|| foreign("s"))?);
         let value = match (self, show) {
             (Self::Timed { secs, elements, .. }, Show::Rate) => elements / secs,
-            (Self::Timed { secs, elements, .. }, Show::Time) => secs / elements * per_second(unit)?,
-            (Self::Timed { secs, .. }, Show::PeakShare) => secs * per_second(unit)?,
-            (Self::Told(told), Show::Value) => told.figure,
-            (Self::Timed { .. }, Show::Value) | (Self::Told(_), Show::Rate | Show::Time | Show::PeakShare) => {
-                return None;
-            }
+            (Self::Timed { secs, elements, .. }, Show::Time) => in_unit(secs / elements)?,
+            (Self::Timed { secs, .. }, Show::PeakShare) => in_unit(*secs)?,
+            (Self::Told(told), Show::Value) if told.unit == unit => told.figure,
+            (Self::Told(told), Show::Value) => return Err(foreign(&told.unit)),
+            (Self::Timed { .. }, Show::Value) => return Err(Unfit::Timed),
+            (Self::Told(_), Show::Rate | Show::Time | Show::PeakShare) => return Err(Unfit::Told),
         };
-        Some(value * scale)
+        Ok(value * scale)
+    }
+
+    /// The same figure by the median of its samples, if it was timed.
+    pub fn at_median(&self) -> Option<Self> {
+        match *self {
+            Self::Timed {
+                median_secs, elements, ..
+            } => Some(Self::Timed {
+                secs: median_secs,
+                median_secs,
+                elements,
+            }),
+            Self::Told(_) => None,
+        }
     }
 
     /// How many times longer than the fastest sample the median took, if it was timed.
@@ -272,12 +313,16 @@ pub(super) mod tests {
 
         let figures = Figures::read(directory.path()).unwrap();
         let timed = figures.get("replay/sample/1024").unwrap();
-        assert_eq!(timed.shown(Show::Time, "µs", 1.0), Some(0.5));
-        assert_eq!(timed.shown(Show::Rate, "any", 0.5), Some(1e6));
+        assert_eq!(timed.shown(Show::Time, "µs", 1.0), Ok(0.5));
+        assert_eq!(timed.shown(Show::Rate, "any", 0.5), Ok(1e6));
         assert_eq!(timed.disturbance(), Some(1.5));
-        assert_eq!(timed.shown(Show::Value, "any", 1.0), None);
+        assert_eq!(timed.at_median().unwrap().shown(Show::Time, "µs", 1.0), Ok(0.75));
+        assert_eq!(timed.shown(Show::Value, "any", 1.0), Err(Unfit::Timed));
         let told = figures.get("transport/records").unwrap();
-        assert_eq!(told.shown(Show::Value, "records/s", 1.0), Some(3e5));
+        assert_eq!(told.shown(Show::Value, "records/s", 1.0), Ok(3e5));
+        let refused = told.shown(Show::Value, "steps/s", 1.0).unwrap_err();
+        assert_eq!(refused.to_string(), "is in records/s, not in steps/s");
+        assert_eq!(told.shown(Show::Rate, "records/s", 1.0), Err(Unfit::Told));
 
         fs::write(directory.path().join("bad.figures"), "{\"name\":1}\n").unwrap();
         let refused = Figures::read(directory.path()).unwrap_err().to_string();

@@ -37,6 +37,10 @@ pub struct Core {
     pub f32_flops: f64,
     /// Bytes a second copied from memory to memory.
     pub copied_bytes_per_sec: f64,
+    /// Threads of others that ran, or wanted to, at that moment: with any, times are too long.
+    pub others_running: u32,
+    /// Whether it was the only core that was allowed to measure.
+    pub is_pinned: bool,
 }
 
 /// What is known of it.
@@ -54,8 +58,6 @@ pub struct Machine {
     pub memory_bytes: u64,
     /// The kernel.
     pub kernel: String,
-    /// Processes that wanted to run, on average over the last five minutes: more than the benchmarks' one, and times are too long.
-    pub load: f64,
 }
 
 impl Core {
@@ -64,10 +66,12 @@ impl Core {
         Self {
             f32_flops: peak_flops(Isa::best()),
             copied_bytes_per_sec: copied_bytes_per_sec(),
+            others_running: others_running(&read("/proc/loadavg")),
+            is_pinned: thread::available_parallelism().is_ok_and(|cores| cores.get() == 1),
         }
     }
 
-    /// The best of what the lines of `path` say; measured now where there are none.
+    /// The best of what the lines of `path` say, and the worst of what disturbed it; measured now where there are none.
     pub fn best_of(path: &Path) -> Self {
         let text = fs::read_to_string(path).unwrap_or_default();
         let lines = text.lines().filter_map(|line| serde_json::from_str(line).ok());
@@ -75,6 +79,8 @@ impl Core {
             .reduce(|a: Self, b: Self| Self {
                 f32_flops: a.f32_flops.max(b.f32_flops),
                 copied_bytes_per_sec: a.copied_bytes_per_sec.max(b.copied_bytes_per_sec),
+                others_running: a.others_running.max(b.others_running),
+                is_pinned: a.is_pinned && b.is_pinned,
             })
             .unwrap_or_else(Self::measure)
     }
@@ -83,7 +89,6 @@ impl Core {
 impl Machine {
     /// This machine, whose cores are like `core`.
     pub fn with(core: Core) -> Self {
-        let load = read("/proc/loadavg");
         let info = read("/proc/cpuinfo");
         let field = |name: &str| {
             info.lines()
@@ -111,11 +116,6 @@ impl Machine {
             core,
             memory_bytes: memory_kib.unwrap_or(0_u64) << 10,
             kernel: read("/proc/sys/kernel/osrelease").trim().to_owned(),
-            load: load
-                .split_whitespace()
-                .nth(1)
-                .and_then(|word| word.parse().ok())
-                .unwrap_or(0.0),
         }
     }
 }
@@ -130,6 +130,15 @@ fn copied_bytes_per_sec() -> f64 {
         start.elapsed().as_secs_f64()
     });
     COPIED as f64 / copies.fold(f64::INFINITY, f64::min)
+}
+
+/// Of `/proc/loadavg`, the threads that run or want to, without the calling one.
+fn others_running(load: &str) -> u32 {
+    let running = load
+        .split_whitespace()
+        .nth(3)
+        .and_then(|word| word.split('/').next()?.parse().ok());
+    running.unwrap_or(1_u32).saturating_sub(1)
 }
 
 /// The machine's cores; the calling thread itself may be pinned to one.
@@ -147,17 +156,18 @@ impl fmt::Display for Machine {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "{}, {} cores, {:.0} GB of memory, Linux {}, load {:.1}",
+            "{}, {} cores, {:.0} GB of memory, Linux {}; between benchmarks, at most {} threads of others ran",
             self.processor,
             self.cores,
             self.memory_bytes as f64 / 1e9,
             self.kernel,
-            self.load
+            self.core.others_running
         )?;
         write!(
             f,
-            "{}; one core: {:.1} GFLOP/s in f32, {:.1} GB/s copied",
+            "{}; one core{}: {:.1} GFLOP/s in f32, {:.1} GB/s copied",
             self.instructions.join(" "),
+            if self.core.is_pinned { "" } else { ", NOT pinned to it" },
             self.core.f32_flops / 1e9,
             self.core.copied_bytes_per_sec / 1e9
         )
@@ -172,15 +182,26 @@ mod tests {
     fn the_best_of_what_was_measured_counts() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("machine.jsonl");
-        let line = |f32_flops, copied_bytes_per_sec| {
+        let line = |f32_flops, copied_bytes_per_sec, others_running| {
             let core = Core {
                 f32_flops,
                 copied_bytes_per_sec,
+                others_running,
+                is_pinned: others_running == 0,
             };
             serde_json::to_string(&core).unwrap()
         };
-        fs::write(&path, format!("{}\n{}\n", line(2e9, 1e9), line(1e9, 3e9))).unwrap();
+        fs::write(&path, format!("{}\n{}\n", line(2e9, 1e9, 0), line(1e9, 3e9, 2))).unwrap();
         let best = Core::best_of(&path);
         assert_eq!((best.f32_flops, best.copied_bytes_per_sec), (2e9, 3e9));
+        // And the worst of what disturbed.
+        assert_eq!((best.others_running, best.is_pinned), (2, false));
+    }
+
+    #[test]
+    fn whoever_asks_does_not_count_as_another() {
+        assert_eq!(others_running("9.92 9.09 6.03 3/412 31793"), 2);
+        assert_eq!(others_running("0.00 0.00 0.00 1/412 31793"), 0);
+        assert_eq!(others_running(""), 0);
     }
 }

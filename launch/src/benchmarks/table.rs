@@ -23,6 +23,8 @@ struct Line {
     unit: String,
     /// In `unit`.
     figure: Option<f64>,
+    /// The same by the median of its samples, if it was timed.
+    median: Option<f64>,
     /// Of the core's f32 peak.
     peak_share: Option<f64>,
     target: String,
@@ -84,12 +86,13 @@ impl Table {
 
     fn grid(&self, judging: Judging) -> Grid {
         let mut grid = Grid::new();
-        grid.set_header(["stage", "figure", "must reach", "baseline", "ratio", "met"]);
+        grid.set_header(["stage", "figure", "median", "must reach", "baseline", "ratio", "met"]);
         for line in &self.lines {
             let right = |text: String| Cell::new(text).set_alignment(CellAlignment::Right);
             grid.add_row([
                 Cell::new(&line.stage),
                 right(line.figure_text()),
+                right(line.median.map(number).unwrap_or_default()),
                 right(line.target.clone()),
                 Cell::new(line.baseline_text()),
                 right(
@@ -111,7 +114,8 @@ impl Table {
 impl Line {
     fn new(row: &Row, figures: &Figures, f32_flops: f64) -> Self {
         let measured = figures.get(&row.figure);
-        let figure = measured.and_then(|measured| measured.shown(row.show, &row.unit, row.scale));
+        let shown = |figure: &Figure| figure.shown(row.show, &row.unit, row.scale).ok();
+        let figure = measured.and_then(shown);
         let peak_share = match (row.show, measured) {
             (Show::PeakShare, Some(Figure::Timed { secs, elements, .. })) => Some(elements / secs / f32_flops),
             _ => None,
@@ -127,6 +131,7 @@ impl Line {
             stage: row.stage.clone(),
             unit: row.unit.clone(),
             figure,
+            median: measured.and_then(Figure::at_median).as_ref().and_then(shown),
             peak_share,
             target: target(row),
             verdict: judge(row, figure, peak_share, ratio),
@@ -169,12 +174,11 @@ fn compared(row: &Row, measured: &Figure, figures: &Figures) -> Option<Compared>
             Figure::Timed { .. } => None,
         };
     };
-    // Times add up, rates do not.
-    let added = match row.show {
-        Show::Rate => Show::Time,
-        show @ (Show::Time | Show::PeakShare | Show::Value) => show,
-    };
-    let parts = baseline.of.iter().map(|of| figures.get(of)?.shown(added, "s", 1.0));
+    let (show, unit) = row.part_shown();
+    let parts = baseline
+        .of
+        .iter()
+        .map(|of| figures.get(of)?.shown(show, unit, 1.0).ok());
     let sum: f64 = parts.sum::<Option<f64>>()?;
     let figure = match row.show {
         Show::Rate => 1.0 / sum,
@@ -266,6 +270,7 @@ mod tests {
             at_most: None,
             baseline: None,
             ratio_at_least: None,
+            native_with: None,
         }
     }
 

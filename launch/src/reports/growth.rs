@@ -41,7 +41,7 @@ pub fn draw(growth: &Growth, figures: &Figures, path: &Path) -> Result<bool, Rep
             points: figures
                 .series(&series.of)
                 .into_iter()
-                .filter_map(|(x, figure)| Some((x, figure.shown(series.show, &series.unit, series.scale)?)))
+                .filter_map(|(x, figure)| Some((x, figure.shown(series.show, &series.unit, series.scale).ok()?)))
                 .filter(|&(x, y)| x > 0.0 && y > 0.0 && x.is_finite() && y.is_finite())
                 .collect(),
         })

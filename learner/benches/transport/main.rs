@@ -6,7 +6,7 @@
 //! there are, though not how many records a larger machine would move.
 //!
 //! Each figure is a line of JSON on standard output, with the baseline it is to be seen against, measured beside it; a table for people goes to standard
-//! error. `--quick` measures for a moment only, to see that it works.
+//! error. `--quick` measures for a moment only, with the fewest and the most actors, to see that it works.
 
 #![allow(clippy::unwrap_used, reason = "a benchmark fails by panicking, as tests do")]
 
@@ -42,7 +42,7 @@ fn main() {
     // Ascending, for actors only come.
     let actors = match (is_quick, chosen.is_empty()) {
         (_, false) => chosen,
-        (true, true) => vec![1, 2],
+        (true, true) => vec![ACTORS[0], ACTORS[ACTORS.len() - 1]],
         (false, true) => ACTORS.to_vec(),
     };
     let seconds = if is_quick { 0.3 } else { 2.0 };

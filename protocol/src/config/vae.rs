@@ -20,8 +20,8 @@ pub struct VaeSection {
     pub learning_rate: f64,
     /// Weight of the Kullback-Leibler term against the squared error summed over the image's pixels. Default 1, the plain VAE.
     pub kl_weight: f64,
-    /// In what precision depth images are encoded: `f32` or `bf16`. Part of the result. AMD's Zen 4 encodes nearly twice as fast in bfloat16, Intel's Sapphire and Emerald Rapids
-    /// more slowly than in `f32`; all processors get the same numbers (those below 1.2e-38 apart). The VAE is trained in `f32` either way. Default `f32`.
+    /// In what precision depth images are encoded: `f32` or `bf16`. Part of the result. AVX-512's instruction for bfloat16 is used where it is, AMX never: AMD's Zen 4
+    /// encodes nearly twice as fast with it, Intel's Sapphire and Emerald Rapids more slowly than in `f32`; all processors get the same numbers (those below 1.2e-38 apart). The VAE is trained in `f32` either way. Default `f32`.
     pub encoder_precision: Precision,
 }
 

@@ -5,6 +5,7 @@
 //! [`reference`](ReferenceCamera) traces the same surfaces ray by ray; a property test holds the two together.
 
 mod canvas;
+mod instructions;
 mod noise;
 mod reference;
 mod scene;
@@ -20,6 +21,7 @@ use nalgebra::Isometry3;
 use crate::course::Course;
 use crate::disturbances::DepthNoiseSettings;
 
+pub use instructions::Instructions;
 pub use reference::ReferenceCamera;
 pub use settings::{CameraFault, CameraSettings};
 
@@ -38,11 +40,8 @@ pub struct DepthCamera {
     scene: scene::Scene,
     canvas: canvas::Canvas,
     noise: Option<noise::StereoNoise>,
-    draw: Draw,
+    draw: instructions::Draw,
 }
-
-/// [`draw`], compiled for the instructions that this machine has.
-type Draw = fn(&mut DepthCamera, &settings::View, Errors, &mut [u8; IMAGE_PIXELS]);
 
 /// Which errors an image has.
 #[derive(Clone, Copy)]
@@ -64,7 +63,7 @@ impl DepthCamera {
             scene: scene::Scene::new(&course.mesh()),
             canvas: canvas::Canvas::new(),
             noise: None,
-            draw: fastest_draw(),
+            draw: Instructions::best().draw(),
         })
     }
 
@@ -100,36 +99,4 @@ fn draw(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: 
         (Errors::OfKey(key), Some(noise)) => noise.write(camera.canvas.nearness(), key, image),
         _ => camera.canvas.write(image),
     }
-}
-
-/// The same arithmetic in the same order whichever is chosen: wider registers do not change a bit of the image.
-fn fastest_draw() -> Draw {
-    #[cfg(target_arch = "x86_64")]
-    {
-        if is_x86_feature_detected!("avx512f")
-            && is_x86_feature_detected!("avx512bw")
-            && is_x86_feature_detected!("avx512dq")
-            && is_x86_feature_detected!("avx512vl")
-        {
-            // SAFETY: the machine has the features that the function is compiled for, as just asked.
-            return |camera, view, errors, image| unsafe { draw_avx512(camera, view, errors, image) };
-        }
-        if is_x86_feature_detected!("avx2") {
-            // SAFETY: as above.
-            return |camera, view, errors, image| unsafe { draw_avx2(camera, view, errors, image) };
-        }
-    }
-    draw
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-fn draw_avx512(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: &mut [u8; IMAGE_PIXELS]) {
-    draw(camera, view, errors, image);
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn draw_avx2(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: &mut [u8; IMAGE_PIXELS]) {
-    draw(camera, view, errors, image);
 }

@@ -2,7 +2,7 @@
 
 use nalgebra::Isometry3;
 
-use super::{CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use super::{CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, Instructions};
 use crate::course::{Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout, test_course};
 use crate::disturbances::{DepthModel, DepthNoiseSettings};
 
@@ -224,9 +224,12 @@ fn instructions_do_not_change_a_bit_of_the_errors() {
         .unwrap()
         .with_noise(&settings);
     let pose = Isometry3::translation(7.0, 0.4, 3.0);
-    let [mut fastest, mut plain] = [[0; IMAGE_PIXELS]; 2];
-    camera.render_with_noise(&pose, 9, &mut fastest);
+    let [mut plain, mut wider] = [[0; IMAGE_PIXELS]; 2];
     camera.draw = super::draw;
     camera.render_with_noise(&pose, 9, &mut plain);
-    assert!(fastest == plain);
+    for set in Instructions::ALL.into_iter().filter(|set| set.is_available()) {
+        camera.draw = set.draw();
+        camera.render_with_noise(&pose, 9, &mut wider);
+        assert!(plain == wider, "{set}");
+    }
 }

@@ -7,7 +7,8 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail};
 use clap::{Parser, Subcommand};
 use serde::Serialize;
-use skein_launch::benchmarks::catalogue::{BenchKind, Catalogue, When, bench_of};
+use skein_launch::benchmarks::catalogue::{BenchKind, Catalogue, Growth, Row, When, bench_of};
+use skein_launch::benchmarks::faults::faults;
 use skein_launch::benchmarks::figures::Figures;
 use skein_launch::benchmarks::machine::{Core, Machine};
 use skein_launch::benchmarks::table::{Judging, Table};
@@ -113,39 +114,69 @@ fn core() -> Result<()> {
 }
 
 fn tell(directory: &Path, only: &[String], judging: Judging, pictures: Option<&Path>) -> Result<()> {
-    let Catalogue { mut rows, growths, .. } = Catalogue::load();
-    rows.retain(|row| only.is_empty() || only.iter().any(|name| name == bench_of(&row.figure)));
+    let wanted = |figure: &str| only.is_empty() || only.iter().any(|name| name == bench_of(figure));
+    let Catalogue { rows, growths, .. } = Catalogue::load();
     let figures = Figures::read(directory)?;
     if figures.is_empty() {
         bail!("{} holds no figures: run launch/bench.sh", directory.display());
     }
     let machine = Machine::with(Core::best_of(&directory.join("machine.jsonl")));
+    let rows: Vec<Row> = rows
+        .into_iter()
+        .filter(|row| wanted(&row.figure))
+        .map(|row| row.on(&machine.instructions))
+        .collect();
     let table = Table::new(&rows, &figures, machine.core.f32_flops);
-    println!("{machine}\n{}", table.to_terminal(judging));
-    match (judging, figures.most_disturbed()) {
-        (Judging::Nothing, _) => println!("Run to see that the benchmarks work: these times mean nothing."),
-        (Judging::Times, None) => {}
-        (Judging::Times, Some((name, times))) => println!(
-            "Times are those of the fastest of 60 samples; the median was up to {times:.2} times that, at {name}."
-        ),
-    }
+    let note = note(judging, &figures);
+    println!("{machine}\n{}\n{note}", table.to_terminal(judging));
 
     let write = |name: &str, text: String| {
         let path = directory.join(name);
         fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
     };
-    write("table.md", format!("{machine}\n\n{}\n", table.to_markdown(judging)))?;
+    write(
+        "table.md",
+        format!("{machine}\n\n{}\n\n{note}\n", table.to_markdown(judging)),
+    )?;
     let results = Results {
         machine: &machine,
         table: &table,
     };
     write("table.json", serde_json::to_string_pretty(&results)?)?;
+    let growths: Vec<Growth> = growths
+        .into_iter()
+        .filter(|growth| pictures.is_some() && growth.series.iter().all(|series| wanted(&series.of)))
+        .collect();
     if let Some(folder) = pictures {
-        for growth in &growths {
-            let path = folder.join(&growth.picture).with_extension("png");
-            if growth::draw(growth, &figures, &path)? {
-                println!("{}", path.display());
-            }
+        draw(&growths, &figures, folder)?;
+    }
+    match faults(&rows, &growths, &figures) {
+        faults if faults.is_empty() => Ok(()),
+        faults => bail!(
+            "the benchmarks told something else than launch/benchmarks.toml asks for:\n  {}",
+            faults.join("\n  ")
+        ),
+    }
+}
+
+/// What is to be known of the table's times.
+fn note(judging: Judging, figures: &Figures) -> String {
+    match (judging, figures.most_disturbed()) {
+        (Judging::Nothing, _) => "Run to see that the benchmarks work: these times mean nothing.".to_owned(),
+        (Judging::Times, None) => {
+            "What needs processes is a median of 15 starts, or a mean over two seconds.".to_owned()
+        }
+        (Judging::Times, Some((name, times))) => format!(
+            "A figure that has a median beside it is the fastest of 60 samples, and judged by that; the median took up to {times:.2} times as long, at {name}."
+        ),
+    }
+}
+
+fn draw(growths: &[Growth], figures: &Figures, folder: &Path) -> Result<()> {
+    for growth in growths {
+        let path = folder.join(&growth.picture).with_extension("png");
+        if growth::draw(growth, figures, &path)? {
+            println!("{}", path.display());
         }
     }
     Ok(())
