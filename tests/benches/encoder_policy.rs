@@ -23,7 +23,7 @@ fn main() {
     let mut config = Config::default();
     config.learning.observation = OBSERVATION;
     let vae = TorchVae::new(&config.vae, 1, Device::Cpu);
-    let sac = TorchSac::new(&config.sac, OBSERVATION, 1, Device::Cpu);
+    let sac = TorchSac::new(&config.sac, OBSERVATION.len(), 1, Device::Cpu);
     let layout = SnapshotLayout::of(&config);
     let mut values = vec![0.0; layout.values()];
     vae.publish(&mut values[layout.encoder()]);

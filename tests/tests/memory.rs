@@ -29,7 +29,7 @@ fn assert_actors_stay_below(bytes: u64, policy_lag: u64) {
     let actors = run.processes(Role::Actor);
     assert_eq!(actors.len(), 2);
     for actor in actors {
-        let most = actor.usage().unwrap().most_resident_bytes;
+        let most = actor.usage().expect("the actor is alive").most_resident_bytes;
         println!("actor {}: {most} bytes with policy lag {policy_lag}", actor.pid());
         assert!(most <= bytes, "actor {} took {most} bytes", actor.pid());
     }

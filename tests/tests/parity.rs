@@ -150,7 +150,7 @@ fn what_the_learner_publishes_flies_as_the_learner_says() {
         .flat_map(|observation| ENGINES.map(|engine| (observation, engine)))
     {
         let config = config(observation);
-        let sac = Sac::new(&config.sac, observation, 9, engine, Device::Cpu);
+        let sac = Sac::new(&config.sac, observation.len(), 9, engine, Device::Cpu);
         let network = network(&config, &vae(&config, 9), |into| sac.publish(into));
         let observed = vec![0.3; observation.len()];
         let learner = sac.mode(&observed);
