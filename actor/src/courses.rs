@@ -280,6 +280,7 @@ mod tests {
             start_level: 1,
             exploration: Exploration::Mode,
             seed: 1,
+            leg: None,
         }
     }
 

@@ -1,8 +1,8 @@
-//! The environment loop: one ticket in, one flight out.
+//! The environment loop: one ticket in, one flight out, or one leg of a flight.
 //!
 //! [`Pilot::fly`] is the whole of it, and the only one: training, evaluation during training and evaluation of a file differ in the ticket and in where
 //! the records go. A flight is a function of its ticket and of the snapshot the ticket names, so nothing is remembered from one flight to the next, and
-//! start, exploration noise and disturbances are drawn from generators of their own.
+//! start, exploration noise and disturbances are drawn from generators of their own. What is remembered from one leg to the next saves time alone.
 
 use std::ops::DerefMut;
 
@@ -11,6 +11,7 @@ use rand_pcg::Pcg64Mcg;
 use skein_protocol::ACTION;
 use skein_protocol::evaluation::FlightScore;
 use skein_protocol::ids::{ActorId, Incarnation};
+use skein_protocol::leg::Leg;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Ticket;
@@ -30,6 +31,8 @@ pub struct Pilot {
     simulators: Simulators,
     reward: RewardSettings,
     agent: Agent,
+    /// What the last ticket left in the air, if it was for a leg.
+    under_way: Option<UnderWay>,
 }
 
 impl Pilot {
@@ -42,6 +45,7 @@ impl Pilot {
             simulators,
             reward,
             agent,
+            under_way: None,
         }
     }
 
@@ -50,38 +54,40 @@ impl Pilot {
         self.incarnation = incarnation;
     }
 
-    /// Flies `ticket` with `network` from take-off to its end: each step a record into `link`, and a closing one at last.
+    /// Flies `ticket` with `network` to the end of its flight or its leg: each step a record into `link`, and a closing one at last. `None` when the flight
+    /// goes on after the leg.
     ///
     /// # Errors
-    /// [`FlightError`]; what was sent of the flight is void then.
+    /// [`FlightError`]; what was sent on this ticket is void then.
     pub fn fly<L: RecordLink>(
         &mut self,
         ticket: &Ticket,
         network: &Network,
         link: &mut L,
-    ) -> Result<FlightScore, FlightError<L::Error>> {
-        let mut noise = generator(ticket, Purpose::ActionNoise);
+    ) -> Result<Option<FlightScore>, FlightError<L::Error>> {
+        // Each leg draws from a generator of its own: who flies a later one need not know how often the earlier ones drew.
+        let mut noise = generator(ticket, Purpose::ActionNoise, ticket.first_step());
         let begin = |link: &mut L, step| {
             let mut record = link.loan().map_err(FlightError::Link)?;
             record.begin(ticket, self.actor, self.incarnation, step);
             Ok(record)
         };
 
-        let mut record = begin(link, 0)?;
-        let simulator = match take_off(&mut self.simulators, ticket) {
-            Ok(simulator) => simulator,
+        let mut record = begin(link, ticket.first_step())?;
+        let (simulator, mut flown) = match take_up(&mut self.simulators, self.under_way.take(), ticket) {
+            Ok(taken_up) => taken_up,
             Err(fault) => return Err(give_up(fault, record, link)),
         };
         link.lap(Stage::TakeOff);
         self.agent
             .observe(simulator, network, &mut record, |stage| link.lap(stage));
 
-        let mut previous_action = [0.0; ACTION];
         let mut flight_return = 0.0;
-        for step in 1.. {
+        for step in ticket.first_step() + 1.. {
             if link.directive().map_err(FlightError::Link)? == Directive::Abandon {
                 return Err(FlightError::Abandoned);
             }
+            let previous_action = flown.last().copied().unwrap_or_default();
             let action = self
                 .agent
                 .act(ticket.exploration, network, &record, &previous_action, &mut noise);
@@ -101,20 +107,19 @@ impl Pilot {
             link.send(record).map_err(FlightError::Link)?;
 
             flight_return += f64::from(reward.total());
-            previous_action = action;
+            flown.push(action);
             record = next;
             if let Some(ended) = report.outcome {
-                let outcome = outcome(ended);
-                let hit_wall = hit_wall(&report);
-                close(&mut record, outcome, &report, simulator.course());
+                let score = close(&mut record, outcome(ended), &report, simulator.course(), flight_return);
                 link.send(record).map_err(FlightError::Link)?;
-                return Ok(FlightScore {
-                    walls_passed: report.walls_passed.into(),
-                    // As in `flights.csv`.
-                    flight_return: f64::from(flight_return as f32),
-                    outcome,
-                    hit_wall,
-                });
+                return Ok(Some(score));
+            }
+            if is_last_of_leg(ticket, step) {
+                record.kind = RecordKind::LegEnd.code();
+                record.walls_passed = report.walls_passed;
+                link.send(record).map_err(FlightError::Link)?;
+                self.under_way = Some(UnderWay::after(ticket, flown));
+                return Ok(None);
             }
         }
         unreachable!("the simulator's step limit ends every flight before the step numbers run out")
@@ -185,21 +190,88 @@ pub enum FlightFault {
     /// The simulation broke down.
     #[error(transparent)]
     Simulation(#[from] SimulationError),
+    /// The actions before a leg do not lead to it.
+    #[error("the flight ends in step {step} of the {flown} that are said to have been flown before the leg")]
+    EndedBefore {
+        /// The step, from 1.
+        step: usize,
+        /// Actions flown before.
+        flown: usize,
+    },
+}
+
+/// A flight in the middle, in the simulator that has flown the last of it.
+struct UnderWay {
+    ticket: Ticket,
+    /// From take-off on.
+    flown: Vec<[f32; ACTION]>,
+}
+
+impl UnderWay {
+    fn after(ticket: &Ticket, flown: Vec<[f32; ACTION]>) -> Self {
+        let ticket = ticket.clone();
+        Self { ticket, flown }
+    }
+
+    /// Whether `leg` of the flight of `ticket` begins here, to the last bit.
+    fn is_before(&self, ticket: &Ticket, leg: &Leg) -> bool {
+        let flight = |ticket: &Ticket| {
+            (
+                ticket.run,
+                ticket.flight,
+                ticket.course,
+                ticket.start_level,
+                ticket.seed,
+            )
+        };
+        let bits = |actions: &[[f32; ACTION]]| -> Vec<_> { actions.iter().flatten().map(|x| x.to_bits()).collect() };
+        flight(&self.ticket) == flight(ticket) && bits(&self.flown) == bits(&leg.flown)
+    }
+}
+
+/// The simulator where `ticket` begins, and the actions that led there: at take-off or, of a later leg, where the one before ended. If that was not flown here,
+/// or something else was since, the actions are repeated, which leads to the same place.
+fn take_up<'a>(
+    simulators: &'a mut Simulators,
+    under_way: Option<UnderWay>,
+    ticket: &Ticket,
+) -> Result<(&'a mut Simulator, Vec<[f32; ACTION]>), FlightFault> {
+    let Some(leg) = &ticket.leg else {
+        return Ok((take_off(simulators, ticket)?, Vec::new()));
+    };
+    if let Some(under_way) = under_way.filter(|under_way| under_way.is_before(ticket, leg)) {
+        return Ok((simulators.of(ticket)?, under_way.flown));
+    }
+    let simulator = take_off(simulators, ticket)?;
+    for (number, action) in (1..).zip(leg.flown.iter()) {
+        if simulator.step(*action)?.outcome.is_some() {
+            return Err(FlightFault::EndedBefore {
+                step: number,
+                flown: leg.flown.len(),
+            });
+        }
+    }
+    Ok((simulator, leg.flown.to_vec()))
+}
+
+fn is_last_of_leg(ticket: &Ticket, step: u32) -> bool {
+    let leg = ticket.leg.as_ref();
+    leg.is_some_and(|leg| step == ticket.first_step() + leg.steps)
 }
 
 fn take_off<'a>(simulators: &'a mut Simulators, ticket: &Ticket) -> Result<&'a mut Simulator, FlightFault> {
     let simulator = simulators.of(ticket)?;
     simulator.reset(
         ticket.start_level,
-        &mut generator(ticket, Purpose::StartPosition),
-        &mut generator(ticket, Purpose::Disturbances),
+        &mut generator(ticket, Purpose::StartPosition, 0),
+        &mut generator(ticket, Purpose::Disturbances, 0),
     )?;
     Ok(simulator)
 }
 
-/// What draws for one purpose in the flight of `ticket`.
-fn generator(ticket: &Ticket, purpose: Purpose) -> Pcg64Mcg {
-    Pcg64Mcg::seed_from_u64(derive(ticket.seed, purpose, 0))
+/// What draws for one purpose in the flight of `ticket`, from `step` on.
+fn generator(ticket: &Ticket, purpose: Purpose, step: u32) -> Pcg64Mcg {
+    Pcg64Mcg::seed_from_u64(derive(ticket.seed, purpose, step.into()))
 }
 
 /// Writes into the record of an observation what was done on it and what came of that.
@@ -214,13 +286,27 @@ fn complete(record: &mut TransitionRecord, action: [f32; ACTION], report: &StepR
     record.truncated = u8::from(report.outcome == Some(simulator::Outcome::TimedOut));
 }
 
-/// Makes a record with an observation the flight's last.
-fn close(record: &mut TransitionRecord, outcome: Outcome, report: &StepReport, course: &Course) {
+/// Makes a record with an observation the flight's last; returns what the flight came to.
+fn close(
+    record: &mut TransitionRecord,
+    outcome: Outcome,
+    report: &StepReport,
+    course: &Course,
+    flight_return: f64,
+) -> FlightScore {
+    let hit_wall = hit_wall(report);
     record.kind = RecordKind::Closing.code();
     record.walls_passed = report.walls_passed;
     record.course_walls = course.levels();
     record.outcome = outcome.code();
-    record.hit_wall = hit_wall(report).unwrap_or(0);
+    record.hit_wall = hit_wall.unwrap_or(0);
+    FlightScore {
+        walls_passed: report.walls_passed.into(),
+        // As in `flights.csv`; of a leg, what was earned in it.
+        flight_return: f64::from(flight_return as f32),
+        outcome,
+        hit_wall,
+    }
 }
 
 /// The wall that was hit, from 1 in flight order.
@@ -249,5 +335,7 @@ fn outcome(ended: simulator::Outcome) -> Outcome {
     }
 }
 
+#[cfg(test)]
+mod leg_tests;
 #[cfg(test)]
 mod tests;

@@ -217,6 +217,7 @@ impl Evaluation<'_> {
             start_level: 1,
             exploration: Exploration::Mode,
             seed: derive(self.config.run.seed, Purpose::EvaluationFlight, flight),
+            leg: None,
         };
         let mut memory = Memory {
             keep: self.keep,
@@ -225,7 +226,7 @@ impl Evaluation<'_> {
             sent: Vec::new(),
         };
         match pilot.fly(&ticket, network, &mut memory) {
-            Ok(score) => Ok(EvaluatedFlight {
+            Ok(Some(score)) => Ok(EvaluatedFlight {
                 score,
                 walls: memory.walls,
                 records: memory.sent,
@@ -236,6 +237,7 @@ impl Evaluation<'_> {
                 Err(EvaluationError::Flight { course, flight, fault })
             }
             Err(FlightError::Link(never)) => match never {},
+            Ok(None) => unreachable!("its ticket is for a whole flight"),
             Err(FlightError::Abandoned) => unreachable!("nobody tells an evaluation to stop"),
         }
     }

@@ -180,7 +180,8 @@ fn fly(pilot: &mut Pilot, ticket: &Ticket, network: &Network, line: &mut Learner
         info_span!("flight", flight = %ticket.flight, attempt = %ticket.attempt, policy = %ticket.policy_version);
     let _entered = span.enter();
     match pilot.fly(ticket, network, line) {
-        Ok(score) => {
+        Ok(None) => debug!(steps = ticket.first_step(), "leg flown"),
+        Ok(Some(score)) => {
             line.flights_flown += 1;
             debug!(
                 walls = score.walls_passed,

@@ -7,10 +7,10 @@ use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_learner::flight::{CommittedFlight, StepObservation};
 use skein_learner::replay::{Minibatch, Replay};
-use skein_protocol::LATENT;
 use skein_protocol::config::{Config, Observation};
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::transition::Outcome;
+use skein_protocol::{ACTION, LATENT};
 
 /// Transitions a minibatch.
 const BATCH: usize = 256;
@@ -66,6 +66,8 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedFlight {
         policy_version: PolicyVersion(0),
         actor: ActorId(0),
         level: 1,
+        first_step: 0,
+        action_before: [0.0; ACTION],
         observations: (0..=STEPS)
             .map(|_| StepObservation {
                 latent: [(); LATENT].map(|()| draw()),
@@ -78,7 +80,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedFlight {
         rewards: (0..STEPS).map(|_| draw()).collect(),
         reward_terms: vec![[0.0; 4]; STEPS],
         level_up: (0..STEPS).map(|step| step % STEPS_PER_WALL == 0).collect(),
-        outcome: Outcome::Collided,
+        outcome: Some(Outcome::Collided),
         walls_passed: 0,
         course_walls: 5,
         hit_wall: None,

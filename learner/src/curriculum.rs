@@ -2,8 +2,10 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
+use skein_protocol::ACTION;
 use skein_protocol::config::{Config, ConfirmOn};
 use skein_protocol::ids::{Attempt, Epoch, FlightId, PolicyVersion, RunId};
+use skein_protocol::leg::Leg;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 
@@ -15,13 +17,14 @@ pub fn epochs(config: &Config) -> u64 {
     config.run.flights.div_ceil(config.learning.flights_per_epoch)
 }
 
-/// Tickets of `epoch`, in flight order.
+/// Tickets of `epoch`, in flight order. Where flights are flown in legs, there is one flight, and `flown` are the actions of its legs so far, from take-off on.
 pub fn training(
     config: &Config,
     run: RunId,
     epoch: Epoch,
     version: PolicyVersion,
     exploration: Exploration,
+    flown: &[[f32; ACTION]],
 ) -> Vec<Ticket> {
     let first = epoch.0 * config.learning.flights_per_epoch;
     let end = (first + config.learning.flights_per_epoch).min(config.run.flights);
@@ -34,6 +37,10 @@ pub fn training(
         start_level: start_level(config, flight),
         exploration,
         seed: derive(config.run.seed, Purpose::Flight, flight),
+        leg: config.learning.in_legs().then(|| Leg {
+            steps: config.learning.leg_steps as u32,
+            flown: flown.into(),
+        }),
     };
     (first..end).map(ticket).collect()
 }
@@ -60,6 +67,7 @@ pub fn evaluation(
         start_level: 1,
         exploration: Exploration::Mode,
         seed: derive(config.run.seed, Purpose::EvaluationFlight, flight),
+        leg: None,
     };
     let flown = courses.flat_map(|course| (0..flights).map(move |flight| (course, flight)));
     (0..).zip(flown).map(ticket).collect()
@@ -108,6 +116,7 @@ mod tests {
                     Epoch(epoch),
                     PolicyVersion(epoch),
                     Exploration::Sample,
+                    &[],
                 )
             })
             .collect()

@@ -102,7 +102,7 @@ fn score(flight: &CommittedFlight) -> FlightScore {
     FlightScore {
         walls_passed: flight.walls_passed.into(),
         flight_return: flight.total_reward().into(),
-        outcome: flight.outcome,
+        outcome: flight.ending(),
         hit_wall: flight.hit_wall,
     }
 }
@@ -122,7 +122,7 @@ fn write_path(
             x_m,
             y_m,
             z_m,
-            outcome: flight.outcome,
+            outcome: flight.ending(),
         })?;
     }
     Ok(())

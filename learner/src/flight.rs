@@ -1,7 +1,8 @@
-//! A training flight as the learner keeps it: committed, complete, in order.
+//! A flight as the learner keeps it: committed, complete, in order.
 //!
 //! The assembler builds it from streamed records; metrics and replay take it from there. It holds one observation more than it has steps: the closing
-//! observation is what the last step led to, and a flight that was cut off bootstraps from it.
+//! observation is what the last step led to, and a flight that was cut off bootstraps from it. Of a flight in legs each leg is one of these, and what has been
+//! flown of it so far is one as well.
 
 use skein_protocol::config::{Observation, View};
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
@@ -21,19 +22,23 @@ pub struct StepObservation {
     pub orientation: [f32; 4],
 }
 
-/// One whole flight of T steps.
+/// One whole flight of T steps, or T steps of one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CommittedFlight {
     /// Its number.
     pub flight: FlightId,
     /// The epoch it belongs to.
     pub epoch: Epoch,
-    /// The one snapshot all of it was flown with.
+    /// The one snapshot all of it was flown with; of several legs, the first one's.
     pub policy_version: PolicyVersion,
-    /// Who flew it; without influence on learning.
+    /// Who flew it, or the first leg of it; without influence on learning.
     pub actor: ActorId,
     /// The level (1 is the first) whose start it took off from.
     pub level: u8,
+    /// Steps of the flight that were flown before these; 0 if it is whole.
+    pub first_step: usize,
+    /// The action before the first; zero at take-off.
+    pub action_before: [f32; ACTION],
     /// `[T + 1]`, the closing observation last.
     pub observations: Vec<StepObservation>,
     /// Lateral and vertical velocity command, each in [-1, 1]; `[T]`.
@@ -44,11 +49,11 @@ pub struct CommittedFlight {
     pub reward_terms: Vec<[f32; 4]>,
     /// Whether a wall was crossed or the destination reached in the step; `[T]`.
     pub level_up: Vec<bool>,
-    /// How it ended.
-    pub outcome: Outcome,
-    /// Walls passed; the end wall is none.
+    /// How it ended; `None` of a leg whose flight goes on.
+    pub outcome: Option<Outcome>,
+    /// Walls passed since take-off; the end wall is none.
     pub walls_passed: u8,
-    /// Walls of the course.
+    /// Walls of the course; 0 while the flight goes on.
     pub course_walls: u8,
     /// The wall that was hit, from 1 in flight order, if it collided with one and not with the corridor.
     pub hit_wall: Option<u8>,
@@ -83,12 +88,50 @@ impl CommittedFlight {
         self.rewards.iter().map(|&reward| f64::from(reward)).sum::<f64>() as f32
     }
 
+    /// How it ended.
+    ///
+    /// # Panics
+    /// When it is a leg whose flight goes on.
+    pub fn ending(&self) -> Outcome {
+        self.outcome
+            .expect("only of flights that have ended is asked how they did")
+    }
+
     /// Whether it ended in a state without a future. A flight that reached its step limit did not, and its last step still bootstraps.
     pub fn terminated(&self) -> bool {
         match self.outcome {
-            Outcome::Collided | Outcome::ReachedEnd => true,
-            Outcome::TimedOut => false,
+            Some(Outcome::Collided | Outcome::ReachedEnd) => true,
+            Some(Outcome::TimedOut) | None => false,
         }
+    }
+
+    /// The same without images.
+    #[must_use]
+    pub fn without_images(&self) -> Self {
+        Self {
+            depth: None,
+            observations: self.observations.clone(),
+            actions: self.actions.clone(),
+            rewards: self.rewards.clone(),
+            reward_terms: self.reward_terms.clone(),
+            level_up: self.level_up.clone(),
+            ..*self
+        }
+    }
+
+    /// Appends the leg that was flown next, but for its images.
+    pub fn extend(&mut self, leg: &Self) {
+        // Its first observation is this one's last, seen by another encoder perhaps.
+        self.observations.pop();
+        self.observations.extend_from_slice(&leg.observations);
+        self.actions.extend_from_slice(&leg.actions);
+        self.rewards.extend_from_slice(&leg.rewards);
+        self.reward_terms.extend_from_slice(&leg.reward_terms);
+        self.level_up.extend_from_slice(&leg.level_up);
+        self.outcome = leg.outcome;
+        self.walls_passed = leg.walls_passed;
+        self.course_walls = leg.course_walls;
+        self.hit_wall = leg.hit_wall;
     }
 
     /// Writes the observation vector at the beginning of `step`, at most T, as the actor saw it.
@@ -99,7 +142,7 @@ impl CommittedFlight {
     fn write_moment(&self, step: usize, observation: Observation, into: &mut [f32]) {
         let previous_action = step
             .checked_sub(1)
-            .map_or([0.0; ACTION], |previous| self.actions[previous]);
+            .map_or(self.action_before, |previous| self.actions[previous]);
         let seen = &self.observations[step];
         observation.write(&seen.latent, &seen.velocity_mps, &previous_action, into);
     }
@@ -148,6 +191,8 @@ pub(crate) mod samples {
             policy_version: PolicyVersion(flight / 10),
             actor: ActorId(0),
             level: 1,
+            first_step: 0,
+            action_before: [0.0; ACTION],
             observations: (0..=steps)
                 .map(|step| StepObservation {
                     latent: code(shade(flight, step)),
@@ -160,7 +205,7 @@ pub(crate) mod samples {
             rewards: (0..steps).map(|step| at(step) / 100.0).collect(),
             reward_terms: vec![[0.0; 4]; steps],
             level_up: vec![false; steps],
-            outcome,
+            outcome: Some(outcome),
             walls_passed: 0,
             course_walls: 5,
             hit_wall: None,

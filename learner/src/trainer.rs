@@ -1,14 +1,14 @@
 //! What is trained, and how much of it is due.
 //!
-//! How many VAE steps and SAC updates an epoch brings follows from the steps flown so far alone, and every random draw is seeded by the epoch: a
-//! trainer restored from a checkpoint goes on bit for bit.
+//! How many VAE steps and SAC updates an epoch brings follows from the steps flown so far alone, and every random draw is seeded by the version of the snapshot
+//! that the updates begin with, which no others do: a trainer restored from a checkpoint goes on bit for bit.
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_inference::{Encoder, encoder};
 use skein_kernels::{Isa, Team};
 use skein_protocol::config::{Config, Engine};
-use skein_protocol::ids::{Epoch, PolicyVersion};
+use skein_protocol::ids::PolicyVersion;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
@@ -123,6 +123,11 @@ impl Trainer {
         self.algorithm.updates()
     }
 
+    /// Updates of either network done.
+    pub fn all_updates(&self) -> u64 {
+        self.updates() + self.vae_updates()
+    }
+
     /// VAE steps done.
     pub fn vae_updates(&self) -> u64 {
         self.vae.updates()
@@ -173,14 +178,14 @@ impl Trainer {
         self.replay.insert(flight)
     }
 
-    /// Trains the VAE as far as the steps flown ask for, and freezes it when its time is over. `after_each` may do something between steps, and give up;
-    /// `timer` is told what the time went into.
+    /// Trains the VAE as far as the steps flown ask for, from what snapshot `version` holds on, and freezes it when its time is over. `after_each` may do something
+    /// between steps, and give up; `timer` is told what the time went into.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
     pub fn train_vae<E: From<UpdateError>>(
         &mut self,
-        epoch: Epoch,
+        version: PolicyVersion,
         timer: &mut LapTimer,
         mut after_each: impl FnMut(&VaeMetrics) -> Result<(), E>,
     ) -> Result<Option<VaeMetrics>, E> {
@@ -190,8 +195,8 @@ impl Trainer {
         let section = &self.config.vae;
         let counted = self.steps.min(section.train_steps as u64);
         let due = (counted as f64 * section.updates_per_step) as u64;
-        let mut rng = self.rng(Purpose::VaeBatches, epoch);
-        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::VaeNoise, epoch.0));
+        let mut rng = self.rng(Purpose::VaeBatches, version);
+        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::VaeNoise, version.0));
         let (mut images, mut last) = (Vec::new(), None);
         while self.vae.updates() < due {
             self.replay
@@ -224,24 +229,24 @@ impl Trainer {
         encoder(&snapshot, &self.layout, self.config.vae.encoder_precision)
     }
 
-    /// Does the policy updates that the steps flown since the warm-up ask for; returns the means of their metrics. `after_each` may do something
-    /// between updates, and give up; `timer` is told what the time went into.
+    /// Does the policy updates that the steps flown since the warm-up ask for, from what snapshot `version` holds on; their metrics go into `means`. `after_each`
+    /// may do something between updates, and give up; `timer` is told what the time went into.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
     pub fn train_policy<E: From<UpdateError>>(
         &mut self,
-        epoch: Epoch,
+        version: PolicyVersion,
         timer: &mut LapTimer,
+        means: &mut Means,
         mut after_each: impl FnMut(&[(Scalar, f32)]) -> Result<(), E>,
-    ) -> Result<Vec<(Scalar, f64)>, E> {
+    ) -> Result<(), E> {
         let learning = &self.config.learning;
         let counted = self.steps.saturating_sub(learning.warmup_steps as u64);
         let due = (counted as f64 * learning.updates_per_step) as u64;
-        let mut rng = self.rng(Purpose::PolicyBatches, epoch);
-        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::PolicyNoise, epoch.0));
+        let mut rng = self.rng(Purpose::PolicyBatches, version);
+        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::PolicyNoise, version.0));
         let mut minibatch = Minibatch::default();
-        let mut means = Means::default();
         while self.algorithm.updates() < due {
             self.replay.sample(&mut rng, self.config.batch_size(), &mut minibatch);
             timer.lap(Stage::Sample, 1);
@@ -250,11 +255,11 @@ impl Trainer {
             means.add(&metrics);
             after_each(&metrics)?;
         }
-        Ok(means.finish())
+        Ok(())
     }
 
-    fn rng(&self, purpose: Purpose, epoch: Epoch) -> Pcg64Mcg {
-        Pcg64Mcg::seed_from_u64(derive(self.config.run.seed, purpose, epoch.0))
+    fn rng(&self, purpose: Purpose, version: PolicyVersion) -> Pcg64Mcg {
+        Pcg64Mcg::seed_from_u64(derive(self.config.run.seed, purpose, version.0))
     }
 
     /// The parameters that actors fly with, as they are now.
@@ -290,8 +295,8 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
 }
 
 /// Means of the metrics of an epoch's updates.
-#[derive(Default)]
-struct Means {
+#[derive(Debug, Default)]
+pub struct Means {
     sums: Vec<(Scalar, f64)>,
     count: usize,
 }
@@ -307,8 +312,8 @@ impl Means {
         self.count += 1;
     }
 
-    /// Nothing if there was no update.
-    fn finish(self) -> Vec<(Scalar, f64)> {
+    /// The means; nothing if there was no update.
+    pub fn finish(self) -> Vec<(Scalar, f64)> {
         let mean = |(scalar, sum)| (scalar, sum / self.count as f64);
         self.sums.into_iter().map(mean).collect()
     }

@@ -1,10 +1,11 @@
 //! The training loop: delayed learning, in reading order.
 //!
 //! An epoch is a fixed number of flights, all flown with one frozen snapshot. When the last of them is committed, the learner takes them in, in flight
-//! order, updates the networks and publishes the next snapshot. Everything it does follows from configuration, seed and committed flights; a learner
-//! that died goes on from a checkpoint as if nothing had been (`saving`).
+//! order, updates the networks and publishes the next snapshot. With direct updates an epoch is one flight, flown in legs, and the same is done after each of
+//! them. Everything it does follows from configuration, seed and committed flights; a learner that died goes on from a checkpoint as if nothing had been (`saving`).
 
 mod candidates;
+mod curves;
 mod error;
 mod saving;
 mod stop;
@@ -32,6 +33,7 @@ use crate::metrics::{Metrics, Scalar};
 use crate::report::Reporter;
 use crate::trainer::Trainer;
 
+use curves::EpochCurves;
 pub use error::TrainingError;
 use stop::StopWatch;
 
@@ -51,6 +53,7 @@ struct Training<'a> {
     checkpoints: CheckpointWriter,
     started: Instant,
     epoch_started: Instant,
+    curves: EpochCurves,
     /// What this thread's time goes into: what it does between two laps is in the later one.
     timer: LapTimer,
     /// What is counted of the run. What trainer and metrics count themselves is filled in for a checkpoint.
@@ -61,11 +64,13 @@ struct Training<'a> {
     resumes: u64,
     /// Ordered and not learned from.
     in_the_air: VecDeque<InTheAir>,
+    /// The flight whose first legs are learned from, and whose next leg is not, as far as it was flown; without images.
+    under_way: Option<CommittedFlight>,
     /// The newest snapshot, those of the flights in the air, and the best.
     snapshots: BTreeMap<PolicyVersion, Snapshot>,
 }
 
-/// Flights of an epoch that are under way.
+/// Flights of an epoch that are under way, or the leg of one.
 struct InTheAir {
     order: EpochOrder,
     batch: Batch,
@@ -111,19 +116,35 @@ impl Training<'_> {
         // An earlier life may have been stopped while it looked.
         self.look_for_best()?;
         while self.progress.epochs < epochs {
-            let epoch = Epoch(self.progress.epochs);
+            let epoch = self.progress.epochs;
             // With policy lag 1, the next epoch is flown with the snapshot at hand while this one is learned from.
-            self.order_until(epochs.min(epoch.0 + 1 + self.config.learning.policy_lag))?;
-            let flights = self.collect()?;
-            self.take_in(flights)?;
-            self.train_vae(epoch)?;
-            self.train_policy(epoch)?;
+            self.order_until(epochs.min(epoch + 1 + self.config.learning.policy_lag))?;
+            self.learn_from_flown()?;
+            while self.under_way.is_some() {
+                // The rest of the flight is flown with what its last leg has taught.
+                self.order(self.next_order(epoch))?;
+                self.learn_from_flown()?;
+            }
             self.progress.epochs += 1;
-            self.publish()?;
-            tracing::debug!(epoch = epoch.0, flights = self.progress.flights, "epoch learned from");
-            self.metrics.flush()?;
+            tracing::debug!(epoch, flights = self.progress.flights, "epoch learned from");
+            self.draw_curves()?;
             self.look_for_best()?;
             self.checkpoint_if_due()?;
+        }
+        Ok(())
+    }
+
+    /// Waits for the flights or the leg ordered first, learns from them, and publishes what was learned.
+    fn learn_from_flown(&mut self) -> Result<(), TrainingError> {
+        let flown = self.collect()?;
+        self.take_in(flown)?;
+        let before = self.trainer.all_updates();
+        self.train_vae()?;
+        self.train_policy()?;
+        // A leg that brings no update goes on with the snapshot there is.
+        if self.under_way.is_none() || self.trainer.all_updates() > before {
+            self.progress.version += 1;
+            self.publish()?;
         }
         Ok(())
     }
@@ -154,23 +175,31 @@ impl Training<'_> {
             .back()
             .map_or(self.progress.epochs, |last| last.order.epoch + 1);
         for epoch in first..end {
-            self.order(EpochOrder {
-                epoch,
-                policy_version: self.progress.version().0,
-                exploration: self.trainer.exploration(),
-                keep: self.trainer.keep(),
-            })?;
+            self.order(self.next_order(epoch))?;
         }
         Ok(())
     }
 
+    /// How what is ordered now of `epoch` is flown.
+    fn next_order(&self, epoch: u64) -> EpochOrder {
+        EpochOrder {
+            epoch,
+            policy_version: self.progress.version().0,
+            exploration: self.trainer.exploration(),
+            keep: self.trainer.keep(),
+        }
+    }
+
+    /// Orders the flights of an epoch, or the next leg of the one that is under way.
     fn order(&mut self, order: EpochOrder) -> Result<(), TrainingError> {
+        let flown = self.under_way.as_ref().map_or(&[][..], |flight| &flight.actions);
         let tickets = curriculum::training(
             self.config,
             self.identity.run,
             Epoch(order.epoch),
             PolicyVersion(order.policy_version),
             order.exploration,
+            flown,
         );
         let batch = self.reception.fly(Epoch(order.epoch), order.keep, tickets)?;
         let flights = Vec::with_capacity(batch.remaining());
@@ -178,14 +207,20 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Waits for all flights of the epoch that was ordered first. Until they are there, it counts as in the air.
+    /// Waits for all flights of the epoch that was ordered first, or for its leg. Until they are there, it counts as in the air.
     fn collect(&mut self) -> Result<Vec<CommittedFlight>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         self.reporter.update(|progress| progress.phase = Phase::Flying);
+        let (is_amid_flight, shared) = (self.under_way.is_some(), self.reception.shared());
         if let Some(InTheAir { batch, flights, .. }) = self.in_the_air.front_mut() {
-            while let Some(flight) = batch.next(self.stop)? {
+            let watch = &mut self.stop_watch;
+            let mut next = || match is_amid_flight {
+                true => batch.next_unless(|| watch.amid_flight(&shared)),
+                false => Ok(batch.next(self.stop)?),
+            };
+            while let Some(flight) = next()? {
                 self.reporter.update(|progress| {
-                    progress.flights += 1;
+                    progress.flights += u64::from(flight.outcome.is_some());
                     progress.steps += flight.steps() as u64;
                 });
                 flights.push(flight);
@@ -200,16 +235,13 @@ impl Training<'_> {
             .unwrap_or_default())
     }
 
-    /// Takes the epoch's flights into metrics and replay buffer, in flight order.
-    fn take_in(&mut self, flights: Vec<CommittedFlight>) -> Result<(), TrainingError> {
-        let count = flights.len() as u64;
-        let steps: usize = flights.iter().map(CommittedFlight::steps).sum();
-        let steps_per_sec = steps as f64 / self.epoch_started.elapsed().as_secs_f64();
-        self.epoch_started = Instant::now();
-        for flight in flights {
-            self.metrics.flight(&flight)?;
+    /// Takes what was flown into metrics and replay buffer, in flight order.
+    fn take_in(&mut self, flown: Vec<CommittedFlight>) -> Result<(), TrainingError> {
+        let count = flown.len() as u64;
+        for flight in flown {
+            self.curves.steps += flight.steps();
+            self.tell(&flight)?;
             self.trainer.take_in(flight)?;
-            self.progress.flights += 1;
         }
         let windows = self.metrics.windows();
         self.reporter.update(|progress| {
@@ -217,17 +249,33 @@ impl Training<'_> {
             progress.walls_passed = windows.walls_passed.mean();
             progress.mean_return = windows.total_reward.mean();
         });
-        let replay = self.trainer.replay();
-        let sizes = [
-            (Scalar::ReplayTransitions, replay.len() as f64),
-            (Scalar::ReplaySuccess, replay.success_len() as f64),
-            (Scalar::StepsPerSec, steps_per_sec),
-        ];
-        self.metrics.scalars(self.last_flight(), &sizes)?;
-        self.metrics
-            .scalars(self.last_flight(), &self.reception.shared().faults().scalars())?;
         self.timer.lap(Stage::TakeIn, count);
         Ok(())
+    }
+
+    /// Tells the metrics of a flight that has ended, and keeps one that goes on.
+    fn tell(&mut self, flown: &CommittedFlight) -> Result<(), TrainingError> {
+        let joined = self.under_way.take().map(|mut flight| {
+            flight.extend(flown);
+            flight
+        });
+        if flown.outcome.is_none() {
+            self.under_way = joined.or_else(|| Some(flown.without_images()));
+            return Ok(());
+        }
+        self.metrics.flight(joined.as_ref().unwrap_or(flown))?;
+        self.progress.flights += 1;
+        Ok(())
+    }
+
+    /// Tells what the epoch that has just been learned from brought.
+    fn draw_curves(&mut self) -> Result<(), TrainingError> {
+        let curves = std::mem::take(&mut self.curves);
+        let shared = self.reception.shared();
+        let points = curves.points(self.epoch_started.elapsed(), self.trainer.replay(), &shared);
+        self.epoch_started = Instant::now();
+        self.metrics.scalars(self.last_flight(), &points)?;
+        Ok(self.metrics.flush()?)
     }
 
     /// The number of the newest flight: what curves are keyed by.
@@ -235,9 +283,10 @@ impl Training<'_> {
         self.progress.flights.saturating_sub(1)
     }
 
-    fn train_vae(&mut self, epoch: Epoch) -> Result<(), TrainingError> {
+    fn train_vae(&mut self) -> Result<(), TrainingError> {
+        let version = self.progress.version();
         let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
-        let trained = self.trainer.train_vae(epoch, &mut self.timer, |metrics| {
+        let trained = self.trainer.train_vae(version, &mut self.timer, |metrics| {
             reporter.update(|progress| {
                 progress.vae_updates += 1;
                 progress.vae_loss = Some(metrics.loss.into());
@@ -245,23 +294,18 @@ impl Training<'_> {
             pass(FaultPoint::LearnerMidUpdates);
             watch.after_update()
         })?;
-        let Some(metrics) = trained else {
-            return Ok(());
-        };
-        let curves = [
-            (Scalar::VaeLoss, metrics.loss.into()),
-            (Scalar::VaePixelError, metrics.pixel_error.into()),
-            (Scalar::VaeDivergence, metrics.divergence.into()),
-        ];
-        Ok(self.metrics.scalars(self.last_flight(), &curves)?)
+        self.curves.vae = trained.or(self.curves.vae);
+        Ok(())
     }
 
-    fn train_policy(&mut self, epoch: Epoch) -> Result<(), TrainingError> {
+    fn train_policy(&mut self) -> Result<(), TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
+        let version = self.progress.version();
         let started = Instant::now();
         let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
         let updates_before = self.trainer.updates();
-        let mut curves = self.trainer.train_policy(epoch, &mut self.timer, |metrics| {
+        let means = &mut self.curves.policy;
+        self.trainer.train_policy(version, &mut self.timer, means, |metrics| {
             let temperature = metrics.iter().find(|(scalar, _)| *scalar == Scalar::Temperature);
             reporter.update(|progress| {
                 progress.updates += 1;
@@ -271,11 +315,8 @@ impl Training<'_> {
             watch.after_update()
         })?;
         pass(FaultPoint::LearnerUpdated);
-        let done = self.trainer.updates() - updates_before;
-        let updates_per_sec = done as f64 / started.elapsed().as_secs_f64();
-        if !curves.is_empty() {
-            curves.push((Scalar::UpdatesPerSec, updates_per_sec));
-        }
-        Ok(self.metrics.scalars(self.last_flight(), &curves)?)
+        self.curves.updates += self.trainer.updates() - updates_before;
+        self.curves.updating += started.elapsed();
+        Ok(())
     }
 }

@@ -1,6 +1,6 @@
 //! The contract between Skein's processes.
 //!
-//! Everything that two processes must agree on is defined here, and nothing else: who flies what ([`ticket`]), what a flown step looks like on the
+//! Everything that two processes must agree on is defined here, and nothing else: who flies what ([`ticket`], [`leg`]), what a flown step looks like on the
 //! wire ([`transition`]), what a policy snapshot contains ([`snapshot`]), the iceoryx2 services that carry them ([`services`]), the configuration of a
 //! run ([`config`]) and the files it leaves ([`run`], [`evaluation`], [`summary`]), and what their time is counted by ([`stages`]); and what all of our programs do alike
 //! ([`allocation`], [`logging`]). It knows neither libtorch nor the physics engine, so that every
@@ -14,6 +14,7 @@ pub mod evaluation;
 pub mod failure;
 pub mod fault;
 pub mod ids;
+pub mod leg;
 pub mod logging;
 pub mod progress;
 pub mod run;
@@ -28,7 +29,7 @@ pub mod transition;
 
 /// Version of everything in this crate that crosses a process boundary; part of every service's attributes, so that a process of another version is
 /// refused when it opens a service.
-pub const PROTOCOL_VERSION: u32 = 5;
+pub const PROTOCOL_VERSION: u32 = 6;
 
 /// Width of the depth image in pixels (paper, section 3.3).
 pub const IMAGE_WIDTH: usize = 128;

@@ -19,17 +19,17 @@ pub enum Purpose {
     VaeParameters = 4,
     /// Initial parameters of policy and critic.
     PolicyParameters = 5,
-    /// Minibatches drawn for the policy updates of one epoch; indexed by epoch.
+    /// Minibatches drawn for the policy updates between two snapshots; indexed by the former's version, which is the epoch unless flights are flown in legs.
     PolicyBatches = 6,
-    /// Action noise inside the policy updates of one epoch; indexed by epoch.
+    /// Action noise inside the policy updates between two snapshots; indexed likewise.
     PolicyNoise = 7,
-    /// Minibatches drawn for the VAE steps of one epoch; indexed by epoch.
+    /// Minibatches drawn for the VAE steps between two snapshots; indexed likewise.
     VaeBatches = 8,
-    /// Reparameterisation noise of the VAE steps of one epoch; indexed by epoch.
+    /// Reparameterisation noise of the VAE steps between two snapshots; indexed likewise.
     VaeNoise = 9,
     /// Where one flight starts; derived from the ticket's seed.
     StartPosition = 10,
-    /// Exploration noise of one flight; derived from the ticket's seed, so that a start drawn otherwise does not shift it.
+    /// Exploration noise of one flight, or of the leg of it that begins at the step of this index; derived from the ticket's seed, so that a start drawn otherwise does not shift it.
     ActionNoise = 11,
     /// What disturbs one flight; derived from the ticket's seed.
     Disturbances = 12,

@@ -69,7 +69,7 @@ stages! {
     Actors {
         /// Snapshots are taken in and made ready to fly with. Snapshots.
         TakeSnapshot => "snapshot",
-        /// The simulator is set to the start of a flight. Flights.
+        /// The simulator is set to the start of a flight, or to where a leg begins. Flights, legs.
         TakeOff => "take-off",
         /// The drone moves until its next decision. Environment steps.
         Physics => "physics",
@@ -95,7 +95,7 @@ stages! {
         ReceivingIdle => "idle",
     }
     Training {
-        /// Flights go into replay and metrics. Flights.
+        /// Flights go into replay and metrics. Flights, legs.
         TakeIn => "take in",
         /// A minibatch of depth images is gathered. Minibatches.
         SampleImages => "sample images",

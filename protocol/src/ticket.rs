@@ -1,16 +1,17 @@
 //! The ticket: everything a flight is a function of.
 //!
 //! A flight is flown only against a ticket, and two actors that hold the same ticket fly the same flight, bit for bit. The learner sends tickets inside
-//! [`ControlRecord`]s, the one fixed-size message that actors listen to.
+//! [`ControlRecord`]s, fixed-size messages that actors listen to; those of [legs](crate::leg) inside [`LegRecord`]s, which have room for more.
 
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion, RunId};
+use crate::leg::{Leg, LegRecord};
 
 /// What a flight is flown for, how, where and with which policy.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Ticket {
     /// The run it belongs to.
     pub run: RunId,
@@ -18,7 +19,7 @@ pub struct Ticket {
     pub flight: FlightId,
     /// How often this flight had been issued before.
     pub attempt: Attempt,
-    /// The snapshot to hold for the whole flight.
+    /// The snapshot to hold for all that the ticket is for.
     pub policy_version: PolicyVersion,
     /// Where it is flown.
     pub course: CourseChoice,
@@ -28,6 +29,15 @@ pub struct Ticket {
     pub exploration: Exploration,
     /// Seed of everything random in the flight.
     pub seed: u64,
+    /// The part of the flight to fly; `None` for all of it.
+    pub leg: Option<Leg>,
+}
+
+impl Ticket {
+    /// Steps of the flight that were flown on other tickets before.
+    pub fn first_step(&self) -> u32 {
+        self.leg.as_ref().map_or(0, |leg| leg.flown.len() as u32)
+    }
 }
 
 /// Where a flight is flown.
@@ -53,7 +63,7 @@ pub enum Exploration {
 }
 
 /// What the learner tells an actor.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Control {
     /// Fly this.
     Fly(Ticket),
@@ -91,7 +101,7 @@ const _: () = assert!(size_of::<ControlRecord>() == 6 * 8 + 3 * 4 + 4);
 const EVERYONE: u32 = u32::MAX;
 
 impl ControlRecord {
-    /// `ticket`, for one life of one actor.
+    /// `ticket` for all of its flight, for one life of one actor.
     pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: Incarnation) -> Self {
         let (course_kind, course_index, course_seed) = match ticket.course {
             CourseChoice::Training => (0, 0, 0),
@@ -217,7 +227,46 @@ impl ControlRecord {
                 }
             },
             seed: self.seed,
+            leg: None,
         })
+    }
+}
+
+/// A message to actors, for the service that has room for it.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Message {
+    /// Everything but tickets of legs.
+    Control(ControlRecord),
+    /// The ticket of a leg.
+    Leg(Box<LegRecord>),
+}
+
+impl Message {
+    /// `ticket`, for one life of one actor.
+    pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: Incarnation) -> Self {
+        match &ticket.leg {
+            None => Self::Control(ControlRecord::fly(ticket, actor, incarnation)),
+            Some(leg) => Self::Leg(Box::new(LegRecord::fly(ticket, leg, actor, incarnation))),
+        }
+    }
+
+    /// Whether this life of this actor is meant.
+    pub fn is_for(&self, actor: ActorId, incarnation: Incarnation) -> bool {
+        match self {
+            Self::Control(record) => record.is_for(actor, incarnation),
+            Self::Leg(record) => record.is_for(actor, incarnation),
+        }
+    }
+
+    /// What is said.
+    ///
+    /// # Errors
+    /// [`ControlFault`] when the message holds what no learner of this version and run writes.
+    pub fn read(&self, run: RunId) -> Result<Control, ControlFault> {
+        match self {
+            Self::Control(record) => record.read(run),
+            Self::Leg(record) => record.read(run),
+        }
     }
 }
 
@@ -235,6 +284,9 @@ pub enum ControlFault {
         /// Its value.
         value: u8,
     },
+    /// The ticket of a leg makes no sense.
+    #[error("the ticket of a leg {0}")]
+    Leg(&'static str),
 }
 
 #[cfg(test)]
@@ -251,6 +303,7 @@ mod tests {
             start_level: 2,
             exploration: Exploration::Sample,
             seed: 42,
+            leg: None,
         }
     }
 

@@ -1,7 +1,7 @@
 //! The transition record: one step of a flight, as it lies in shared memory.
 //!
-//! A flight of T steps is T+1 records. Record t holds the observation at step t, the action chosen on it, and the reward and end flags that followed; the
-//! closing record holds the last observation only. The depth camera renders into [`TransitionRecord::depth`] of a loaned sample, and the learner reads
+//! A flight of T steps is T+1 records, and so is a leg of one. Record t holds the observation at step t, the action chosen on it, and the reward and end flags that
+//! followed; the closing record holds the last observation only. The depth camera renders into [`TransitionRecord::depth`] of a loaned sample, and the learner reads
 //! it there: the image's bytes are written once.
 
 use bytemuck::{Pod, Zeroable};
@@ -25,7 +25,7 @@ pub struct TransitionRecord {
     pub run: u64,
     /// The flight.
     pub flight: u64,
-    /// The snapshot the whole flight is flown with.
+    /// The snapshot that all of the ticket is flown with.
     pub policy_version: u64,
     /// The actor's life.
     pub incarnation: u64,
@@ -33,7 +33,7 @@ pub struct TransitionRecord {
     pub actor: u32,
     /// The ticket's attempt: tells a flight flown again from its late twin.
     pub attempt: u32,
-    /// Position in the flight, from 0 without a gap; the closing record counts too.
+    /// Position in the flight, from 0 without a gap, legs flown before included; the closing record counts too.
     pub step: u32,
     /// A [`RecordKind`].
     pub kind: u8,
@@ -84,6 +84,8 @@ pub enum RecordKind {
     Step,
     /// The last observation; ends the flight.
     Closing,
+    /// The last observation of a leg whose flight goes on.
+    LegEnd,
     /// The flight broke off by a fault in the simulator; what was sent of it is void.
     Failed,
 }
@@ -134,12 +136,13 @@ impl RecordKind {
             Self::Step => 1,
             Self::Closing => 2,
             Self::Failed => 3,
+            Self::LegEnd => 4,
         }
     }
 
     /// From the wire; `None` for what is no kind.
     pub fn from_code(code: u8) -> Option<Self> {
-        [Self::Step, Self::Closing, Self::Failed]
+        [Self::Step, Self::Closing, Self::Failed, Self::LegEnd]
             .into_iter()
             .find(|kind| kind.code() == code)
     }
@@ -337,6 +340,7 @@ mod tests {
             start_level: 1,
             exploration: Exploration::Sample,
             seed: 9,
+            leg: None,
         }
     }
 

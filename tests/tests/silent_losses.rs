@@ -98,6 +98,7 @@ impl Run {
             start_level: 1,
             exploration: Exploration::Uniform,
             seed: flight,
+            leg: None,
         }
     }
 

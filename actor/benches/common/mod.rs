@@ -73,5 +73,6 @@ pub(crate) fn ticket(run: RunId, flight: u64, level: u8) -> Ticket {
         start_level: level,
         exploration: Exploration::Sample,
         seed: flight,
+        leg: None,
     }
 }

@@ -12,13 +12,13 @@ use crate::courses::Courses;
 use crate::testing::{config, random_snapshot};
 use skein_inference::Scratch;
 
-const ACTOR: ActorId = ActorId(3);
-const LIFE: Incarnation = Incarnation(8);
+pub(super) const ACTOR: ActorId = ActorId(3);
+pub(super) const LIFE: Incarnation = Incarnation(8);
 
 /// Keeps what is sent, and where each image lay when it was loaned and when it was sent.
 #[derive(Default)]
-struct Tape {
-    sent: Vec<Box<TransitionRecord>>,
+pub(super) struct Tape {
+    pub(super) sent: Vec<Box<TransitionRecord>>,
     loaned_at: Vec<usize>,
     sent_at: Vec<usize>,
     abandon_after: Option<usize>,
@@ -51,7 +51,7 @@ impl RecordLink for Tape {
     }
 }
 
-fn ticket(exploration: Exploration, seed: u64) -> Ticket {
+pub(super) fn ticket(exploration: Exploration, seed: u64) -> Ticket {
     Ticket {
         run: RunId(1),
         flight: FlightId(5),
@@ -61,12 +61,13 @@ fn ticket(exploration: Exploration, seed: u64) -> Ticket {
         start_level: 2,
         exploration,
         seed,
+        leg: None,
     }
 }
 
 const NETWORK: skein_protocol::ids::PolicyVersion = skein_protocol::ids::PolicyVersion(4);
 
-fn pilot(simulator: &str) -> Pilot {
+pub(super) fn pilot(simulator: &str) -> Pilot {
     let courses = Courses::of_run(&config(simulator)).unwrap();
     Pilot::new(
         ACTOR,
@@ -76,21 +77,34 @@ fn pilot(simulator: &str) -> Pilot {
     )
 }
 
-fn network(change: impl Fn(&mut [f32])) -> Network {
+/// Everything that may disturb a flight.
+pub(super) const STORMY: &str =
+    "disturbances = { mass_spread = 0.2, latency_periods = 1, gust.force_rms_n = 0.15, depth.model = \"stereo\" }";
+
+pub(super) fn network(change: impl Fn(&mut [f32])) -> Network {
     let layout = SnapshotLayout::new(Observation::LatentVelocityAction.len(), 16);
     let mut snapshot = random_snapshot(&layout, NETWORK.0);
     change(&mut snapshot.values[layout.policy()]);
     Network::new(&snapshot, &layout, Precision::F32)
 }
 
-fn flown(pilot: &mut Pilot, ticket: &Ticket) -> (FlightScore, Tape) {
+pub(super) fn flown(pilot: &mut Pilot, ticket: &Ticket) -> (FlightScore, Tape) {
+    let (score, tape) = fly(pilot, ticket);
+    (score.expect("the flight is flown whole"), tape)
+}
+
+pub(super) fn fly(pilot: &mut Pilot, ticket: &Ticket) -> (Option<FlightScore>, Tape) {
     let mut tape = Tape::default();
     let score = pilot.fly(ticket, &network(|_| {}), &mut tape).unwrap();
     (score, tape)
 }
 
 fn bytes(tape: &Tape) -> Vec<&[u8]> {
-    tape.sent.iter().map(|record| bytemuck::bytes_of(&**record)).collect()
+    raw(&tape.sent)
+}
+
+pub(super) fn raw(records: &[Box<TransitionRecord>]) -> Vec<&[u8]> {
+    records.iter().map(|record| bytemuck::bytes_of(&**record)).collect()
 }
 
 #[test]
@@ -244,8 +258,6 @@ fn a_generated_course_is_the_tickets_own() {
 
 #[test]
 fn a_disturbed_flight_is_a_function_of_its_ticket_too() {
-    const STORMY: &str =
-        "disturbances = { mass_spread = 0.2, latency_periods = 1, gust.force_rms_n = 0.15, depth.model = \"stereo\" }";
     let mut used = pilot(STORMY);
     let (score, first) = flown(&mut used, &ticket(Exploration::Sample, 1));
     let (_, other) = flown(&mut used, &ticket(Exploration::Sample, 2));
@@ -315,7 +327,7 @@ fn what_was_hit_is_in_the_closing_record() {
             start_level: 1,
             ..ticket(Exploration::Mode, 1)
         };
-        let score = pilot("").fly(&ticket, &steady, &mut tape).unwrap();
+        let score = pilot("").fly(&ticket, &steady, &mut tape).unwrap().unwrap();
         let closing = tape.sent.pop().unwrap();
         assert_eq!((score.outcome, score.walls_passed), (Outcome::Collided, 0));
         (score.hit_wall, closing.hit_wall)

@@ -127,11 +127,11 @@ impl<'a> LearnerLine<'a> {
     }
 
     fn listen_for_control(&mut self) -> Result<(), ServiceError> {
-        while let Some(record) = self.ports.receive_control()? {
-            match record.read(self.ports.run()) {
+        while let Some(message) = self.ports.receive_control()? {
+            match message.read(self.ports.run()) {
                 Ok(said) => {
                     self.last_sign = Instant::now();
-                    if record.is_for(self.actor, self.incarnation) {
+                    if message.is_for(self.actor, self.incarnation) {
                         self.obey(said);
                     }
                 }

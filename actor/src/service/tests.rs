@@ -78,6 +78,7 @@ impl Run {
             start_level: 1,
             exploration: Exploration::Sample,
             seed: 6,
+            leg: None,
         }
     }
 
@@ -142,7 +143,7 @@ fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
     // For another life of this actor: not to be flown.
     let other = Ticket {
         flight: FlightId(99),
-        ..ticket
+        ..ticket.clone()
     };
     run.say(ControlRecord::fly(&other, ACTOR, Incarnation(1)));
     run.say(ControlRecord::fly(&ticket, ACTOR, incarnation));

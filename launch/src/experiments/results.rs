@@ -9,7 +9,7 @@ use skein_protocol::summary::Summary;
 
 use super::definition::{Axis, Measure};
 use super::plan::{Plan, PlannedRun, State};
-use super::statistics::volatility;
+use super::statistics::{dispersion_across_time, drawdowns, volatility};
 use crate::reports::ReportError;
 use crate::reports::curves::{FlightRow, read_flights, trailing_mean};
 
@@ -89,21 +89,34 @@ impl RunResult {
         volatility(&self.values(Measure::WallsPassed), self.window)
     }
 
+    /// How restless its walls passed usually were; see [`dispersion_across_time`].
+    pub fn dispersion_across_time(&self) -> Option<f64> {
+        dispersion_across_time(&self.values(Measure::WallsPassed), self.window)
+    }
+
+    /// How far the walls passed over a window of training flights ever fell below the most they had been; `None` if there was no whole window.
+    pub fn largest_drawdown(&self) -> Option<f64> {
+        let fallen = self.curve(Measure::Drawdown, Axis::Flights).into_iter();
+        fallen.map(|(_, below)| below).max_by(f64::total_cmp)
+    }
+
     /// The average of `measure` over each whole window of training flights, at the flights, steps or updates that were behind it then.
     pub fn curve(&self, measure: Measure, over: Axis) -> Vec<(f64, f64)> {
+        let partial = self.window.saturating_sub(1);
         let means = trailing_mean(&self.values(measure), self.window);
-        self.places(over)
-            .into_iter()
-            .zip(means)
-            .skip(self.window.saturating_sub(1))
-            .collect()
+        let whole = means.get(partial..).unwrap_or_default();
+        let points = match measure {
+            Measure::WallsPassed | Measure::Return => whole.to_vec(),
+            Measure::Drawdown => drawdowns(whole),
+        };
+        self.places(over).into_iter().skip(partial).zip(points).collect()
     }
 
     fn values(&self, measure: Measure) -> Vec<f64> {
         self.flights
             .iter()
             .map(|flight| match measure {
-                Measure::WallsPassed => f64::from(flight.walls_passed),
+                Measure::WallsPassed | Measure::Drawdown => f64::from(flight.walls_passed),
                 Measure::Return => flight.episode_return,
             })
             .collect()

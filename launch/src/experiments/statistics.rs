@@ -107,6 +107,24 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
 ///
 /// Where start levels are flown in turn, a window should be whole turns of them (50 flights of 5 levels, 10 each): otherwise the turns themselves show.
 pub fn volatility(values: &[f64], window: usize) -> Option<f64> {
+    let differences = differences_once_risen(values, window)?;
+    let squares: f64 = differences.iter().map(|difference| difference.powi(2)).sum();
+    Some((squares / differences.len() as f64).sqrt())
+}
+
+/// Dispersion across time: the interquartile range of the differences that [`volatility`] is of. A few large swings, which make most of a volatility, do not
+/// show in it: it tells how restless a curve usually is.
+///
+/// Source: Chan et al., "Measuring the Reliability of Reinforcement Learning Algorithms", arXiv:1912.05663, with one window for all that follows
+/// the rise.
+pub fn dispersion_across_time(values: &[f64], window: usize) -> Option<f64> {
+    let mut differences = differences_once_risen(values, window)?;
+    differences.sort_by(f64::total_cmp);
+    Some(quantile(&differences, 0.75) - quantile(&differences, 0.25))
+}
+
+/// Differences between the averages over successive windows, from the one on that has risen; at least two.
+fn differences_once_risen(values: &[f64], window: usize) -> Option<Vec<f64>> {
     let averages: Vec<f64> = values
         .chunks_exact(window.max(1))
         .map(|chunk| chunk.iter().sum::<f64>() / chunk.len() as f64)
@@ -119,11 +137,19 @@ pub fn volatility(values: &[f64], window: usize) -> Option<f64> {
     let level = quantile(&second_half, 0.5);
     let risen = averages.iter().position(|average| *average >= RISEN * level)?;
     let after = &averages[risen..];
-    if after.len() < 3 {
-        return None;
-    }
-    let squares: f64 = after.windows(2).map(|pair| (pair[1] - pair[0]).powi(2)).sum();
-    Some((squares / (after.len() - 1) as f64).sqrt())
+    (after.len() >= 3).then(|| after.windows(2).map(|pair| pair[1] - pair[0]).collect())
+}
+
+/// How far each point of a curve lies below the highest before it: what was learned and is lost again.
+///
+/// Source: as [`dispersion_across_time`], where the worst of it is the long-term risk across time.
+pub fn drawdowns(curve: &[f64]) -> Vec<f64> {
+    let mut highest = f64::NEG_INFINITY;
+    let below = |value: &f64| {
+        highest = highest.max(*value);
+        highest - value
+    };
+    curve.iter().map(below).collect()
 }
 
 #[cfg(test)]
@@ -232,5 +258,36 @@ mod tests {
         // Too few windows to say anything.
         assert_eq!(of(&[1.0, 1.0]), None);
         assert_eq!(of(&[]), None);
+    }
+
+    #[test]
+    fn dispersion_is_the_usual_swing_and_volatility_sees_the_rare_one() {
+        // Risen at once; differences are -0.1, 0.1 in turn.
+        let steady = [2.0, 1.9, 2.0, 1.9, 2.0, 1.9, 2.0, 1.9, 2.0];
+        let of = |values: &[f64]| {
+            (
+                dispersion_across_time(values, 1).unwrap(),
+                volatility(values, 1).unwrap(),
+            )
+        };
+        let (dispersion, volatility) = of(&steady);
+        assert!((dispersion - 0.2).abs() < 1e-9 && (volatility - 0.1).abs() < 1e-9);
+        let mut fallen_once = steady;
+        fallen_once[7] = 0.0;
+        let (same, larger) = of(&fallen_once);
+        assert!((same - 0.2).abs() < 1e-9 && larger > 0.9, "{same} {larger}");
+        // A steady rise has no dispersion: only how differences differ counts.
+        let rising: Vec<f64> = (0..20).map(|step| 10.0 + 0.1 * f64::from(step)).collect();
+        assert!(of(&rising).0 < 1e-9);
+        assert_eq!(dispersion_across_time(&[1.0, 1.0], 1), None);
+    }
+
+    #[test]
+    fn a_drawdown_is_measured_from_the_highest_point_before() {
+        assert_eq!(
+            drawdowns(&[1.0, 3.0, 2.0, 2.5, 0.5, 4.0, 3.5]),
+            [0.0, 0.0, 1.0, 0.5, 2.5, 0.0, 0.5]
+        );
+        assert!(drawdowns(&[]).is_empty());
     }
 }

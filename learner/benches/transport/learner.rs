@@ -173,6 +173,7 @@ impl Learner {
             start_level: 1,
             exploration: Exploration::Sample,
             seed: flight,
+            leg: None,
         };
         let tickets = numbers.clone().map(ticket).collect();
         self.batches

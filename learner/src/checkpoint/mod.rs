@@ -57,8 +57,10 @@ pub struct CheckpointState {
 pub struct Progress {
     /// Training flights committed; the checkpoint's name.
     pub flights: u64,
-    /// Epochs learned from; the version of the newest snapshot.
+    /// Epochs learned from.
     pub epochs: u64,
+    /// The version of the newest snapshot. One is published after each epoch, and after each leg within one that brought an update.
+    pub version: u64,
     /// SHA-256 of the newest snapshot.
     pub policy_sha256: String,
     /// Environment steps committed.
@@ -91,6 +93,7 @@ impl Progress {
         Self {
             flights: 0,
             epochs: 0,
+            version: 0,
             policy_sha256: String::new(),
             environment_steps: 0,
             vae_steps: 0,
@@ -106,9 +109,9 @@ impl Progress {
         }
     }
 
-    /// The newest snapshot's version: one is published after each epoch.
+    /// The newest snapshot's version.
     pub fn version(&self) -> PolicyVersion {
-        PolicyVersion(self.epochs)
+        PolicyVersion(self.version)
     }
 }
 

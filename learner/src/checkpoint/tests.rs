@@ -43,6 +43,7 @@ fn state(flights: u64) -> CheckpointState {
         progress: Progress {
             flights,
             epochs: 7,
+            version: 9,
             policy_sha256: "0123".into(),
             environment_steps: 12,
             vae_steps: 3,

@@ -10,44 +10,23 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use skein_protocol::config::TransportSection;
-use skein_protocol::ids::{ActorId, Attempt, Epoch, FlightId, Incarnation, RunId};
+use skein_protocol::ids::{ActorId, Attempt, FlightId, Incarnation, RunId};
 use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus};
-use skein_protocol::ticket::{ControlRecord, Ticket};
+use skein_protocol::ticket::{ControlRecord, Message, Ticket};
 use skein_protocol::transition::{RecordFault, TransitionRecord};
 
-use super::assembly::{Assembled, Assembly, Keep};
+use super::assembly::{Assembled, Assembly, LegEnd};
 use super::failures::Failures;
 use super::faults::{Faults, Refusal, Reissue};
 use super::situation::{FlightOut, Situation};
 use crate::flight::CommittedFlight;
 
 pub use super::failures::HopelessFlight;
+pub use super::order::{Order, Place};
 
 /// Flights that an actor may spoil one after the other before others are preferred to it.
 const MOST_SPOILED: u32 = 3;
-
-/// A flight to be flown.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Order {
-    /// What to fly.
-    pub ticket: Ticket,
-    /// The epoch it belongs to.
-    pub epoch: Epoch,
-    /// What is kept of it.
-    pub keep: Keep,
-    /// Who waits for it, and at which place among the flights ordered together.
-    pub place: Place,
-}
-
-/// A place in a batch of flights that were ordered together.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Place {
-    /// The batch.
-    pub batch: u64,
-    /// The flight's position in it.
-    pub index: usize,
-}
 
 /// The book-keeping.
 #[derive(Debug)]
@@ -62,9 +41,11 @@ pub struct Desk {
     /// What the time of actors that are gone went into.
     times_of_the_gone: Times,
     /// What is to be said to actors besides their tickets.
-    letters: Vec<ControlRecord>,
+    letters: Vec<Message>,
     /// Whether something was said to an actor that may not look by itself.
     is_wake_due: bool,
+    /// Where the last leg ended, if its flight goes on.
+    leg_end: Option<LegEnd>,
 }
 
 #[derive(Debug)]
@@ -94,11 +75,16 @@ impl Actor {
 
 #[derive(Debug)]
 struct Issued {
-    order: Order,
     since: Instant,
     assembly: Assembly,
     /// Whether its actor has not spoken since: one that flies it does not wait.
     is_newest_word: bool,
+}
+
+impl Issued {
+    fn ticket(&self) -> &Ticket {
+        &self.assembly.order().ticket
+    }
 }
 
 impl Desk {
@@ -114,6 +100,7 @@ impl Desk {
             times_of_the_gone: Times::default(),
             letters: Vec::new(),
             is_wake_due: false,
+            leg_end: None,
         }
     }
 
@@ -143,7 +130,7 @@ impl Desk {
         let since = |then| now.saturating_duration_since(then);
         let out = self.actors.iter().flat_map(|(id, actor)| {
             actor.tickets.iter().map(move |issued| FlightOut {
-                flight: issued.order.ticket.flight,
+                flight: issued.ticket().flight,
                 actor: *id,
                 records: issued.assembly.records(),
                 issued: since(issued.since),
@@ -236,9 +223,8 @@ impl Desk {
             return Ok(None);
         };
         actor.last_sign = now;
-        let is_of = |issued: &Issued| {
-            issued.order.ticket.flight.0 == record.flight && issued.order.ticket.attempt.0 == record.attempt
-        };
+        let is_of =
+            |issued: &Issued| issued.ticket().flight.0 == record.flight && issued.ticket().attempt.0 == record.attempt;
         let Some(position) = actor.tickets.iter().position(is_of) else {
             // The rest of a flight that was given up.
             self.faults.refuse(Refusal::NoTicket);
@@ -267,17 +253,18 @@ impl Desk {
         match issued.assembly.push(record) {
             Ok(Assembled::Step) => Ok(None),
             Ok(Assembled::Whole(flight)) => {
-                let place = issued.order.place;
+                let place = issued.assembly.order().place;
                 self.remove_first(id, now);
                 self.failures.flown(flight.flight);
+                self.leg_end = LegEnd::of(&flight);
                 Ok(Some((place, *flight)))
             }
             Ok(Assembled::Failed) => {
-                let flight = issued.order.ticket.flight;
+                let flight = issued.ticket().flight;
                 self.fail(id, flight, "the simulator broke down").map(|()| None)
             }
             Err(fault) => {
-                let flight = issued.order.ticket.flight;
+                let flight = issued.ticket().flight;
                 self.refuse(id, flight, record, &fault).map(|()| None)
             }
         }
@@ -343,8 +330,8 @@ impl Desk {
             {
                 // Of an actor that speaks, not one record came: its line may be broken in one direction. A new one is not.
                 if issued.assembly.is_empty() {
-                    self.letters
-                        .push(ControlRecord::rejoin(self.run, id, actor.incarnation));
+                    let letter = ControlRecord::rejoin(self.run, id, actor.incarnation);
+                    self.letters.push(Message::Control(letter));
                 }
                 self.spoil_first(id, Reissue::Late);
                 self.restart_clock(id, now);
@@ -355,7 +342,7 @@ impl Desk {
 
     /// Hands out tickets as far as there are orders and actors with credit: each actor its first before any its second, and none to an actor that spoils
     /// every flight while there are others. Returns what to send.
-    pub fn issue(&mut self, now: Instant) -> Vec<ControlRecord> {
+    pub fn issue(&mut self, now: Instant) -> Vec<Message> {
         let mut messages = std::mem::take(&mut self.letters);
         self.is_wake_due |= !messages.is_empty();
         let credit = self.limits.tickets_per_actor;
@@ -371,12 +358,12 @@ impl Desk {
             let Some(order) = self.waiting.pop_front() else {
                 break;
             };
-            messages.push(ControlRecord::fly(&order.ticket, id, actor.incarnation));
+            messages.push(Message::fly(&order.ticket, id, actor.incarnation));
+            let begins = self.leg_end.filter(|end| end.is_before(&order));
             let longest = self.limits.max_records_per_flight;
-            let assembly = Assembly::new(order.ticket, order.epoch, order.keep, longest, id, actor.incarnation);
+            let assembly = Assembly::new(order, begins, longest, id, actor.incarnation);
             self.is_wake_due |= actor.may_wait || actor.tickets.is_empty();
             actor.tickets.push_back(Issued {
-                order,
                 since: now,
                 assembly,
                 is_newest_word: true,
@@ -430,7 +417,7 @@ impl Desk {
     }
 
     fn reissue(&mut self, issued: Issued, id: ActorId, why: Reissue) {
-        let mut order = issued.order;
+        let mut order = issued.assembly.into_order();
         if self.is_worth_telling(id) {
             tracing::warn!(actor = %id, flight = %order.ticket.flight, attempt = %order.ticket.attempt, "ticket issued again: it or its actor {}", why.name());
         }
@@ -441,6 +428,9 @@ impl Desk {
     }
 }
 
+#[cfg(test)]
+#[path = "leg_tests.rs"]
+mod leg_tests;
 #[cfg(test)]
 #[path = "desk_tests.rs"]
 mod tests;

@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 
 use bytemuck::Zeroable;
 use proptest::prelude::*;
-use skein_protocol::ids::PolicyVersion;
+use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::{Control, CourseChoice, Exploration};
 use skein_protocol::transition::{Outcome, RecordKind};
 
+use super::super::assembly::Keep;
 use super::super::failures;
 use super::*;
 
@@ -34,6 +35,7 @@ pub(super) fn order(flight: u64) -> Order {
         start_level: 1,
         exploration: Exploration::Sample,
         seed: flight,
+        leg: None,
     };
     Order {
         ticket,
@@ -73,7 +75,7 @@ fn flown(desk: &mut Desk, actor: u32, life: Incarnation, state: ActorState, secs
 }
 
 /// Tickets handed out to `actor`.
-pub(super) fn tickets_for(messages: &[ControlRecord], actor: u32, life: Incarnation) -> Vec<Ticket> {
+pub(super) fn tickets_for(messages: &[Message], actor: u32, life: Incarnation) -> Vec<Ticket> {
     let own = messages.iter().filter(|message| message.is_for(ActorId(actor), life));
     own.filter_map(|message| match message.read(RUN) {
         Ok(Control::Fly(ticket)) => Some(ticket),
@@ -147,7 +149,7 @@ fn a_flight_with_a_hole_is_discarded_whole_and_flown_again() {
     sent.remove(1);
     assert!(feed(&mut desk, &sent, now).is_empty());
     assert_eq!(desk.faults().reissued(), 1);
-    let again = tickets_for(&desk.issue(now), 0, LIFE)[0];
+    let again = tickets_for(&desk.issue(now), 0, LIFE).remove(0);
     assert_eq!((again.flight, again.attempt), (FlightId(0), Attempt(1)));
     // The actor flies on with what it holds: flight 1, then flight 0 again.
     assert_eq!(
@@ -239,7 +241,7 @@ fn fail_for_ever(
     for _ in 0..most {
         desk.issue(now);
         let issued = desk.actors[&ActorId(actor)].tickets.front();
-        let Some(ticket) = issued.map(|issued| issued.order.ticket) else {
+        let Some(ticket) = issued.map(|issued| issued.ticket().clone()) else {
             return Ok(());
         };
         let mut record = records(&ticket, actor, LIFE)[0];
@@ -279,7 +281,7 @@ fn an_actor_that_sends_garbage_for_ever_fails_no_run_while_another_flies() {
     let mut committed = 0;
     while desk.open_orders() > 0 {
         desk.issue(now);
-        let ticket = desk.actors[&ActorId(1)].tickets[0].order.ticket;
+        let ticket = desk.actors[&ActorId(1)].tickets[0].ticket().clone();
         committed += feed(&mut desk, &records(&ticket, 1, LIFE), now).len();
     }
     assert_eq!(committed, 6);
@@ -386,7 +388,7 @@ proptest! {
             for other in 0..3 {
                 held[other].extend(tickets_for(&messages, other as u32, lives[other]));
             }
-            let next = held[index].front().copied();
+            let next = held[index].front().cloned();
             let mut sent = next.map(|ticket| records(&ticket, actor, lives[index])).unwrap_or_default();
             let (mut forget, mut restart) = (true, false);
             match event {

@@ -29,7 +29,7 @@ use crate::flight::CommittedFlight;
 const OPENING_PATIENCE: Duration = Duration::from_secs(30);
 /// How long the receiving thread may take to end once it is told to.
 const ENDING_PATIENCE: Duration = Duration::from_secs(5);
-/// How often a waiting training thread looks whether it should stop.
+/// How long a waiting training thread waits before it looks whether it should stop.
 const STOP_CHECK: Duration = Duration::from_millis(100);
 
 /// The training thread's end.
@@ -253,17 +253,29 @@ impl Batch {
     /// # Errors
     /// [`ReceptionError`] when `stop` is set or the receiving thread has ended.
     pub fn next(&mut self, stop: &AtomicBool) -> Result<Option<CommittedFlight>, ReceptionError> {
+        self.next_unless(|| match stop.load(Ordering::Relaxed) {
+            true => Err(ReceptionError::Stopped),
+            false => Ok(()),
+        })
+    }
+
+    /// The same, until `look` has a reason not to wait any longer; it is asked ten times a second.
+    ///
+    /// # Errors
+    /// [`ReceptionError`] when the receiving thread has ended, or what `look` returns.
+    pub fn next_unless<E: From<ReceptionError>>(
+        &mut self,
+        mut look: impl FnMut() -> Result<(), E>,
+    ) -> Result<Option<CommittedFlight>, E> {
         while self.remaining > 0 {
-            if stop.load(Ordering::Relaxed) {
-                return Err(ReceptionError::Stopped);
-            }
+            look()?;
             match self.flights.recv_timeout(STOP_CHECK) {
                 Ok(flight) => {
                     self.remaining -= 1;
                     return Ok(Some(flight));
                 }
                 Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => return Err(self.shared.failed()),
+                Err(RecvTimeoutError::Disconnected) => return Err(self.shared.failed().into()),
             }
         }
         Ok(None)

@@ -16,7 +16,7 @@ use skein_protocol::run::RunIdentity;
 use skein_protocol::services::{LearnerPorts, ServiceError};
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::{LapTimer, Stage};
-use skein_protocol::ticket::ControlRecord;
+use skein_protocol::ticket::{ControlRecord, Message};
 
 use super::desk::{Desk, HopelessFlight, Order, Place};
 use super::reception::{Command, ReceptionError, Shared};
@@ -55,7 +55,7 @@ struct Delivery {
 
 enum Outgoing {
     Snapshot(Snapshot),
-    Control(ControlRecord),
+    Message(Message),
 }
 
 /// What the training thread wants of the receiving one, besides its commands.
@@ -233,7 +233,7 @@ impl Server {
 
     fn hand_out(&mut self, now: Instant) {
         self.outbox
-            .extend(self.desk.issue(now).into_iter().map(Outgoing::Control));
+            .extend(self.desk.issue(now).into_iter().map(Outgoing::Message));
     }
 
     /// Sends what is to be sent, as far as that works.
@@ -241,7 +241,7 @@ impl Server {
         while let Some(outgoing) = self.outbox.front() {
             let sent = match outgoing {
                 Outgoing::Snapshot(snapshot) => self.ports.publish(snapshot),
-                Outgoing::Control(record) => self.ports.send_control(*record),
+                Outgoing::Message(message) => self.ports.send(message),
             };
             if self.trouble.unless(sent).is_none() {
                 break;

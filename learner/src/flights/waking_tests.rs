@@ -17,7 +17,7 @@ fn an_actor_is_woken_to_a_ticket_unless_it_shows_that_it_flies() {
 
     // It flies 0, and finds 2 before it flies 1 or after.
     feed(&mut desk, &records(&tickets[0], 0, LIFE), now);
-    let second = tickets_for(&desk.issue(now), 0, LIFE)[0];
+    let second = tickets_for(&desk.issue(now), 0, LIFE).remove(0);
     assert!(!desk.take_wake(), "it flies");
 
     // It may say this for want of 2, which was on its way.
@@ -32,10 +32,10 @@ fn an_actor_is_woken_to_a_ticket_unless_it_shows_that_it_flies() {
     // Nothing that it was given before that word shows that it has heard the word's answer.
     (3..6).for_each(|flight| desk.order(order(flight)));
     feed(&mut desk, &records(&tickets[1], 0, LIFE), now);
-    let third = tickets_for(&desk.issue(now), 0, LIFE)[0];
+    let third = tickets_for(&desk.issue(now), 0, LIFE).remove(0);
     assert!(desk.take_wake(), "it may wait");
     feed(&mut desk, &records(&second, 0, LIFE), now);
-    let fourth = tickets_for(&desk.issue(now), 0, LIFE)[0];
+    let fourth = tickets_for(&desk.issue(now), 0, LIFE).remove(0);
     assert!(desk.take_wake(), "it may wait");
     feed(&mut desk, &records(&third, 0, LIFE), now);
     assert_eq!(tickets_for(&desk.issue(now), 0, LIFE).len(), 1);

@@ -21,7 +21,7 @@ pub struct FlightRow {
     pub flight: u64,
     /// Epoch it belongs to.
     pub epoch: u64,
-    /// Snapshot it was flown with.
+    /// Snapshot it was flown with; in legs, the first of them.
     pub policy_version: u64,
     /// Who flew it: the one column that may differ between two runs of one configuration.
     pub actor: u32,
@@ -51,6 +51,7 @@ const COLUMNS: [&str; 9] = [
     "outcome",
 ];
 
+/// Of a flight that has ended.
 impl From<&CommittedFlight> for FlightRow {
     fn from(flight: &CommittedFlight) -> Self {
         Self {
@@ -62,7 +63,7 @@ impl From<&CommittedFlight> for FlightRow {
             steps: flight.steps(),
             walls_passed: flight.walls_passed,
             total_reward: flight.total_reward(),
-            outcome: flight.outcome,
+            outcome: flight.ending(),
         }
     }
 }

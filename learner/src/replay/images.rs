@@ -57,6 +57,19 @@ impl ImageStore {
         first
     }
 
+    /// Appends images to the last flight's block; returns the number of the image before the first of them. The caller made sure of [`ImageStore::has_room`], and
+    /// that there is a block.
+    pub(super) fn extend(&mut self, images: &[u8]) -> u32 {
+        let before = self.len as u32 - 1;
+        self.len += images.len() / IMAGE_PIXELS;
+        if let Some(block) = self.flights.last_mut() {
+            let block = Arc::make_mut(block);
+            block.reserve_exact(images.len());
+            block.extend_from_slice(images);
+        }
+        before
+    }
+
     /// The blocks, in order.
     pub(super) fn flights(&self) -> &[Arc<Vec<u8>>] {
         &self.flights

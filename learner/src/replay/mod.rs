@@ -1,7 +1,7 @@
 //! The split replay buffer (paper, section 3.5).
 //!
 //! Successful avoidance is rare in the beginning and would drown among everything else, so it has a part of its own with a fixed share of every
-//! minibatch. (With a share of nought there is one part for all, the ordinary buffer.) Each part is a [`ring`] of self-contained rows. Whole flights go in, in flight order, and nothing here is random but what the
+//! minibatch. (With a share of nought there is one part for all, the ordinary buffer.) Each part is a [`ring`] of self-contained rows. Whole flights go in, in flight order, or their legs, and nothing here is random but what the
 //! caller's seeded generator draws: the content is a function of the flights, and a minibatch one of content and seed.
 //!
 //! While the VAE is trained, the depth [`images`] of stored transitions are kept: the VAE learns from them, and when it is frozen the latent codes of all
@@ -19,7 +19,7 @@ use std::sync::Arc;
 use rand::{Rng, RngExt};
 use skein_protocol::config::{Config, ReplaySection, View};
 use skein_protocol::ids::FlightId;
-use skein_protocol::{ACTION, LATENT};
+use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
 
 use crate::flight::{CommittedFlight, FlightFault};
 use images::ImageStore;
@@ -38,6 +38,8 @@ pub struct Replay {
     regular: Ring,
     /// Until the VAE is frozen.
     images: Option<ImageStore>,
+    /// The flight that was stored last, and how many steps of it: what a later leg must follow. In no checkpoint, as those lie between flights.
+    last: Option<(FlightId, usize)>,
 }
 
 /// A minibatch of transitions in flat buffers that are reused from draw to draw.
@@ -63,6 +65,14 @@ pub enum InsertError {
     /// Its parts do not belong together.
     #[error(transparent)]
     Fault(#[from] FlightFault),
+    /// It is a leg, and what was stored last is not what was flown before it.
+    #[error("a leg of flight {flight} from its step {first_step} on cannot follow what was stored before it")]
+    OutOfPlace {
+        /// The flight.
+        flight: FlightId,
+        /// Steps flown before.
+        first_step: usize,
+    },
     /// It came without depth images while the VAE is trained.
     #[error(
         "flight {flight} has no depth images, but the VAE is not frozen yet and its latent codes will have to be made anew"
@@ -101,6 +111,7 @@ impl Replay {
             success: Ring::new(success, layout),
             regular: Ring::new(regular, layout),
             images: Some(ImageStore::new(image_limit(config))),
+            last: None,
         }
     }
 
@@ -125,12 +136,13 @@ impl Replay {
     }
 
     /// Stores all transitions of `flight`, in order, each in the part the success rule says. Its depth images are taken over while the VAE is trained, and
-    /// dropped after.
+    /// dropped after. Of a later leg the first image is the last one of the leg before, and is not stored twice.
     ///
     /// # Errors
     /// [`InsertError`]; the buffer is as before.
     pub fn insert(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
         flight.check()?;
+        self.check_place(&flight)?;
         let first_image = self.take_images(&mut flight)?;
         let success = success_steps(&flight.level_up, &self.section);
         let last = flight.steps() - 1;
@@ -143,7 +155,17 @@ impl Replay {
             *row.reward = flight.rewards[step];
             *row.terminated = f32::from(step == last && flight.terminated());
         }
+        self.last = Some((flight.flight, flight.first_step + flight.steps()));
         Ok(())
+    }
+
+    /// Whether a later leg follows the one before it.
+    fn check_place(&self, flight: &CommittedFlight) -> Result<(), InsertError> {
+        let CommittedFlight { flight, first_step, .. } = *flight;
+        match first_step == 0 || self.last == Some((flight, first_step)) {
+            true => Ok(()),
+            false => Err(InsertError::OutOfPlace { flight, first_step }),
+        }
     }
 
     /// Draws `count` transitions uniformly with replacement from each part in the configured ratio; all from the other part while one is empty.
@@ -199,7 +221,8 @@ impl Replay {
         let Some(store) = &mut self.images else {
             return Ok(None);
         };
-        let (id, found) = (flight.flight, flight.steps() + 1);
+        let is_later_leg = flight.first_step > 0;
+        let (id, found) = (flight.flight, flight.steps() + usize::from(!is_later_leg));
         if !store.has_room(found) {
             let (held, limit) = (store.len(), store.limit());
             return Err(InsertError::TooManyImages {
@@ -210,7 +233,10 @@ impl Replay {
             });
         }
         let images = flight.depth.take().ok_or(InsertError::NoImages { flight: id })?;
-        Ok(Some(store.push(Arc::new(images))))
+        Ok(Some(match is_later_leg {
+            true => store.extend(&images[IMAGE_PIXELS..]),
+            false => store.push(Arc::new(images)),
+        }))
     }
 }
 

@@ -44,10 +44,12 @@ fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
     }
     let (mut timer, before) = (LapTimer::start(), (trainer.vae_updates(), trainer.updates()));
     trainer
-        .train_vae(Epoch(epoch), &mut timer, |_| Ok::<_, UpdateError>(()))
+        .train_vae(PolicyVersion(epoch), &mut timer, |_| Ok::<_, UpdateError>(()))
         .unwrap();
     trainer
-        .train_policy(Epoch(epoch), &mut timer, |_| Ok::<_, UpdateError>(()))
+        .train_policy(PolicyVersion(epoch), &mut timer, &mut Means::default(), |_| {
+            Ok::<_, UpdateError>(())
+        })
         .unwrap();
     let done = (trainer.vae_updates() - before.0, trainer.updates() - before.1);
     let booked = |stage| timer.times().of(stage).count;
@@ -60,6 +62,7 @@ fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
         progress: Progress {
             flights: epochs * FLIGHTS,
             epochs,
+            version: epochs,
             environment_steps: trainer.steps(),
             vae_steps: trainer.vae_updates(),
             policy_updates: trainer.updates(),
@@ -152,7 +155,7 @@ fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
             .map(code)
             .collect();
         let mut drawn = Minibatch::default();
-        let mut rng = trainer.rng(Purpose::PolicyBatches, Epoch(9));
+        let mut rng = trainer.rng(Purpose::PolicyBatches, PolicyVersion(9));
         trainer.replay().sample(&mut rng, 200, &mut drawn);
         let rows = drawn.observations.chunks(drawn.observations.len() / 200);
         for observation in rows {

@@ -66,8 +66,8 @@ pub enum TrainingError {
         checkpoints: PathBuf,
         first_after: u64,
     },
-    /// It was told to stop and did not wait for the end of an epoch's updates.
-    #[error("stopped amid the updates of an epoch")]
+    /// It was told to stop and did not wait for the end of an epoch's updates, or of the flight that it was learning from.
+    #[error("stopped amid an epoch")]
     Abandoned,
 }
 

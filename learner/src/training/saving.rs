@@ -16,7 +16,7 @@ use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{Ending, Summary};
 
-use super::{StopWatch, Training, TrainingError};
+use super::{EpochCurves, StopWatch, Training, TrainingError};
 use crate::checkpoint::{CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, Progress};
 use crate::disk::Disk;
 use crate::flights::reception::Reception;
@@ -87,11 +87,13 @@ impl<'a> Training<'a> {
             disk,
             started,
             epoch_started: started,
+            curves: EpochCurves::default(),
             timer,
             progress: saved.clone(),
             saved,
             resumes,
             in_the_air: VecDeque::new(),
+            under_way: None,
             snapshots,
         };
         training.remove_later_results()?;
@@ -172,7 +174,8 @@ impl<'a> Training<'a> {
 
     /// Hands the state to the writing thread, unless it is that of the newest checkpoint; and keeps the newest snapshot as a file.
     ///
-    /// Only between epochs: then the state follows from the epochs done, whether a candidate was looked at, and what had been ordered earlier.
+    /// Only between epochs, and so between flights: then the state follows from the epochs done, whether a candidate was looked at, and what had been ordered
+    /// earlier. What lies in the middle of a flight is in none.
     pub(super) fn checkpoint(&mut self) -> Result<(), TrainingError> {
         let (now, saved) = (&self.progress, &self.saved);
         if (now.epochs, now.latest_candidate) == (saved.epochs, saved.latest_candidate) {
@@ -222,12 +225,12 @@ impl<'a> Training<'a> {
         Ok(self.counted())
     }
 
-    /// Gives up the updates of an epoch half done: the files tell what the next life will go on from. Returns how far that is.
+    /// Gives up an epoch half done: the files tell what the next life will go on from. Returns how far that is.
     pub(super) fn go_back(&mut self) -> Result<Progress, TrainingError> {
         tracing::warn!(
             flights = self.progress.flights,
             checkpoint = self.saved.flights,
-            "told to stop, and an epoch's updates take too long: back to the newest checkpoint"
+            "told to stop, and the end of the epoch takes too long: back to the newest checkpoint"
         );
         self.reporter.update(|progress| progress.phase = Phase::Finishing);
         // What is flushed now cannot follow what is cut.

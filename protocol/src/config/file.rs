@@ -386,6 +386,36 @@ mod tests {
             ),
             ("[sac]\ndiscount = nan", vec![], vec!["sac.discount = NaN"]),
             (
+                "[learning]\nleg_steps = 1",
+                vec![],
+                vec!["learning.flights_per_epoch = 10", "leg_steps = 1", "set it to 1"],
+            ),
+            (
+                "[learning]\nleg_steps = 1\nflights_per_epoch = 1",
+                vec!["learning.policy_lag=1"],
+                vec![
+                    "--set learning.policy_lag=1",
+                    "learning.policy_lag = 1",
+                    "leg_steps = 1",
+                    "set it to 0",
+                ],
+            ),
+            (
+                "[learning]\nleg_steps = 2\nflights_per_epoch = 1\n[replay]\nsuccess = \"approach\"",
+                vec![],
+                vec!["replay.success = approach", "leg_steps = 2", "level-up"],
+            ),
+            (
+                "[learning]\nleg_steps = 1\nflights_per_epoch = 1\n[transport]\nmax_records_per_flight = 300",
+                vec![],
+                vec!["transport.max_records_per_flight = 300", "256", "lower it"],
+            ),
+            (
+                "[learning]\nleg_steps = 257",
+                vec![],
+                vec!["learning.leg_steps = 257", "256"],
+            ),
+            (
                 "",
                 vec!["simulator.................x=1"],
                 vec!["--set simulator....", "deeper"],

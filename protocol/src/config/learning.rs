@@ -5,9 +5,10 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require};
+use crate::leg::MOST_FLOWN;
 use crate::{ACTION, LATENT};
 
-/// `[learning]`: delayed learning.
+/// `[learning]`: when is learned, how much, and from what.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearningSection {
@@ -15,6 +16,9 @@ pub struct LearningSection {
     pub algorithm: AlgorithmName,
     /// Flights flown with one frozen snapshot before the networks are updated. 1 is the paper's delayed learning. Default 10.
     pub flights_per_epoch: u64,
+    /// Steps after which the networks are updated and the weights refreshed in the middle of a flight, which goes on with them. 0 waits for the flight's end, as
+    /// delayed learning does; 1 is direct updates, which the paper compares that with. One actor flies at a time then. Default 0.
+    pub leg_steps: u64,
     /// Epochs a snapshot is behind when it is flown: 0 flies the newest; 1 lets actors fly while the learner updates. Default 0.
     pub policy_lag: u64,
     /// Policy updates per environment step, done at the end of the epoch. Default 0.5.
@@ -37,6 +41,7 @@ impl Default for LearningSection {
         Self {
             algorithm: AlgorithmName::Sac,
             flights_per_epoch: 10,
+            leg_steps: 0,
             policy_lag: 0,
             updates_per_step: 0.5,
             warmup_steps: 2000,
@@ -62,6 +67,7 @@ impl LearningSection {
             self.policy_lag,
             "is above 1: flying two epochs behind gains nothing over one, whose updates already overlap the flying",
         )?;
+        self.validate_legs()?;
         require(
             (0.0..=100.0).contains(&self.updates_per_step),
             "learning.updates_per_step",
@@ -106,6 +112,46 @@ impl LearningSection {
 
 /// Earlier moments that can be seen at most.
 const MOST_HISTORY: usize = 16;
+
+impl LearningSection {
+    /// Whether flights are flown in legs, so that the weights are refreshed in the middle of them.
+    pub fn in_legs(&self) -> bool {
+        self.leg_steps > 0
+    }
+
+    /// One flight is under way in legs at a time: only then does each leg follow from all that was flown before.
+    fn validate_legs(&self) -> Result<(), Invalid> {
+        require(
+            self.leg_steps <= MOST_FLOWN as u64,
+            "learning.leg_steps",
+            self.leg_steps,
+            format!("is above {MOST_FLOWN}, the longest flight in legs: 0 learns after whole flights"),
+        )?;
+        for (key, value, needed) in [
+            ("learning.flights_per_epoch", self.flights_per_epoch, 1),
+            ("learning.policy_lag", self.policy_lag, 0),
+        ] {
+            require(
+                !self.in_legs() || value == needed,
+                key,
+                value,
+                format!(
+                    "does not go with learning.leg_steps = {}, which refreshes the weights in the middle of the one flight that is under way: set it to {needed}, or learning.leg_steps to 0",
+                    self.leg_steps
+                ),
+            )?;
+        }
+        require(
+            !self.in_legs() || self.history_steps.is_empty(),
+            "learning.history_steps",
+            format!("{:?}", self.history_steps),
+            format!(
+                "does not go with learning.leg_steps = {}: who flies a leg has not seen the ones before; name none, or set learning.leg_steps to 0",
+                self.leg_steps
+            ),
+        )
+    }
+}
 
 /// A learning algorithm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

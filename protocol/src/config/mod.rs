@@ -17,6 +17,8 @@ mod vae;
 
 use serde::{Deserialize, Serialize};
 
+use crate::leg::MOST_FLOWN;
+
 pub use courses::CoursesSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
 pub use file::{ConfigError, culprit};
@@ -100,6 +102,7 @@ impl Config {
                 self.replay.capacity
             ),
         )?;
+        self.validate_legs()?;
         require(
             self.learning.algorithm == AlgorithmName::Sac || self.run.engine() == Engine::Native,
             "run.engine",
@@ -117,6 +120,27 @@ impl Config {
             format!(
                 "exceeds learning.warmup_steps = {}: the first update would have too few transitions to draw from",
                 self.learning.warmup_steps
+            ),
+        )
+    }
+
+    /// What flights in legs ask of other sections.
+    fn validate_legs(&self) -> Result<(), Invalid> {
+        let (leg_steps, longest) = (self.learning.leg_steps, self.transport.max_records_per_flight);
+        require(
+            !self.learning.in_legs() || self.replay.success == SuccessRule::LevelUp || self.replay.success_share == 0.0,
+            "replay.success",
+            "approach",
+            format!(
+                "does not go with learning.leg_steps = {leg_steps}: the steps before a level-up are stored and learned from by then; set it to \"level-up\", or learning.leg_steps to 0"
+            ),
+        )?;
+        require(
+            !self.learning.in_legs() || longest <= MOST_FLOWN,
+            "transport.max_records_per_flight",
+            longest,
+            format!(
+                "is above {MOST_FLOWN}, and learning.leg_steps = {leg_steps}: the ticket of a leg has no room for more actions flown before; lower it, and simulator.max_steps if need be, or set learning.leg_steps to 0"
             ),
         )
     }

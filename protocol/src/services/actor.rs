@@ -16,10 +16,11 @@ use super::opening::{Manner, Opener};
 use super::{Ipc, ServiceError, failed, node, wait};
 use crate::config::Config;
 use crate::ids::RunId;
+use crate::leg::LegRecord;
 use crate::run::{Life, RunIdentity};
 use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 use crate::status::StatusRecord;
-use crate::ticket::ControlRecord;
+use crate::ticket::{ControlRecord, Message};
 use crate::transition::TransitionRecord;
 
 /// A transition record in shared memory, being written.
@@ -35,6 +36,7 @@ pub struct ActorPorts {
     transitions: Publisher<Ipc, TransitionRecord, ()>,
     status: Publisher<Ipc, StatusRecord, ()>,
     control: Subscriber<Ipc, ControlRecord, ()>,
+    legs: Subscriber<Ipc, LegRecord, ()>,
     weights: Subscriber<Ipc, [u8], SnapshotHeader>,
     wake: Listener<Ipc>,
     wake_learner: Notifier<Ipc>,
@@ -80,6 +82,11 @@ impl ActorPorts {
                 .subscriber_builder()
                 .create()
                 .map_err(failed("control", "subscribing"))?,
+            legs: open
+                .legs()?
+                .subscriber_builder()
+                .create()
+                .map_err(failed("legs", "subscribing"))?,
             weights: open
                 .weights()?
                 .subscriber_builder()
@@ -150,13 +157,16 @@ impl ActorPorts {
             .map_err(failed("status", "sending"))
     }
 
-    /// The next control record, if one has arrived.
+    /// The next message, if one has arrived. Tickets of legs come after all else.
     ///
     /// # Errors
     /// [`ServiceError`] when the learner's memory cannot be mapped.
-    pub fn receive_control(&self) -> Result<Option<ControlRecord>, ServiceError> {
-        let sample = self.control.receive().map_err(failed("control", "receiving"))?;
-        Ok(sample.map(|sample| *sample))
+    pub fn receive_control(&self) -> Result<Option<Message>, ServiceError> {
+        if let Some(sample) = self.control.receive().map_err(failed("control", "receiving"))? {
+            return Ok(Some(Message::Control(*sample)));
+        }
+        let sample = self.legs.receive().map_err(failed("legs", "receiving"))?;
+        Ok(sample.map(|sample| Message::Leg(Box::new(*sample))))
     }
 
     /// The next snapshot, if one has arrived; the inner result says whether it can be flown.
@@ -191,6 +201,7 @@ impl ActorPorts {
         self.control
             .update_connections()
             .map_err(failed("control", "connecting"))?;
+        self.legs.update_connections().map_err(failed("legs", "connecting"))?;
         self.weights
             .update_connections()
             .map_err(failed("weights", "connecting"))?;

@@ -18,10 +18,11 @@ use super::opening::{Manner, Opener, control_slots};
 use super::{Ipc, ServiceError, failed, node, wait};
 use crate::config::Config;
 use crate::fault::{FaultPoint, pass};
+use crate::leg::LegRecord;
 use crate::run::{Announcement, Life, RunIdentity};
 use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 use crate::status::StatusRecord;
-use crate::ticket::ControlRecord;
+use crate::ticket::{ControlRecord, Message};
 use crate::transition::TransitionRecord;
 
 /// A transition record in shared memory, received.
@@ -42,6 +43,7 @@ pub struct LearnerPorts {
     transitions: Subscriber<Ipc, TransitionRecord, ()>,
     status: Subscriber<Ipc, StatusRecord, ()>,
     control: Publisher<Ipc, ControlRecord, ()>,
+    legs: Publisher<Ipc, LegRecord, ()>,
     weights: Publisher<Ipc, [u8], SnapshotHeader>,
     wake: Listener<Ipc>,
     wake_actors: Notifier<Ipc>,
@@ -102,6 +104,13 @@ impl LearnerPorts {
                 .override_sample_preallocation(move |worst_case| worst_case.min(messages))
                 .create()
                 .map_err(failed("control", "publishing"))?,
+            legs: open
+                .legs()?
+                .publisher_builder()
+                .max_loaned_samples(1)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+                .map_err(failed("legs", "publishing"))?,
             weights: weights_factory
                 .publisher_builder()
                 .initial_max_slice_len(layout.values() * size_of::<f32>())
@@ -151,7 +160,22 @@ impl LearnerPorts {
         Ok(sample.map(|sample| *sample))
     }
 
-    /// Sends `record` to the actors connected now; a lost one is made good by the ticket's deadline.
+    /// Sends `message` to the actors connected now; a lost one is made good by the ticket's deadline.
+    ///
+    /// # Errors
+    /// [`ServiceError`] when there is no memory to send it in.
+    pub fn send(&self, message: &Message) -> Result<(), ServiceError> {
+        match message {
+            Message::Control(record) => self.send_control(*record),
+            Message::Leg(record) => self
+                .legs
+                .send_copy(**record)
+                .map(drop)
+                .map_err(failed("legs", "sending")),
+        }
+    }
+
+    /// Sends `record` as [`LearnerPorts::send`] does.
     ///
     /// # Errors
     /// [`ServiceError`] when there is no memory to send it in.
@@ -215,6 +239,7 @@ impl LearnerPorts {
         self.weights
             .update_connections()
             .map_err(failed("weights", "connecting"))?;
+        self.legs.update_connections().map_err(failed("legs", "connecting"))?;
         self.control
             .update_connections()
             .map_err(failed("control", "connecting"))

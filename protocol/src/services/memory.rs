@@ -10,9 +10,10 @@ use rustix::fs::FallocateFlags;
 use rustix::mm::{Advice, madvise};
 
 use super::learner::SNAPSHOT_SLOTS;
-use super::opening::{control_buffer, control_slots, transition_buffer};
+use super::opening::{control_buffer, control_slots, leg_slots, transition_buffer};
 use super::{ServiceError, failed};
 use crate::config::Config;
+use crate::leg::LegRecord;
 use crate::run::{Life, RunIdentity};
 use crate::snapshot::SnapshotLayout;
 use crate::ticket::ControlRecord;
@@ -31,8 +32,9 @@ const SLOT_OVERHEAD: usize = 3 << 10;
 pub fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
     let snapshot = SnapshotLayout::of(config).values() * size_of::<f32>() + SAMPLE_OVERHEAD;
     let control = control_slots(&config.transport) * (size_of::<ControlRecord>() + SAMPLE_OVERHEAD / 2);
+    let legs = leg_slots(&config.transport) * (size_of::<LegRecord>() + SAMPLE_OVERHEAD / 2);
     let slots = config.transport.max_actors * SLOT_OVERHEAD;
-    let learner = SNAPSHOT_SLOTS * snapshot + control + slots + LEARNER_OVERHEAD;
+    let learner = SNAPSHOT_SLOTS * snapshot + control + legs + slots + LEARNER_OVERHEAD;
     // Flights of all tickets, and what either side has in hand.
     let records = transition_buffer(&config.transport) + 8;
     // A queue of eight bytes a message there and back, and one byte to say who has it.

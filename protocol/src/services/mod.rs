@@ -5,6 +5,7 @@
 //! | `transitions` | publish-subscribe | actors → learner | [`TransitionRecord`], rendered into the loaned sample |
 //! | `status` | publish-subscribe | actors → learner | [`StatusRecord`] |
 //! | `control` | publish-subscribe | learner → actors | [`ControlRecord`]: tickets, signs of life, the stop |
+//! | `legs` | publish-subscribe | learner → actors | [`LegRecord`]: tickets of legs |
 //! | `weights` | publish-subscribe | learner → actors | snapshots' bytes behind a [`SnapshotHeader`] |
 //! | `wake-learner`, `wake-actors` | event | both | that there is something to read |
 //!
@@ -34,6 +35,7 @@ use iceoryx2::node::Node;
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::prelude::*;
 
+use crate::leg::LegRecord;
 use crate::run::{Life, RunIdentity};
 use crate::snapshot::SnapshotHeader;
 use crate::status::StatusRecord;
@@ -118,9 +120,10 @@ fn transport_config(identity: &RunIdentity, life: Life) -> Result<IceoryxConfig,
 /// What the records that cross the transport look like; equal in processes that can read each other's.
 pub(crate) fn record_layout() -> String {
     format!(
-        "transition {} control {} status {} snapshot header {}",
+        "transition {} control {} leg {} status {} snapshot header {}",
         size_of::<TransitionRecord>(),
         size_of::<ControlRecord>(),
+        size_of::<LegRecord>(),
         size_of::<StatusRecord>(),
         size_of::<SnapshotHeader>(),
     )

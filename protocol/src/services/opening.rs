@@ -7,6 +7,7 @@ use iceoryx2::service::port_factory::event;
 use super::{Ipc, ServiceError, failed};
 use crate::PROTOCOL_VERSION;
 use crate::config::{Config, TransportSection};
+use crate::leg::LegRecord;
 use crate::run::RunIdentity;
 use crate::snapshot::{SnapshotHeader, SnapshotLayout};
 use crate::status::StatusRecord;
@@ -17,6 +18,8 @@ use crate::transition::TransitionRecord;
 const BORROWED_RECORDS: usize = 2;
 /// Snapshots a late joiner still gets: with policy lag 1 two versions are in use, and an evaluation adds a third.
 pub(super) const SNAPSHOT_HISTORY: usize = 4;
+/// Tickets of legs that may wait for an actor.
+const LEG_BUFFER: usize = 1;
 /// How services come to be.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Manner {
@@ -151,6 +154,26 @@ impl<'a> Opener<'a> {
         opened!(self, "control", builder())
     }
 
+    pub(super) fn legs(
+        &self,
+    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, LegRecord, ()>, ServiceError> {
+        let name = service_name("legs")?;
+        let builder = || {
+            self.node
+                .service_builder(&name)
+                .publish_subscribe::<LegRecord>()
+                .max_publishers(1)
+                .max_subscribers(self.actors)
+                .max_nodes(self.nodes())
+                .subscriber_max_buffer_size(LEG_BUFFER)
+                .subscriber_max_borrowed_samples(1)
+                .history_size(0)
+                // One flight is under way in legs at a time, and one leg of it: of tickets for legs the newest counts.
+                .enable_safe_overflow(true)
+        };
+        opened!(self, "legs", builder())
+    }
+
     pub(super) fn weights(
         &self,
     ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, [u8], SnapshotHeader>, ServiceError>
@@ -207,6 +230,11 @@ pub(super) fn control_buffer(transport: &TransportSection) -> usize {
 /// up to as many of them as are counted here. If there are more, nothing can be said to anybody, and the learner gives the transport up.
 pub(super) fn control_slots(transport: &TransportSection) -> usize {
     16 * control_buffer(transport)
+}
+
+/// Tickets of legs that exist at once: one that waits for each actor, one that it looks at, and one that is written.
+pub(super) fn leg_slots(transport: &TransportSection) -> usize {
+    2 * transport.max_actors * (LEG_BUFFER + 1) + 1
 }
 
 fn service_name(name: &'static str) -> Result<ServiceName, ServiceError> {

@@ -67,6 +67,8 @@ pub enum TableKind {
     Outcomes,
     /// What it took until the agent was trained, and how well and steadily it flew at the end of training.
     Learning,
+    /// How much training swung, and how much of what was learned was lost again.
+    Steadiness,
     /// What the runs took: steps, updates, time.
     Cost,
 }
@@ -89,6 +91,8 @@ pub enum Measure {
     WallsPassed,
     /// Sum of a flight's rewards.
     Return,
+    /// How far the walls passed a flight lie below the most they had been.
+    Drawdown,
 }
 
 /// What a curve is drawn over.

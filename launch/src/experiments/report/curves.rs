@@ -35,6 +35,7 @@ impl Findings<'_> {
         let what = match curve.measure {
             Measure::WallsPassed => "Walls passed",
             Measure::Return => "Return",
+            Measure::Drawdown => "Drawdown of the walls passed",
         };
         let shortened = match self.experiment.is_shortened() {
             true => " (shortened runs)",
@@ -50,10 +51,11 @@ impl Findings<'_> {
             y: match curve.measure {
                 Measure::WallsPassed => "walls passed",
                 Measure::Return => "return",
+                Measure::Drawdown => "walls below the highest average before",
             },
             level: match curve.measure {
                 Measure::WallsPassed => self.ideal()?,
-                Measure::Return => None,
+                Measure::Return | Measure::Drawdown => None,
             },
             lines: arms
                 .iter()
@@ -119,6 +121,7 @@ pub(super) fn measure_name(measure: Measure) -> &'static str {
     match measure {
         Measure::WallsPassed => "walls_passed",
         Measure::Return => "return",
+        Measure::Drawdown => "drawdown",
     }
 }
 

@@ -129,6 +129,13 @@ impl Findings<'_> {
                 "A run that never reached the rate counts with all that it took (≥). Volatility is the root mean square of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to. "
             );
         }
+        if tables.contains(&TableKind::Steadiness) {
+            let window = self.experiment.arms[0].config.evaluation.window_flights;
+            let _ = write!(
+                text,
+                "Dispersion across time is the interquartile range of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; the largest drawdown is how far the average over {window} flights ever fell below the highest it had been (arXiv:1912.05663). "
+            );
+        }
         if !pictures.is_empty() {
             text.push_str("Lines are interquartile means over the seeds, bands their 95 % bootstrap intervals; a line ends where the first of its runs does. ");
         }

@@ -28,6 +28,7 @@ impl Findings<'_> {
             TableKind::Evaluation => self.evaluation(),
             TableKind::Outcomes => vec![self.outcomes()],
             TableKind::Learning => vec![self.learning()],
+            TableKind::Steadiness => vec![self.steadiness()],
             TableKind::Cost => vec![self.cost()],
         }
     }
@@ -148,16 +149,14 @@ impl Findings<'_> {
                     Clock(secs).to_string()
                 }),
             );
-            for of_run in [
-                RunResult::final_walls_passed,
-                RunResult::final_return,
-                RunResult::volatility,
-            ] {
-                let estimate = self.estimate(number, of_run);
-                row.push(estimate.map_or(NOTHING.to_owned(), |estimate| {
-                    with_interval(estimate, |value| format!("{value:.2}"))
-                }));
-            }
+            row.extend(self.measured(
+                number,
+                &[
+                    RunResult::final_walls_passed,
+                    RunResult::final_return,
+                    RunResult::volatility,
+                ],
+            ));
             rows.push(row);
         }
         let window = evaluation.window_flights;
@@ -185,6 +184,34 @@ impl Findings<'_> {
             ),
             table: grid(header.to_vec(), rows, 1),
         }
+    }
+
+    fn steadiness(&self) -> Titled {
+        let mut rows = Vec::new();
+        for (number, arm) in self.experiment.arms.iter().enumerate() {
+            let mut row = self.head(number, arm);
+            row.extend(self.measured(
+                number,
+                &[RunResult::dispersion_across_time, RunResult::largest_drawdown],
+            ));
+            rows.push(row);
+        }
+        let header = ["arm", "seeds", "dispersion across time", "largest drawdown"];
+        Titled {
+            title: "Steadiness of the walls passed in training: the smaller, the steadier".to_owned(),
+            table: grid(header.map(str::to_owned).to_vec(), rows, 1),
+        }
+    }
+
+    /// Cells of what is measured of the runs of an arm.
+    fn measured(&self, arm: usize, measures: &[fn(&RunResult) -> Option<f64>]) -> Vec<String> {
+        let cell = |of_run: &fn(&RunResult) -> Option<f64>| {
+            let estimate = self.estimate(arm, of_run);
+            estimate.map_or(NOTHING.to_owned(), |estimate| {
+                with_interval(estimate, |value| format!("{value:.2}"))
+            })
+        };
+        measures.iter().map(cell).collect()
     }
 
     /// When the runs of an arm were trained. A run that never was counts with all that it took, which is the least it would have taken.

@@ -59,6 +59,76 @@ fn a_minibatch_holds_the_configured_share_of_success() {
     }
 }
 
+/// `flight` in legs of `steps` steps, each with the images of all that it saw.
+fn in_legs(flight: &CommittedFlight, steps: usize) -> Vec<CommittedFlight> {
+    let leg = |first: usize| {
+        let end = (first + steps).min(flight.steps());
+        let is_last = end == flight.steps();
+        let images = &flight.depth.as_ref().unwrap()[first * IMAGE_PIXELS..(end + 1) * IMAGE_PIXELS];
+        CommittedFlight {
+            first_step: first,
+            action_before: first
+                .checked_sub(1)
+                .map_or([0.0; ACTION], |before| flight.actions[before]),
+            observations: flight.observations[first..=end].to_vec(),
+            actions: flight.actions[first..end].to_vec(),
+            rewards: flight.rewards[first..end].to_vec(),
+            reward_terms: flight.reward_terms[first..end].to_vec(),
+            level_up: flight.level_up[first..end].to_vec(),
+            outcome: flight.outcome.filter(|_| is_last),
+            depth: Some(images.to_vec()),
+            ..flight.without_images()
+        }
+    };
+    (0..flight.steps()).step_by(steps).map(leg).collect()
+}
+
+#[test]
+fn a_flight_stored_in_legs_is_the_flight_stored_whole() {
+    for (steps, outcome) in [(1, Outcome::Collided), (3, Outcome::TimedOut), (7, Outcome::ReachedEnd)] {
+        let config = config(1000, Observation::LatentVelocityAction);
+        let (mut whole, mut legs) = (Replay::new(&config), Replay::new(&config));
+        for number in 0..3 {
+            let mut flown = with_images(flight(number, 7, outcome));
+            flown.level_up[5] = true;
+            let parts = in_legs(&flown, steps);
+            let mut joined = parts[0].without_images();
+            parts[1..].iter().for_each(|leg| joined.extend(leg));
+            assert_eq!(joined, flown.without_images());
+            parts.into_iter().for_each(|leg| legs.insert(leg).unwrap());
+            whole.insert(flown).unwrap();
+        }
+        assert_eq!(legs.state(), whole.state());
+        legs.freeze_latents(4, encode).unwrap();
+        whole.freeze_latents(4, encode).unwrap();
+        assert_eq!(legs.state(), whole.state());
+    }
+}
+
+#[test]
+fn a_leg_that_does_not_follow_what_was_stored_last_is_refused() {
+    let legs = |number| in_legs(&with_images(flight(number, 6, Outcome::Collided)), 2);
+    let config = config(1000, Observation::Latent);
+    let mut replay = Replay::new(&config);
+    let refused = |leg: CommittedFlight, replay: &mut Replay| {
+        let before = replay.state();
+        let error = replay.insert(leg).unwrap_err().to_string();
+        assert_eq!(replay.state(), before);
+        assert!(error.contains("flight 4 from its step 2 on"), "{error}");
+    };
+    refused(legs(4).remove(1), &mut replay);
+    replay.insert(legs(3).remove(0)).unwrap();
+    refused(legs(4).remove(1), &mut replay);
+    replay.insert(legs(4).remove(0)).unwrap();
+    replay.insert(legs(4).remove(1)).unwrap();
+    refused(legs(4).remove(1), &mut replay);
+    let mut restored = Replay::restore(&config, replay.state()).unwrap();
+    assert!(
+        restored.insert(legs(4).remove(2)).is_err(),
+        "a checkpoint lies between flights"
+    );
+}
+
 #[test]
 fn an_empty_part_is_made_up_for_by_the_other() {
     for level_up in [false, true] {

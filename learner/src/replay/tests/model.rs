@@ -57,7 +57,7 @@ impl Model {
                 }
                 vector
             };
-            let ends = step + 1 == flight.steps() && flight.outcome != Outcome::TimedOut;
+            let ends = step + 1 == flight.steps() && flight.outcome != Some(Outcome::TimedOut);
             let transition = Transition {
                 observation: observed(step),
                 next_observation: observed(step + 1),

@@ -82,6 +82,7 @@ fn state() -> CheckpointState {
         progress: Progress {
             flights: FLIGHTS,
             epochs: 2,
+            version: 2,
             in_the_air: vec![EpochOrder {
                 epoch: 2,
                 policy_version: 1,

@@ -45,6 +45,7 @@ pub(super) fn sample_ticket(flight: u64) -> Ticket {
         start_level: 1,
         exploration: Exploration::Sample,
         seed: flight,
+        leg: None,
     }
 }
 
@@ -189,7 +190,7 @@ impl Learner {
             // Other actors came by records of random bytes and hold theirs for ever.
             for (actor, life) in lives.filter(|&(actor, life)| message.is_for(actor, life)) {
                 self.held.push(Held {
-                    ticket,
+                    ticket: ticket.clone(),
                     actor,
                     life,
                     step: 0,

@@ -1,0 +1,288 @@
+//! A flight is whole, in order and makes sense, and so is a leg, or it is refused by what is wrong with it.
+
+use bytemuck::Zeroable;
+use skein_protocol::ids::{Attempt, Epoch, PolicyVersion, RunId};
+use skein_protocol::leg::Leg;
+use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+
+use super::super::order::Place;
+use super::*;
+
+const ACTOR: ActorId = ActorId(2);
+const LIFE: Incarnation = Incarnation(11);
+/// Steps of the flight here.
+const STEPS: u32 = 3;
+
+fn ticket() -> Ticket {
+    Ticket {
+        run: RunId(1),
+        flight: FlightId(5),
+        attempt: Attempt(0),
+        policy_version: PolicyVersion(3),
+        course: CourseChoice::Training,
+        start_level: 1,
+        exploration: Exploration::Sample,
+        seed: 9,
+        leg: None,
+    }
+}
+
+fn order(ticket: Ticket, keep: Keep) -> Order {
+    Order {
+        ticket,
+        epoch: Epoch(0),
+        keep,
+        place: Place { batch: 0, index: 0 },
+    }
+}
+
+fn assembly(keep: Keep) -> Assembly {
+    Assembly::new(order(ticket(), keep), None, STEPS as usize + 1, ACTOR, LIFE)
+}
+
+/// Record `step`, its image filled with its number.
+fn record(step: u32) -> TransitionRecord {
+    let mut record = TransitionRecord::zeroed();
+    record.begin(&ticket(), ACTOR, LIFE, step);
+    record.depth.fill(step as u8);
+    record.truncated = u8::from(step == STEPS - 1);
+    if step == STEPS {
+        record.kind = RecordKind::Closing.code();
+        record.outcome = Outcome::TimedOut.code();
+    }
+    record
+}
+
+fn assemble(keep: Keep) -> CommittedFlight {
+    let mut assembly = assembly(keep);
+    for step in 0..STEPS {
+        assert!(matches!(assembly.push(&record(step)), Ok(Assembled::Step)));
+    }
+    match assembly.push(&record(STEPS)) {
+        Ok(Assembled::Whole(flight)) => *flight,
+        other => panic!("the closing record gives {other:?}"),
+    }
+}
+
+#[test]
+fn no_flight_mixes_policy_versions() {
+    for strange in 1..=STEPS {
+        let mut assembly = assembly(Keep::Latents);
+        for step in 0..strange {
+            assembly.push(&record(step)).unwrap();
+        }
+        let mut newer = record(strange);
+        newer.policy_version += 1;
+        let fault = assembly.push(&newer).unwrap_err();
+        let (name, found, expected) = ("policy_version", 4, 3);
+        assert_eq!(fault, RecordFault::Mismatch { name, found, expected });
+    }
+    assert_eq!(assemble(Keep::Latents).policy_version, PolicyVersion(3));
+}
+
+#[test]
+fn a_flight_that_never_ends_is_refused_at_its_limit() {
+    let mut assembly = assembly(Keep::Depth);
+    let onward = |step| {
+        let mut record = record(step);
+        record.kind = RecordKind::Step.code();
+        record.truncated = 0;
+        record
+    };
+    for step in 0..STEPS {
+        assembly.push(&onward(step)).unwrap();
+    }
+    assert!(matches!(assembly.push(&onward(STEPS)), Ok(Assembled::Step)));
+    let fault = assembly.push(&onward(STEPS + 1)).unwrap_err();
+    assert_eq!(
+        fault,
+        RecordFault::TooLong {
+            most: STEPS as usize + 1
+        }
+    );
+}
+
+/// The assembly of two steps that follow one that led to `seen`.
+fn leg(begins: Option<LegEnd>) -> Assembly {
+    let leg = Leg {
+        steps: 2,
+        flown: vec![[0.25, -0.5]].into(),
+    };
+    let ticket = Ticket {
+        leg: Some(leg),
+        ..ticket()
+    };
+    Assembly::new(order(ticket, Keep::Depth), begins, 100, ACTOR, LIFE)
+}
+
+fn changed(mut record: TransitionRecord, change: impl FnOnce(&mut TransitionRecord)) -> TransitionRecord {
+    change(&mut record);
+    record
+}
+
+fn leg_end(step: u32) -> TransitionRecord {
+    changed(onward(step), |record| record.kind = RecordKind::LegEnd.code())
+}
+
+/// A step after which the flight goes on.
+fn onward(step: u32) -> TransitionRecord {
+    changed(record(step), |record| {
+        (record.kind, record.truncated, record.outcome) = (RecordKind::Step.code(), 0, 0);
+    })
+}
+
+#[test]
+fn a_leg_is_its_steps_and_what_they_led_to_and_knows_what_came_before() {
+    let mut assembly = leg(None);
+    assert!(matches!(assembly.push(&onward(1)), Ok(Assembled::Step)));
+    assert!(matches!(assembly.push(&onward(2)), Ok(Assembled::Step)));
+    let Ok(Assembled::Whole(leg)) = assembly.push(&leg_end(3)) else {
+        panic!("a leg's end ends it");
+    };
+    assert_eq!((leg.first_step, leg.steps(), leg.outcome), (1, 2, None));
+    assert_eq!((leg.action_before, leg.check()), ([0.25, -0.5], Ok(())));
+    assert!(!leg.terminated());
+    let end = LegEnd::of(&leg).unwrap();
+    assert_eq!((end.flight, end.steps), (FlightId(5), 3));
+    // The flight may end in a leg, of which no other begins then.
+    let mut last = self::leg(None);
+    last.push(&changed(onward(1), |record| record.terminated = 1)).unwrap();
+    let closing = changed(onward(2), |record| {
+        (record.kind, record.outcome) = (RecordKind::Closing.code(), Outcome::Collided.code());
+    });
+    let Ok(Assembled::Whole(last)) = last.push(&closing) else {
+        panic!("a closing record ends a leg, too");
+    };
+    assert_eq!((last.outcome, LegEnd::of(&last)), (Some(Outcome::Collided), None));
+}
+
+#[test]
+fn a_leg_that_is_too_short_or_too_long_or_of_a_whole_flight_is_refused() {
+    let refusal = |records: &[TransitionRecord], mut assembly: Assembly| {
+        let fault = records.iter().find_map(|record| assembly.push(record).err());
+        fault.expect("it makes no sense").to_string()
+    };
+    assert!(refusal(&[onward(1), leg_end(2)], leg(None)).contains("before its last step"));
+    assert!(refusal(&[onward(1), onward(2), onward(3)], leg(None)).contains("after the leg's last"));
+    assert!(refusal(&[onward(0)], leg(None)).contains("step is 0 where 1"));
+    assert!(refusal(&[leg_end(1)], leg(None)).contains("before its last step"));
+    assert!(refusal(&[onward(0), leg_end(1)], assembly(Keep::Latents)).contains("flown whole"));
+    let end =
+        |change: fn(&mut TransitionRecord)| refusal(&[onward(1), changed(onward(2), change), leg_end(3)], leg(None));
+    assert!(end(|last| last.truncated = 1).contains("ended before the leg"));
+    assert!(end(|last| (last.walls_passed, last.level_up) = (1, 1)).contains("walls passed after"));
+}
+
+#[test]
+fn a_leg_begins_where_the_one_before_it_ended_with_the_walls_that_were_passed() {
+    let seen = StepObservation {
+        latent: [9.0; skein_protocol::LATENT],
+        velocity_mps: [1.0, 0.5, 0.0],
+        position_m: [3.0, 0.0, 2.0],
+        orientation: [0.0, 0.0, 0.0, 1.0],
+    };
+    let (flight, steps, walls_passed) = (FlightId(5), 1, 2);
+    let begins = LegEnd {
+        flight,
+        steps,
+        walls_passed,
+        seen,
+    };
+    let there = changed(onward(1), |record| {
+        (record.position_m, record.velocity_mps) = (seen.position_m, seen.velocity_mps);
+        (record.orientation, record.walls_passed) = (seen.orientation, 2);
+    });
+    // An encoder that has learned since sees it otherwise.
+    assert_ne!(there.latent, seen.latent);
+    assert!(matches!(leg(Some(begins)).push(&there), Ok(Assembled::Step)));
+    let changes: [fn(&mut TransitionRecord); 3] = [
+        |record| record.position_m[2] += 1e-6,
+        |record| record.velocity_mps[1] = -0.5,
+        |record| record.orientation[0] = 1e-9,
+    ];
+    for change in changes {
+        let elsewhere = changed(there, change);
+        let fault = leg(Some(begins)).push(&elsewhere).unwrap_err().to_string();
+        assert!(fault.contains("does not begin where"), "{fault}");
+    }
+    let fewer = changed(there, |record| record.walls_passed = 1);
+    assert!(leg(Some(begins)).push(&fewer).is_err());
+}
+
+#[test]
+fn depth_images_are_copied_only_for_who_wants_them() {
+    assert_eq!(assemble(Keep::Latents).depth, None);
+    let kept = assemble(Keep::Depth).depth.unwrap();
+    let images: Vec<_> = kept.chunks_exact(IMAGE_PIXELS).map(|image| image.to_vec()).collect();
+    assert_eq!(images, (0..=3).map(|step| vec![step; IMAGE_PIXELS]).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_flight_that_contradicts_itself_is_refused() {
+    // A change of one record, by its step, and what is said of it or of the first one that shows it.
+    type Case = (u32, fn(&mut TransitionRecord), &'static str);
+    let cases: [Case; 9] = [
+        (0, |r| r.truncated = 1, "a step after the flight's end"),
+        (0, |r| r.terminated = 1, "a step after the flight's end"),
+        (2, |r| r.truncated = 0, "the flight did not end as it closes"),
+        (
+            3,
+            |r| r.outcome = Outcome::Collided.code(),
+            "the flight did not end as it closes",
+        ),
+        (
+            2,
+            |r| (r.truncated, r.terminated) = (0, 1),
+            "the flight did not end as it closes",
+        ),
+        (1, |r| r.walls_passed = 1, "a wall passed without a level-up"),
+        (1, |r| r.level_up = 1, "a level-up without a wall passed"),
+        (1, |r| (r.walls_passed, r.level_up) = (1, 1), "walls passed grow fewer"),
+        (3, |r| r.walls_passed = 1, "walls passed after the last step"),
+    ];
+    for (step, change, expected) in cases {
+        let mut assembly = assembly(Keep::Latents);
+        let fault = (0..=STEPS).find_map(|at| {
+            let mut record = record(at);
+            record.course_walls = 5;
+            if at == step {
+                change(&mut record);
+            }
+            assembly.push(&record).err()
+        });
+        assert_eq!(fault, Some(RecordFault::Contradiction { what: expected }), "{expected}");
+    }
+}
+
+#[test]
+fn what_was_hit_is_known_of_the_committed_flight() {
+    for (hit_wall, expected) in [(0, None), (1, Some(1))] {
+        let mut assembly = assembly(Keep::Latents);
+        let mut last = record(0);
+        last.terminated = 1;
+        assembly.push(&last).unwrap();
+        let mut closing = record(1);
+        closing.kind = RecordKind::Closing.code();
+        closing.outcome = Outcome::Collided.code();
+        (closing.course_walls, closing.hit_wall) = (5, hit_wall);
+        let Assembled::Whole(flight) = assembly.push(&closing).unwrap() else {
+            panic!("a closing record ends a flight");
+        };
+        assert_eq!(flight.hit_wall, expected);
+    }
+}
+
+#[test]
+fn the_end_wall_is_reached_by_a_level_up_that_passes_no_wall() {
+    for (level_up, is_refused) in [(1, false), (0, true)] {
+        let mut assembly = assembly(Keep::Latents);
+        let mut last = record(0);
+        (last.terminated, last.level_up) = (1, level_up);
+        assembly.push(&last).unwrap();
+        let mut closing = record(1);
+        closing.kind = RecordKind::Closing.code();
+        closing.outcome = Outcome::ReachedEnd.code();
+        closing.course_walls = 5;
+        assert_eq!(assembly.push(&closing).is_err(), is_refused);
+    }
+}

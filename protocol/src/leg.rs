@@ -1,0 +1,156 @@
+//! A leg: some steps of a flight, flown on a ticket of their own, so that the rest can be flown with what was learned meanwhile.
+//!
+//! A leg is a function of its ticket as a flight is: the ticket carries the actions flown so far. An actor that has flown the leg before still has the drone
+//! where that ended; any other takes off and repeats them, and as the simulator is deterministic it comes to the same.
+//!
+//! Tickets of legs have a service of their own. The actions make them thirty times as long as other messages, of which shared memory has room for thousands.
+
+use std::sync::Arc;
+
+use bytemuck::{Pod, Zeroable};
+use iceoryx2::prelude::ZeroCopySend;
+
+use crate::ACTION;
+use crate::ids::{ActorId, Incarnation, RunId};
+use crate::ticket::{Control, ControlFault, ControlRecord, Ticket};
+
+/// Actions that a leg's ticket has room for.
+pub const MOST_FLOWN: usize = 256;
+
+/// Which part of its flight a ticket is for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Leg {
+    /// Steps to be flown, unless the flight ends before.
+    pub steps: u32,
+    /// Actions flown before, from take-off on, [`MOST_FLOWN`] at most.
+    pub flown: Arc<[[f32; ACTION]]>,
+}
+
+/// The [`Ticket`] of a leg on the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[repr(C)]
+#[type_name("skein.LegRecord.v1")]
+pub struct LegRecord {
+    ticket: ControlRecord,
+    steps: u32,
+    /// How many of `actions` there are.
+    flown: u32,
+    actions: [[f32; ACTION]; MOST_FLOWN],
+}
+
+// Whole fields of eight bytes: no padding, so no uninitialised byte ever leaves the process.
+const _: () = assert!(size_of::<LegRecord>() == size_of::<ControlRecord>() + 2 * 4 + MOST_FLOWN * ACTION * 4);
+
+impl LegRecord {
+    /// `leg` of `ticket`'s flight, for one life of one actor.
+    ///
+    /// # Panics
+    /// When more than [`MOST_FLOWN`] actions were flown before; the configuration allows no flight to become so long.
+    pub fn fly(ticket: &Ticket, leg: &Leg, actor: ActorId, incarnation: Incarnation) -> Self {
+        let mut actions = [[0.0; ACTION]; MOST_FLOWN];
+        actions[..leg.flown.len()].copy_from_slice(&leg.flown);
+        Self {
+            ticket: ControlRecord::fly(ticket, actor, incarnation),
+            steps: leg.steps,
+            flown: leg.flown.len() as u32,
+            actions,
+        }
+    }
+
+    /// Whether this life of this actor is meant.
+    pub fn is_for(&self, actor: ActorId, incarnation: Incarnation) -> bool {
+        self.ticket.is_for(actor, incarnation)
+    }
+
+    /// What is said: to fly a leg.
+    ///
+    /// # Errors
+    /// [`ControlFault`] when the record holds what no learner of this version and run writes.
+    pub fn read(&self, run: RunId) -> Result<Control, ControlFault> {
+        let Control::Fly(ticket) = self.ticket.read(run)? else {
+            return Err(ControlFault::Leg("is no ticket"));
+        };
+        let flown = self
+            .actions
+            .get(..self.flown as usize)
+            .ok_or(ControlFault::Leg("has more actions than it has room for"))?;
+        // No number is within bounds that is none.
+        let are_actions = flown.iter().flatten().all(|command| (-1.0..=1.0).contains(command));
+        if !are_actions {
+            return Err(ControlFault::Leg("has an action outside [-1, 1]"));
+        }
+        if self.steps == 0 {
+            return Err(ControlFault::Leg("is of no step"));
+        }
+        let leg = Leg {
+            steps: self.steps,
+            flown: flown.into(),
+        };
+        Ok(Control::Fly(Ticket {
+            leg: Some(leg),
+            ..ticket
+        }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ids::{Attempt, FlightId, PolicyVersion};
+    use crate::ticket::{CourseChoice, Exploration};
+
+    const RUN: RunId = RunId(3);
+    const ACTOR: ActorId = ActorId(4);
+    const LIFE: Incarnation = Incarnation(8);
+
+    fn ticket(flown: usize) -> Ticket {
+        let actions = (0..flown).map(|step| [step as f32 / 256.0, -1.0]);
+        Ticket {
+            run: RUN,
+            flight: FlightId(7),
+            attempt: Attempt(1),
+            policy_version: PolicyVersion(5),
+            course: CourseChoice::Training,
+            start_level: 2,
+            exploration: Exploration::Sample,
+            seed: 42,
+            leg: Some(Leg {
+                steps: 3,
+                flown: actions.collect(),
+            }),
+        }
+    }
+
+    fn record(flown: usize) -> LegRecord {
+        let ticket = ticket(flown);
+        LegRecord::fly(&ticket, ticket.leg.as_ref().unwrap(), ACTOR, LIFE)
+    }
+
+    #[test]
+    fn a_leg_survives_the_wire_with_all_that_was_flown_before_it() {
+        for flown in [0, 1, MOST_FLOWN] {
+            let record = record(flown);
+            assert_eq!(record.read(RUN), Ok(Control::Fly(ticket(flown))));
+            assert!(record.is_for(ACTOR, LIFE) && !record.is_for(ACTOR, Incarnation(9)));
+        }
+    }
+
+    #[test]
+    fn garbage_is_refused_with_what_is_wrong() {
+        let refused = |damage: fn(&mut LegRecord)| {
+            let mut record = record(2);
+            damage(&mut record);
+            record.read(RUN).unwrap_err().to_string()
+        };
+        assert!(refused(|record| record.flown = 257).contains("more actions"));
+        assert!(refused(|record| record.actions[1][0] = f32::NAN).contains("outside [-1, 1]"));
+        assert!(refused(|record| record.actions[0][1] = 1.5).contains("outside [-1, 1]"));
+        assert!(refused(|record| record.steps = 0).contains("no step"));
+        assert!(refused(|record| record.ticket = ControlRecord::stop(RUN)).contains("no ticket"));
+        assert!(matches!(record(2).read(RunId(4)), Err(ControlFault::OtherRun(3))));
+        // What lies behind the actions is nobody's.
+        let mut record = record(2);
+        record.actions[2] = [f32::NAN; ACTION];
+        assert_eq!(record.read(RUN), Ok(Control::Fly(ticket(2))));
+    }
+}
