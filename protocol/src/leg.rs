@@ -96,8 +96,7 @@ impl LegRecord {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ids::{Attempt, FlightId, PolicyVersion};
-    use crate::ticket::{CourseChoice, Exploration};
+    use crate::ticket::tests::ticket as whole_flight;
 
     const RUN: RunId = RunId(3);
     const ACTOR: ActorId = ActorId(4);
@@ -105,19 +104,13 @@ mod tests {
 
     fn ticket(flown: usize) -> Ticket {
         let actions = (0..flown).map(|step| [step as f32 / 256.0, -1.0]);
+        let leg = Leg {
+            steps: 3,
+            flown: actions.collect(),
+        };
         Ticket {
-            run: RUN,
-            flight: FlightId(7),
-            attempt: Attempt(1),
-            policy_version: PolicyVersion(5),
-            course: CourseChoice::Training,
-            start_level: 2,
-            exploration: Exploration::Sample,
-            seed: 42,
-            leg: Some(Leg {
-                steps: 3,
-                flown: actions.collect(),
-            }),
+            leg: Some(leg),
+            ..whole_flight()
         }
     }
 

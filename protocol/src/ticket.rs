@@ -290,10 +290,10 @@ pub enum ControlFault {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
-    fn ticket() -> Ticket {
+    pub(crate) fn ticket() -> Ticket {
         Ticket {
             run: RunId(3),
             flight: FlightId(7),

@@ -203,6 +203,20 @@ impl Running {
         });
     }
 
+    /// Kills the learner once so many flights were learned from, and waits until another is there.
+    ///
+    /// # Panics
+    /// When the run ends before, or none comes.
+    pub fn kill_learner_after(&mut self, flights: usize) {
+        self.until_flights(flights);
+        let victim = self.process("skein-learner");
+        victim.signal(Signal::KILL);
+        self.until("another learner was there", |run| {
+            let mut learners = run.processes(Role::Learner).into_iter();
+            learners.find(|learner| *learner != victim)
+        });
+    }
+
     /// Starts `skein attach` with one actor.
     ///
     /// # Panics

@@ -36,14 +36,7 @@ fn a_learner_killed_three_times_goes_on_from_its_checkpoints() {
     let calm = calm();
     let mut run = recipe().start();
     for flights in [10, 30, 70] {
-        run.until_flights(flights);
-        let victim = run.process("skein-learner");
-        victim.signal(Signal::KILL);
-        run.until("another learner was there", |run| {
-            run.processes(Role::Learner)
-                .into_iter()
-                .find(|learner| *learner != victim)
-        });
+        run.kill_learner_after(flights);
     }
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);

@@ -63,13 +63,7 @@ fn a_learner_killed_in_the_middle_of_a_flight_goes_back_to_one_that_had_ended() 
     let calm = direct().finish();
     let mut run = direct().start();
     for flights in [7, 18, 29] {
-        run.until_flights(flights);
-        let victim = run.process("skein-learner");
-        victim.signal(Signal::KILL);
-        run.until("another learner was there", |run| {
-            let mut learners = run.processes(Role::Learner).into_iter();
-            learners.find(|learner| *learner != victim)
-        });
+        run.kill_learner_after(flights);
     }
     run.finish().assert_same_as(&calm);
 }

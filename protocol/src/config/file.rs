@@ -115,6 +115,12 @@ impl Config {
     /// # Errors
     /// [`ConfigError`] names file, key, value and remedy.
     pub fn parse(text: &str, path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let shipped = std::env::var_os(SHIPPED_CONFIGS).map(PathBuf::from);
+        Self::parse_with(text, path, overrides, shipped.as_deref())
+    }
+
+    /// [`Config::parse`], with the courses that are not named in `shipped`, or beside the file.
+    fn parse_with(text: &str, path: &Path, overrides: &[String], shipped: Option<&Path>) -> Result<Self, ConfigError> {
         let mut table: Table = toml::from_str(text).map_err(|source| ConfigError::Syntax {
             path: path.to_owned(),
             source: Box::new(source),
@@ -133,8 +139,8 @@ impl Config {
             source,
         })?;
         let directory = path.parent().unwrap_or(Path::new(""));
-        let shipped = std::env::var_os(SHIPPED_CONFIGS).map_or(directory.to_owned(), PathBuf::from);
-        let [training, evaluation] = named.map(|named| if named { directory } else { &shipped });
+        let shipped = shipped.unwrap_or(directory);
+        let [training, evaluation] = named.map(|named| if named { directory } else { shipped });
         config.courses.training = training.join(&config.courses.training);
         for course in &mut config.courses.evaluation {
             *course = evaluation.join(&*course);
@@ -292,6 +298,26 @@ mod tests {
     }
 
     #[test]
+    fn courses_that_are_not_named_are_the_shipped_ones() {
+        let parse = |text| {
+            let path = Path::new("/mine/own.toml");
+            Config::parse_with(text, path, &[], Some(Path::new("/skein/configs"))).unwrap()
+        };
+        let courses = parse("").courses;
+        assert!(
+            courses
+                .paths()
+                .all(|course| course.starts_with("/skein/configs/courses"))
+        );
+        let courses = parse("[courses]\ntraining = \"a.toml\"").courses;
+        assert_eq!(courses.training, Path::new("/mine/a.toml"));
+        assert_eq!(courses.evaluation[0], Path::new("/skein/configs/courses/training.toml"));
+        let courses = parse("[courses]\nevaluation = [\"b.toml\"]").courses;
+        assert_eq!(courses.evaluation, [Path::new("/mine/b.toml")]);
+        assert_eq!(courses.training, Path::new("/skein/configs/courses/training.toml"));
+    }
+
+    #[test]
     fn course_paths_in_overrides_are_relative_to_the_working_directory() {
         let here = std::env::current_dir().unwrap();
         let config = load(
@@ -312,7 +338,7 @@ mod tests {
     fn a_folder_whose_name_cannot_be_written_down_is_refused() {
         use std::os::unix::ffi::OsStrExt;
         let path = Path::new(std::ffi::OsStr::from_bytes(b"/runs/\xff/config.toml"));
-        let error = Config::parse("", path, &[]).unwrap_err().to_string();
+        let error = Config::parse_with("", path, &[], None).unwrap_err().to_string();
         assert!(error.contains("is not UTF-8") && error.contains("rename"), "{error}");
     }
 
@@ -409,6 +435,36 @@ mod tests {
                 "[learning]\nleg_steps = 1\nflights_per_epoch = 1\n[transport]\nmax_records_per_flight = 300",
                 vec![],
                 vec!["transport.max_records_per_flight = 300", "256", "lower it"],
+            ),
+            (
+                "[learning]\nleg_steps = 1\nflights_per_epoch = 1\nhistory_steps = [2]",
+                vec![],
+                vec!["learning.history_steps = [2]", "leg_steps = 1", "name none"],
+            ),
+            (
+                "[learning]\nhistory_steps = [4, 2]",
+                vec![],
+                vec!["learning.history_steps = [4, 2]", "does not rise"],
+            ),
+            (
+                "[learning]\nhistory_steps = [0, 2]",
+                vec![],
+                vec!["learning.history_steps = [0, 2]", "always seen"],
+            ),
+            (
+                "",
+                vec!["learning.history_steps=[1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17]"],
+                vec!["learning.history_steps", "more than 16"],
+            ),
+            (
+                "[sac]\ncritic_networks = 3",
+                vec![],
+                vec!["sac.critic_networks = 3", "neither 1 nor 2"],
+            ),
+            (
+                "[td3]\ncritic_networks = 0",
+                vec![],
+                vec!["td3.critic_networks = 0", "neither 1 nor 2"],
             ),
             (
                 "[learning]\nleg_steps = 257",

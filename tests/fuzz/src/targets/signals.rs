@@ -1,9 +1,10 @@
-//! Status and control records, bit for bit: what is believed says the same when it is written again.
+//! Status and control records and tickets of legs, bit for bit: what is believed says the same when it is written again.
 
 use std::time::Duration;
 
 use bytemuck::{Pod, Zeroable, bytes_of, pod_read_unaligned};
 use skein_protocol::ids::{ActorId, Incarnation, PolicyVersion, RunId};
+use skein_protocol::leg::{Leg, LegRecord};
 use skein_protocol::stages::{Stage, Times};
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, ControlRecord};
@@ -13,13 +14,14 @@ use super::{Target, USUAL, Verdict};
 
 pub(super) const SIGNALS: Target = Target {
     name: "signals",
-    reads: "status and control records",
-    longest_bytes: size_of::<StatusRecord>(),
+    reads: "status and control records, tickets of legs",
+    longest_bytes: size_of::<LegRecord>(),
     weight: 2 * USUAL,
     samples: signal_samples,
     run: |bytes| {
         let run = run_of(bytes);
-        Verdict::of(status(pod(bytes), run).or(control(pod(bytes), run)))
+        let read = [status(pod(bytes), run), control(pod(bytes), run), leg(pod(bytes), run)];
+        Verdict::of(read.into_iter().flatten().next())
     },
 };
 
@@ -37,9 +39,15 @@ fn signal_samples() -> Vec<Vec<u8>> {
         times,
     };
     let run = RunId(1);
+    let ticket = sample_ticket(5);
+    let leg = Leg {
+        steps: 1,
+        flown: vec![[0.5, -1.0]; 3].into(),
+    };
     vec![
+        bytes_of(&LegRecord::fly(&ticket, &leg, ActorId(3), Incarnation(7))).to_vec(),
         bytes_of(&StatusRecord::new(run, &status)).to_vec(),
-        bytes_of(&ControlRecord::fly(&sample_ticket(5), ActorId(3), Incarnation(7))).to_vec(),
+        bytes_of(&ControlRecord::fly(&ticket, ActorId(3), Incarnation(7))).to_vec(),
         bytes_of(&ControlRecord::heartbeat(run)).to_vec(),
         bytes_of(&ControlRecord::stop(run)).to_vec(),
         bytes_of(&ControlRecord::rejoin(run, ActorId(3), Incarnation(7))).to_vec(),
@@ -54,7 +62,7 @@ pub(super) fn pod<T: Pod + Zeroable>(bytes: &[u8]) -> T {
     pod_read_unaligned(&padded)
 }
 
-/// Both kinds of records begin with their run: taken from there, it never hides the rest from its reader.
+/// All kinds of records begin with their run: taken from there, it never hides the rest from its reader.
 fn run_of(bytes: &[u8]) -> RunId {
     RunId(pod(bytes))
 }
@@ -76,5 +84,17 @@ fn control(record: ControlRecord, run: RunId) -> Option<()> {
         assert!(ticket.start_level > 0);
         assert_eq!(again.read(run), Ok(Control::Fly(ticket)));
     }
+    Some(())
+}
+
+fn leg(record: LegRecord, run: RunId) -> Option<()> {
+    assert!(record.read(RunId(!run.0)).is_err());
+    let Control::Fly(ticket) = record.read(run).ok()? else {
+        panic!("a record of a leg is a ticket or nothing");
+    };
+    let leg = ticket.leg.clone().expect("it is of a leg");
+    assert!(leg.steps > 0 && leg.flown.iter().flatten().all(|command| command.abs() <= 1.0));
+    let again = LegRecord::fly(&ticket, &leg, ActorId(1), Incarnation(2));
+    assert_eq!(again.read(run), Ok(Control::Fly(ticket)));
     Some(())
 }
