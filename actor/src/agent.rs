@@ -47,6 +47,7 @@ impl Agent {
         record.position_m = state.position_m.coords.into();
         record.orientation = state.world_from_body.coords.into();
         record.velocity_mps = state.velocity_mps.into();
+        record.ground_truth = simulator.ground_truth().numbers();
         lap(Stage::Encoder);
     }
 

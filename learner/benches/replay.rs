@@ -10,7 +10,7 @@ use skein_learner::replay::{Minibatch, Replay};
 use skein_protocol::config::{Config, Observation};
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, LATENT};
 
 /// Transitions a minibatch.
 const BATCH: usize = 256;
@@ -74,6 +74,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedFlight {
                 velocity_mps: [(); 3].map(|()| draw()),
                 position_m: [0.0; 3],
                 orientation: [0.0, 0.0, 0.0, 1.0],
+                ground_truth: [0.0; GROUND_TRUTH],
             })
             .collect(),
         actions: (0..STEPS).map(|_| [draw(), draw()]).collect(),

@@ -2,7 +2,7 @@
 
 use criterion::{BenchmarkId, Criterion, Throughput};
 use skein_kernels::Team;
-use skein_learner::algorithm::Columns;
+use skein_learner::algorithm::{Columns, Inputs};
 use skein_learner::device::use_threads;
 use skein_learner::noise::Noise;
 use skein_learner::sac::Sac;
@@ -27,6 +27,8 @@ fn main() {
         actions: &actions,
         rewards: &rewards,
         next_observations: &next_observations,
+        states: &observations,
+        next_states: &next_observations,
         terminated: &vec![0.0; rows],
     };
     for width in [64, 128, WIDTH, 512, 1024] {
@@ -41,7 +43,7 @@ fn update(criterion: &mut Criterion, engine: Engine, width: usize, columns: Colu
         hidden_width: width,
         ..SacSection::default()
     };
-    let mut sac = Sac::new(&section, OBSERVATION.len(), 1, engine, Device::Cpu);
+    let mut sac = Sac::new(&section, Inputs::same(OBSERVATION.len()), 1, engine, Device::Cpu);
     let (mut team, mut noise) = (Team::new(1), Noise::new(2));
     let mut group = criterion.benchmark_group("sac_update");
     group.throughput(Throughput::Elements(operations(columns.rewards.len(), width)));

@@ -7,10 +7,11 @@ use std::fmt;
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::ACTION;
-use skein_protocol::config::{AlgorithmName, Config};
+use skein_protocol::config::{AlgorithmName, Config, CriticInput};
 use tch::Device;
 
 use crate::error::UpdateError;
+use crate::flight::TRUE_STATE;
 use crate::metrics::Scalar;
 use crate::networks::Layout;
 use crate::noise::Noise;
@@ -52,10 +53,41 @@ pub trait Algorithm: Stateful + fmt::Debug {
 
 /// The algorithm that a configuration names, untrained. `device`: libtorch's; the native engine is on the processor.
 pub fn new(config: &Config, device: Device) -> Box<dyn Algorithm> {
-    let (observation, seed) = (config.learning.view().len(), config.run.seed);
+    let (inputs, seed) = (Inputs::of(config), config.run.seed);
     match config.learning.algorithm {
-        AlgorithmName::Sac => Box::new(Sac::new(&config.sac, observation, seed, config.run.engine(), device)),
-        AlgorithmName::Td3 => Box::new(Td3::new(&config.td3, observation, seed, Isa::best())),
+        AlgorithmName::Sac => Box::new(Sac::new(&config.sac, inputs, seed, config.run.engine(), device)),
+        AlgorithmName::Td3 => Box::new(Td3::new(&config.td3, inputs, seed, Isa::best())),
+    }
+}
+
+/// How many numbers the networks see of a state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Inputs {
+    /// The policy: an observation.
+    pub policy: usize,
+    /// The critic, beside the action.
+    pub critic: usize,
+}
+
+impl Inputs {
+    /// Those of the run configured by `config`.
+    pub fn of(config: &Config) -> Self {
+        let policy = config.learning.view().len();
+        match config.learning.critic_input {
+            CriticInput::Observation => Self::same(policy),
+            CriticInput::GroundTruth => Self {
+                policy,
+                critic: TRUE_STATE,
+            },
+        }
+    }
+
+    /// Both see an observation of so many numbers.
+    pub fn same(observation: usize) -> Self {
+        Self {
+            policy: observation,
+            critic: observation,
+        }
     }
 }
 
@@ -70,6 +102,10 @@ pub struct Columns<'a> {
     pub rewards: &'a [f32],
     /// `[n, observation]`: what was seen after the action, also where the flight ended there.
     pub next_observations: &'a [f32],
+    /// What the critic sees, `[n, critic's input]`: the observations again, unless it is told more.
+    pub states: &'a [f32],
+    /// The same after the action.
+    pub next_states: &'a [f32],
     /// `[n]`: 1 where the state after the action ends the task (a crash, the end wall), 0 elsewhere. A flight cut off by its step limit is not terminated.
     pub terminated: &'a [f32],
 }
@@ -79,13 +115,15 @@ impl Columns<'_> {
     ///
     /// # Panics
     /// When they have different numbers of rows, or none.
-    pub(crate) fn check(&self, observation: usize) -> usize {
+    pub(crate) fn check(&self, inputs: Inputs) -> usize {
         let rows = self.rewards.len();
         assert!(rows > 0, "a minibatch has at least one transition");
         for (column, width) in [
-            (self.observations, observation),
+            (self.observations, inputs.policy),
             (self.actions, ACTION),
-            (self.next_observations, observation),
+            (self.next_observations, inputs.policy),
+            (self.states, inputs.critic),
+            (self.next_states, inputs.critic),
             (self.terminated, 1),
         ] {
             let len = column.len();

@@ -7,7 +7,7 @@
 use skein_protocol::config::{Observation, View};
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LATENT};
 
 /// What the vehicle saw and where it was at the beginning of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,7 +20,24 @@ pub struct StepObservation {
     pub position_m: [f32; 3],
     /// Orientation, world from body, as a unit quaternion (i, j, k, w).
     pub orientation: [f32; 4],
+    /// What the simulator knows beyond that, in its order and units.
+    pub ground_truth: [f32; GROUND_TRUTH],
 }
+
+/// Length of what a critic that is told the ground truth gets of a moment.
+pub const TRUE_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
+
+/// What brings the numbers of the ground truth, in their order, to a common size: 10 m between walls, some metres to an opening, tenths of a newton.
+#[rustfmt::skip]
+const TRUTH_SCALE: [f32; GROUND_TRUTH] = [
+    0.2, 0.5, 0.5, 1.0, // the next wall: distance, left, up, clearance
+    0.1, 0.5, 0.5, 1.0, // the one after it
+    0.25, 0.25,         // from the corridor's middle
+    0.03,               // to the end
+    1.0,                // mass
+    1.0,                // latency
+    3.0, 3.0, 3.0,      // gust
+];
 
 /// One whole flight of T steps, or T steps of one.
 #[derive(Debug, Clone, PartialEq)]
@@ -139,10 +156,28 @@ impl CommittedFlight {
         view.write(step, into, |step, into| self.write_moment(step, view.moment, into));
     }
 
+    /// Writes what a critic that is told the [ground truth](CriticInput::GroundTruth) gets at the beginning of `step`, `[TRUE_STATE]`: that, the velocity, the tilt
+    /// and the action before, which with latency has yet to take effect; each number roughly within [-2, 2].
+    pub fn write_true_state(&self, step: usize, into: &mut [f32]) {
+        let seen = &self.observations[step];
+        let [roll, pitch, ..] = seen.orientation;
+        let truth = seen
+            .ground_truth
+            .iter()
+            .zip(TRUTH_SCALE)
+            .map(|(value, scale)| value * scale);
+        let motion = seen.velocity_mps.into_iter().chain([10.0 * roll, 10.0 * pitch]);
+        let all = truth.chain(motion).chain(self.action_before(step));
+        into.iter_mut().zip(all).for_each(|(into, value)| *into = value);
+    }
+
+    fn action_before(&self, step: usize) -> [f32; ACTION] {
+        step.checked_sub(1)
+            .map_or(self.action_before, |previous| self.actions[previous])
+    }
+
     fn write_moment(&self, step: usize, observation: Observation, into: &mut [f32]) {
-        let previous_action = step
-            .checked_sub(1)
-            .map_or(self.action_before, |previous| self.actions[previous]);
+        let previous_action = self.action_before(step);
         let seen = &self.observations[step];
         observation.write(&seen.latent, &seen.velocity_mps, &previous_action, into);
     }
@@ -199,6 +234,7 @@ pub(crate) mod samples {
                     velocity_mps: [1.0, at(step) + 0.25, at(step) + 0.5],
                     position_m: [step as f32, 0.0, 3.5],
                     orientation: [0.0, 0.0, 0.0, 1.0],
+                    ground_truth: std::array::from_fn(|index| at(step) + index as f32),
                 })
                 .collect(),
             actions: (0..steps).map(|step| [at(step) / 1e6, -at(step) / 1e6]).collect(),
@@ -287,6 +323,20 @@ mod tests {
                 assert_eq!(seen[LATENT..], observation.velocity_mps[1..]);
             }
         }
+    }
+
+    #[test]
+    fn the_true_state_is_the_ground_truth_the_motion_and_the_action_before() {
+        let flight = samples::flight(3, 5, Outcome::Collided);
+        let mut state = [f32::NAN; TRUE_STATE];
+        flight.write_true_state(4, &mut state);
+        let seen = &flight.observations[4];
+        assert_eq!(state[0], seen.ground_truth[0] * TRUTH_SCALE[0]);
+        assert_eq!(state[15], seen.ground_truth[15] * TRUTH_SCALE[15]);
+        assert_eq!(state[16..19], seen.velocity_mps);
+        assert_eq!(state[21..], flight.actions[3]);
+        flight.write_true_state(0, &mut state);
+        assert_eq!(state[21..], [0.0, 0.0]);
     }
 
     #[test]

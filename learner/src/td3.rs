@@ -8,7 +8,7 @@ use skein_protocol::ACTION;
 use skein_protocol::config::Td3Section;
 use skein_protocol::seeds::{Purpose, derive};
 
-use crate::algorithm::{Algorithm, Columns};
+use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::networks::native::{
@@ -23,7 +23,7 @@ use crate::state::{Part, Stateful};
 #[derive(Debug)]
 pub struct Td3 {
     isa: Isa,
-    observation: usize,
+    inputs: Inputs,
     settings: Td3Section,
     policy_layout: Layout,
     policy: Dense,
@@ -43,7 +43,7 @@ struct Work {
     noise: Vec<f32>,
     /// Of the target policy, then of the policy: `[rows, 2]`.
     actions: Vec<f32>,
-    /// Observations and actions side by side, `[rows, observation + 2]`.
+    /// The critic's states and actions side by side, `[rows, state + 2]`.
     joined: Vec<f32>,
     /// `[rows, 2]`.
     target_values: Vec<f32>,
@@ -57,17 +57,17 @@ struct Work {
 
 impl Td3 {
     /// Untrained networks whose parameters depend on the run's seed alone.
-    pub fn new(section: &Td3Section, observation: usize, run_seed: u64, isa: Isa) -> Self {
-        let (inputs, width) = (observation as i64, section.hidden_width as i64);
+    pub fn new(section: &Td3Section, inputs: Inputs, run_seed: u64, isa: Isa) -> Self {
+        let width = section.hidden_width as i64;
         let mut policy_layout = Layout::default();
-        Policy::with_outputs(&mut policy_layout, inputs, width, ACTION as i64);
+        Policy::with_outputs(&mut policy_layout, inputs.policy as i64, width, ACTION as i64);
         let policy = policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         let mut critic_layout = Layout::default();
-        Critic::describe(&mut critic_layout, inputs, width, section.critic_networks);
+        Critic::describe(&mut critic_layout, inputs.critic as i64, width, section.critic_networks);
         let critic = critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
         Self {
             isa,
-            observation,
+            inputs,
             settings: section.clone(),
             policy: Dense::new(isa, policy_layout.tensors()),
             policy_layout,
@@ -106,11 +106,11 @@ impl Td3 {
         for (action, noise) in actions.iter_mut().zip(drawn) {
             *action = (action.tanh() + (std * *noise).clamp(-bound, bound)).clamp(-1.0, 1.0);
         }
-        join(columns.next_observations, actions, joined);
+        join(columns.next_states, actions, joined);
         self.critic
             .forward_through(team, &self.target_critic, joined, target_values);
 
-        join(columns.observations, columns.actions, joined);
+        join(columns.states, columns.actions, joined);
         let critic = &self.critic_parameters.values;
         self.critic.forward(team, critic, joined, given);
         let (mut loss, mut value) = (0.0, 0.0);
@@ -149,7 +149,7 @@ impl Td3 {
         for (action, given) in actions.iter_mut().zip(output(policy_given)) {
             *action = given.tanh();
         }
-        join(columns.observations, actions, joined);
+        join(columns.states, actions, joined);
         self.critic.forward(team, critic, joined, given);
         let share = 1.0 / *rows as f32;
         let mut loss = 0.0;
@@ -157,7 +157,10 @@ impl Td3 {
             loss -= f64::from(pair(&given.values, row)[0]);
             flowing.copy_from_slice(&[-share, 0.0]);
         }
-        let (action, flowing) = (self.observation..self.observation + ACTION, output_mut(policy_flowing));
+        let (action, flowing) = (
+            self.inputs.critic..self.inputs.critic + ACTION,
+            output_mut(policy_flowing),
+        );
         self.critic
             .backward_through(team, critic, given, value_flowing, action, flowing);
         for (flowing, action) in flowing.iter_mut().zip(actions) {
@@ -177,7 +180,7 @@ impl Td3 {
             rows,
             noise: numbers(rows, ACTION),
             actions: numbers(rows, ACTION),
-            joined: numbers(rows, self.observation + ACTION),
+            joined: numbers(rows, self.inputs.critic + ACTION),
             target_values: numbers(rows, ESTIMATES),
             critic: self.critic.places(rows),
             critic_flowing: self.critic.places(rows),
@@ -203,7 +206,7 @@ impl Algorithm for Td3 {
         columns: Columns<'_>,
         noise: &mut Noise,
     ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
-        let rows = columns.check(self.observation);
+        let rows = columns.check(self.inputs);
         if self.work.rows != rows {
             self.work = self.places(rows);
         }

@@ -285,7 +285,13 @@ impl Trainer {
 }
 
 fn columns(minibatch: &Minibatch) -> Columns<'_> {
+    let (states, next_states) = match minibatch.true_states.is_empty() {
+        true => (&minibatch.observations, &minibatch.next_observations),
+        false => (&minibatch.true_states, &minibatch.next_true_states),
+    };
     Columns {
+        states,
+        next_states,
         observations: &minibatch.observations,
         actions: &minibatch.actions,
         rewards: &minibatch.rewards,

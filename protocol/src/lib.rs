@@ -29,7 +29,7 @@ pub mod transition;
 
 /// Version of everything in this crate that crosses a process boundary; part of every service's attributes, so that a process of another version is
 /// refused when it opens a service.
-pub const PROTOCOL_VERSION: u32 = 6;
+pub const PROTOCOL_VERSION: u32 = 7;
 
 /// Width of the depth image in pixels (paper, section 3.3).
 pub const IMAGE_WIDTH: usize = 128;
@@ -41,6 +41,8 @@ pub const IMAGE_PIXELS: usize = IMAGE_WIDTH * IMAGE_HEIGHT;
 pub const LATENT: usize = 32;
 /// Length of an action: lateral and vertical velocity, each in [-1, 1].
 pub const ACTION: usize = 2;
+/// Numbers of what the simulator knows of a moment, [`transition::TransitionRecord::ground_truth`].
+pub const GROUND_TRUTH: usize = 16;
 /// Bounds of the logarithm of a policy's standard deviation, for actor and learner alike: beyond them tanh saturates or the noise vanishes (as in the
 /// authors' implementation of arXiv:1812.05905).
 pub const LOG_STD: (f32, f32) = (-20.0, 2.0);

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::ids::{ActorId, Incarnation};
 use crate::ticket::Ticket;
-use crate::{ACTION, IMAGE_PIXELS, LATENT};
+use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LATENT};
 
 /// No number of a sound record is larger: rewards end at 4 · 10⁶ by their settings, corridors at 1 km. The learner squares what it learns from, and single
 /// precision ends at 3 · 10³⁸.
@@ -19,7 +19,7 @@ pub const LARGEST_NUMBER: f32 = 1e7;
 /// One step of a flight on the wire. Every bit pattern is a valid value of every field's type; [`TransitionRecord::check`] says whether it makes sense.
 #[derive(Debug, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
-#[type_name("skein.TransitionRecord.v2")]
+#[type_name("skein.TransitionRecord.v3")]
 pub struct TransitionRecord {
     /// The run.
     pub run: u64,
@@ -68,13 +68,15 @@ pub struct TransitionRecord {
     /// In the closing record of a flight that collided: the wall that was hit, from 1 in flight order, or 0 for the corridor. 0 in all others.
     pub hit_wall: u8,
     reserved: [u8; 7],
+    /// What the simulator knows of the observation's moment and the camera does not see; see [`CriticInput::GroundTruth`](crate::config::CriticInput::GroundTruth).
+    pub ground_truth: [f32; GROUND_TRUTH],
     /// The depth image, 128×72, row by row from the top left; 255 is the camera's range or farther. On a cache line of its own.
     pub depth: [u8; IMAGE_PIXELS],
 }
 
-// The header is four cache lines, so that in samples aligned to one (see `services`) the image starts on one; nothing is padding, so that the record is plain data.
-const _: () = assert!(std::mem::offset_of!(TransitionRecord, depth) == 256);
-const _: () = assert!(size_of::<TransitionRecord>() == 256 + IMAGE_PIXELS);
+// The header is five cache lines, so that in samples aligned to one (see `services`) the image starts on one; nothing is padding, so that the record is plain data.
+const _: () = assert!(std::mem::offset_of!(TransitionRecord, depth) == 320);
+const _: () = assert!(size_of::<TransitionRecord>() == 320 + IMAGE_PIXELS);
 const _: () = assert!(align_of::<TransitionRecord>() == 8);
 
 /// What a record is within its flight.
@@ -214,6 +216,7 @@ impl TransitionRecord {
         finite("orientation", &self.orientation)?;
         finite("velocity_mps", &self.velocity_mps)?;
         finite("latent", &self.latent)?;
+        finite("ground_truth", &self.ground_truth)?;
         finite("action", &self.action)?;
         finite("reward", &[self.reward])?;
         finite("reward_terms", &self.reward_terms)?;
@@ -376,6 +379,7 @@ mod tests {
         assert!(check(|r| r.kind = 9).contains("kind"));
         assert!(check(|r| r.kind = RecordKind::Closing.code()).contains("outcome"));
         assert!(check(|r| r.latent[3] = f32::NAN).contains("latent"));
+        assert!(check(|r| r.ground_truth[15] = f32::NAN).contains("ground_truth"));
         assert!(check(|r| r.reward = f32::INFINITY).contains("reward is not finite"));
         assert!(check(|r| r.velocity_mps[1] = -1e8).contains("velocity_mps holds -100000000"));
         assert!(check(|r| r.action = [0.0, 1.5]).contains("action"));

@@ -4,6 +4,7 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput};
 use skein_inference::{Network, Scratch};
+use skein_learner::algorithm::Inputs;
 use skein_learner::device::use_threads;
 use skein_learner::sac::TorchSac;
 use skein_learner::vae::{TorchVae, images_from_bytes};
@@ -23,7 +24,7 @@ fn main() {
     let mut config = Config::default();
     config.learning.observation = OBSERVATION;
     let vae = TorchVae::new(&config.vae, 1, Device::Cpu);
-    let sac = TorchSac::new(&config.sac, OBSERVATION.len(), 1, Device::Cpu);
+    let sac = TorchSac::new(&config.sac, Inputs::same(OBSERVATION.len()), 1, Device::Cpu);
     let layout = SnapshotLayout::of(&config);
     let mut values = vec![0.0; layout.values()];
     vae.publish(&mut values[layout.encoder()]);

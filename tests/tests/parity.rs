@@ -5,6 +5,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_inference::{ActionDistribution, Network, Scratch};
+use skein_learner::algorithm::Inputs;
 use skein_learner::networks::{Layout, Parameters, Policy};
 use skein_learner::sac::Sac;
 use skein_learner::vae::{NativeVae, TorchVae as Vae, images_from_bytes};
@@ -150,7 +151,7 @@ fn what_the_learner_publishes_flies_as_the_learner_says() {
         .flat_map(|observation| ENGINES.map(|engine| (observation, engine)))
     {
         let config = config(observation);
-        let sac = Sac::new(&config.sac, observation.len(), 9, engine, Device::Cpu);
+        let sac = Sac::new(&config.sac, Inputs::same(observation.len()), 9, engine, Device::Cpu);
         let network = network(&config, &vae(&config, 9), |into| sac.publish(into));
         let observed = vec![0.3; observation.len()];
         let learner = sac.mode(&observed);

@@ -1,10 +1,8 @@
 //! A pilot that sees the course itself instead of the depth image: proof that a course can be flown by a given drone.
 
 use crate::course::{Course, Wall};
+use crate::simulator::walls_ahead;
 use crate::vehicle::VehicleState;
-
-/// A wall is behind the drone once its tail has left the opening; m from the drone's centre to its tail, with some to spare.
-const TAIL_M: f32 = 0.6;
 
 /// Velocity asked for per metre of distance to the safe point, 1/s.
 const APPROACH_PER_SEC: f32 = 0.8;
@@ -21,7 +19,7 @@ impl Oracle {
     #[must_use]
     pub fn act(course: &Course, state: &VehicleState) -> [f32; 2] {
         let middle = [0.0, course.corridor().height_m / 2.0];
-        let [y_m, z_m] = next_wall(course, state).map_or(middle, Wall::safe_point);
+        let [y_m, z_m] = walls_ahead(course, state).next().map_or(middle, Wall::safe_point);
         let steer =
             |error_m: f32, velocity_mps: f32| (APPROACH_PER_SEC * error_m - DAMPING * velocity_mps).clamp(-1.0, 1.0);
         let velocity = state.heading_velocity_mps();
@@ -30,15 +28,6 @@ impl Oracle {
             steer(z_m - state.position_m.z, velocity.z),
         ]
     }
-}
-
-/// The first wall that the drone has not left entirely.
-fn next_wall<'a>(course: &'a Course, state: &VehicleState) -> Option<&'a Wall> {
-    let tail_m = state.position_m.x - TAIL_M;
-    course
-        .walls()
-        .iter()
-        .find(|wall| wall.x_m() + course.wall_thickness_m() > tail_m)
 }
 
 #[cfg(test)]

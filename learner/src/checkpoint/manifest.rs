@@ -13,7 +13,7 @@ use super::CheckpointError;
 pub(super) const NAME: &str = "manifest.json";
 
 /// Changes with everything that makes older checkpoints unreadable.
-pub(super) const FORMAT: u32 = 6;
+pub(super) const FORMAT: u32 = 7;
 
 /// Bytes of a file that are read at once for its checksum.
 const PIECE: usize = 1 << 20;

@@ -154,6 +154,7 @@ impl Assembly {
             velocity_mps: record.velocity_mps,
             position_m: record.position_m,
             orientation: record.orientation,
+            ground_truth: record.ground_truth,
         });
         if let Some(depth) = &mut self.flight.depth {
             depth.extend_from_slice(&record.depth);

@@ -180,6 +180,7 @@ fn a_leg_begins_where_the_one_before_it_ended_with_the_walls_that_were_passed() 
         velocity_mps: [1.0, 0.5, 0.0],
         position_m: [3.0, 0.0, 2.0],
         orientation: [0.0, 0.0, 0.0, 1.0],
+        ground_truth: [0.0; skein_protocol::GROUND_TRUTH],
     };
     let (flight, steps, walls_passed) = (FlightId(5), 1, 2);
     let begins = LegEnd {

@@ -53,6 +53,10 @@ pub struct Minibatch {
     pub rewards: Vec<f32>,
     /// `[batch, observation]`.
     pub next_observations: Vec<f32>,
+    /// What the critic alone sees, `[batch, TRUE_STATE]`; empty if that is the observation.
+    pub true_states: Vec<f32>,
+    /// The same after the action.
+    pub next_true_states: Vec<f32>,
     /// `[batch]`: 1 where the flight ended in a state without a future, else 0. A flight's last step before the time limit is 0: it bootstraps.
     pub terminated: Vec<f32>,
     /// Slots drawn, before any row is touched: the loads of many rows are then under way at one time.
@@ -101,9 +105,7 @@ impl Replay {
     /// An empty buffer for the run configured by `config`.
     pub fn new(config: &Config) -> Self {
         let view = config.learning.view();
-        let layout = RowLayout {
-            observation: view.len(),
-        };
+        let layout = RowLayout::of(config);
         let (success, regular) = capacities(&config.replay);
         Self {
             section: config.replay.clone(),
@@ -151,6 +153,8 @@ impl Replay {
             let row = ring.claim(first_image.map(|first| first + step as u32));
             flight.write_observation(step, &self.view, row.observation);
             flight.write_observation(step + 1, &self.view, row.next_observation);
+            flight.write_true_state(step, row.true_state);
+            flight.write_true_state(step + 1, row.next_true_state);
             row.action.copy_from_slice(&flight.actions[step]);
             *row.reward = flight.rewards[step];
             *row.terminated = f32::from(step == last && flight.terminated());
@@ -246,6 +250,8 @@ impl Minibatch {
         self.actions.clear();
         self.rewards.clear();
         self.next_observations.clear();
+        self.true_states.clear();
+        self.next_true_states.clear();
         self.terminated.clear();
     }
 
@@ -258,6 +264,8 @@ impl Minibatch {
             let row = ring.row(slot);
             self.observations.extend_from_slice(row.observation);
             self.next_observations.extend_from_slice(row.next_observation);
+            self.true_states.extend_from_slice(row.true_state);
+            self.next_true_states.extend_from_slice(row.next_true_state);
             self.actions.extend_from_slice(row.action);
             self.rewards.push(row.reward);
             self.terminated.push(row.terminated);

@@ -3,20 +3,26 @@
 //! A row holds everything an update needs of one transition, observation and next observation both, contiguous in memory: a minibatch of random rows
 //! is bound by cache misses, and a row costs one run of neighbouring cache lines where a table per quantity would cost one miss each.
 
-use skein_protocol::config::View;
+use skein_protocol::config::{Config, CriticInput, View};
 use skein_protocol::{ACTION, LATENT};
 
-/// Where the parts of a row lie: `[observation | next observation | action | reward | terminated]`, all `f32`.
+use crate::flight::TRUE_STATE;
+
+/// Where the parts of a row lie: `[observation | next observation | true state | next true state | action | reward | terminated]`, all `f32`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RowLayout {
     /// Length of an observation vector.
     pub(super) observation: usize,
+    /// Length of what the critic alone sees; 0 if that is the observation.
+    pub(super) true_state: usize,
 }
 
 /// Mutable view of one row.
 pub(super) struct RowMut<'a> {
     pub(super) observation: &'a mut [f32],
     pub(super) next_observation: &'a mut [f32],
+    pub(super) true_state: &'a mut [f32],
+    pub(super) next_true_state: &'a mut [f32],
     pub(super) action: &'a mut [f32],
     pub(super) reward: &'a mut f32,
     pub(super) terminated: &'a mut f32,
@@ -27,24 +33,41 @@ pub(super) struct RowMut<'a> {
 pub(super) struct Row<'a> {
     pub(super) observation: &'a [f32],
     pub(super) next_observation: &'a [f32],
+    pub(super) true_state: &'a [f32],
+    pub(super) next_true_state: &'a [f32],
     pub(super) action: &'a [f32],
     pub(super) reward: f32,
     pub(super) terminated: f32,
 }
 
 impl RowLayout {
+    /// That of the run configured by `config`.
+    pub(super) fn of(config: &Config) -> Self {
+        Self {
+            observation: config.learning.view().len(),
+            true_state: match config.learning.critic_input {
+                CriticInput::Observation => 0,
+                CriticInput::GroundTruth => TRUE_STATE,
+            },
+        }
+    }
+
     /// Values in a row.
     pub(super) fn width(self) -> usize {
-        2 * self.observation + ACTION + 2
+        2 * (self.observation + self.true_state) + ACTION + 2
     }
 
     fn row(self, values: &[f32]) -> Row<'_> {
         let (observation, rest) = values.split_at(self.observation);
         let (next_observation, rest) = rest.split_at(self.observation);
+        let (true_state, rest) = rest.split_at(self.true_state);
+        let (next_true_state, rest) = rest.split_at(self.true_state);
         let (action, rest) = rest.split_at(ACTION);
         Row {
             observation,
             next_observation,
+            true_state,
+            next_true_state,
             action,
             reward: rest[0],
             terminated: rest[1],
@@ -54,11 +77,15 @@ impl RowLayout {
     fn row_mut(self, values: &mut [f32]) -> RowMut<'_> {
         let (observation, rest) = values.split_at_mut(self.observation);
         let (next_observation, rest) = rest.split_at_mut(self.observation);
+        let (true_state, rest) = rest.split_at_mut(self.true_state);
+        let (next_true_state, rest) = rest.split_at_mut(self.true_state);
         let (action, rest) = rest.split_at_mut(ACTION);
         let (reward, terminated) = rest.split_at_mut(1);
         RowMut {
             observation,
             next_observation,
+            true_state,
+            next_true_state,
             action,
             reward: &mut reward[0],
             terminated: &mut terminated[0],
@@ -182,7 +209,7 @@ impl Ring {
 pub struct RingState {
     /// Transitions ever inserted.
     pub inserted: u64,
-    /// Rows in slot order, `[filled, width]`: `[observation | next observation | action | reward | terminated]`.
+    /// Rows in slot order, `[filled, width]`: `[observation | next observation | true state | next true state | action | reward | terminated]`.
     pub rows: Vec<f32>,
     /// Number of the depth image of each row's observation, `[filled]`; empty once the VAE is frozen.
     pub images: Vec<u32>,

@@ -46,9 +46,7 @@ impl Replay {
     /// [`RestoreError`] when the content does not fit `config`.
     pub fn restore(config: &Config, state: ReplayState) -> Result<Self, RestoreError> {
         let mut replay = Self::new(config);
-        let layout = super::RowLayout {
-            observation: config.learning.view().len(),
-        };
+        let layout = super::RowLayout::of(config);
         let (success, regular) = capacities(&config.replay);
         let fail = |part| move |problem| RestoreError { part, problem };
         replay.success = Ring::restore(success, layout, state.success).map_err(fail("success part"))?;

@@ -12,7 +12,7 @@ use skein_kernels::{Isa, Team};
 use skein_protocol::config::{Engine, SacSection};
 use tch::Device;
 
-use crate::algorithm::{Algorithm, Columns};
+use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::networks::Layout;
@@ -48,13 +48,13 @@ pub struct SacMetrics {
 
 impl Sac {
     /// Untrained networks whose parameters depend on the run's seed alone. `device`: libtorch's; the native engine is on the processor.
-    pub fn new(section: &SacSection, observation: usize, run_seed: u64, engine: Engine, device: Device) -> Self {
+    pub fn new(section: &SacSection, inputs: Inputs, run_seed: u64, engine: Engine, device: Device) -> Self {
         match engine {
             Engine::Native => {
-                let sac = NativeSac::new(section, observation, run_seed, Isa::best());
+                let sac = NativeSac::new(section, inputs, run_seed, Isa::best());
                 Self::Native(Box::new(sac))
             }
-            Engine::Libtorch => Self::Torch(Box::new(TorchSac::new(section, observation, run_seed, device))),
+            Engine::Libtorch => Self::Torch(Box::new(TorchSac::new(section, inputs, run_seed, device))),
         }
     }
 

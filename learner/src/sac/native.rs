@@ -12,7 +12,7 @@ use skein_protocol::seeds::{Purpose, derive};
 
 use self::sample::Sample;
 use super::SacMetrics;
-use crate::algorithm::Columns;
+use crate::algorithm::{Columns, Inputs};
 use crate::error::UpdateError;
 use crate::networks::native::{
     CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output, output_mut, pair, smaller,
@@ -26,7 +26,7 @@ use crate::state::{Part, Stateful};
 #[derive(Debug)]
 pub struct NativeSac {
     isa: Isa,
-    observation: usize,
+    inputs: Inputs,
     policy_layout: Layout,
     policy: Dense,
     policy_parameters: Learned,
@@ -49,7 +49,7 @@ struct Work {
     /// The policy's, of states after the actions, then of states: `[2 rows, 4]`.
     outputs: Vec<f32>,
     sample: Sample,
-    /// Observations and actions side by side, `[rows, observation + 2]`.
+    /// The critic's states and actions side by side, `[rows, state + 2]`.
     joined: Vec<f32>,
     /// The target's, `[rows, 2]`.
     target_values: Vec<f32>,
@@ -80,18 +80,18 @@ impl NativeSac {
     ///
     /// # Panics
     /// At the first update, when this machine lacks the instructions.
-    pub fn new(section: &SacSection, observation: usize, run_seed: u64, isa: Isa) -> Self {
-        let (inputs, width) = (observation as i64, section.hidden_width as i64);
+    pub fn new(section: &SacSection, inputs: Inputs, run_seed: u64, isa: Isa) -> Self {
+        let width = section.hidden_width as i64;
         let mut policy_layout = Layout::default();
-        Policy::describe(&mut policy_layout, inputs, width);
+        Policy::describe(&mut policy_layout, inputs.policy as i64, width);
         let policy_values = policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         let mut critic_layout = Layout::default();
-        Critic::describe(&mut critic_layout, inputs, width, section.critic_networks);
+        Critic::describe(&mut critic_layout, inputs.critic as i64, width, section.critic_networks);
         let critic_values = critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
         let log_temperature = vec![section.initial_temperature.ln() as f32];
         Self {
             isa,
-            observation,
+            inputs,
             policy: Dense::new(isa, policy_layout.tensors()),
             policy_layout,
             policy_parameters: Learned::new(policy_values, section.policy_learning_rate),
@@ -123,7 +123,7 @@ impl NativeSac {
         columns: Columns<'_>,
         noise: &mut Noise,
     ) -> Result<SacMetrics, UpdateError> {
-        let rows = columns.check(self.observation);
+        let rows = columns.check(self.inputs);
         if self.work.rows != rows {
             self.work = self.places(rows);
         }
@@ -146,6 +146,8 @@ impl NativeSac {
             observations,
             actions,
             next_observations,
+            states,
+            next_states,
             ..
         } = columns;
         let (policy, critic) = (&self.policy_parameters.values, &self.critic_parameters.values);
@@ -163,10 +165,10 @@ impl NativeSac {
 
         // What the state after the action is worth, by the slow critic (eq. 3): both estimates are drawn towards r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s'))
         // (eq. 5).
-        join(next_observations, next_actions, joined);
+        join(next_states, next_actions, joined);
         let target = &self.target_parameters;
         self.critic.forward_through(team, target, joined, target_values);
-        join(observations, actions, joined);
+        join(states, actions, joined);
         self.critic.forward(team, critic, joined, critic_given);
         let mut sums = Sums::default();
         let flowing = &mut critic_flowing.values;
@@ -186,7 +188,7 @@ impl NativeSac {
             .gradient(team, critic, joined, critic_given, critic_flowing, into);
 
         // The policy moves towards actions of higher value, as far as its entropy is worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7).
-        join(observations, drawn_actions, joined);
+        join(states, drawn_actions, joined);
         self.critic.forward(team, critic, joined, critic_given);
         for (row, &log_prob) in drawn_log_prob.iter().enumerate() {
             let values = pair(&critic_given.values, row);
@@ -195,7 +197,7 @@ impl NativeSac {
             drawn_flowing[row * ESTIMATES..][..ESTIMATES]
                 .copy_from_slice(&share_of_smaller(values).map(|part| -share * part));
         }
-        let action = self.observation..self.observation + ACTION;
+        let action = self.inputs.critic..self.inputs.critic + ACTION;
         self.critic
             .backward_through(team, critic, critic_given, drawn_flowing, action, action_gradient);
         // Back through the drawing and the policy.
@@ -233,7 +235,7 @@ impl NativeSac {
             rows,
             outputs: numbers(2 * rows, 2 * ACTION),
             sample: Sample::places(2 * rows),
-            joined: numbers(rows, self.observation + ACTION),
+            joined: numbers(rows, self.inputs.critic + ACTION),
             target_values: numbers(rows, ESTIMATES),
             critic: self.critic.places(rows),
             critic_flowing: self.critic.places(rows),
@@ -267,7 +269,7 @@ impl NativeSac {
 
     /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
     pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
-        let mut outputs = vec![0.0; observations.len() / self.observation * 2 * ACTION];
+        let mut outputs = vec![0.0; observations.len() / self.inputs.policy * 2 * ACTION];
         let policy = &self.policy_parameters.values;
         self.policy
             .forward_through(&mut Team::new(1), policy, observations, &mut outputs);

@@ -12,6 +12,8 @@ pub(crate) struct Transitions {
     pub(crate) actions: Vec<f32>,
     pub(crate) rewards: Vec<f32>,
     pub(crate) next_observations: Vec<f32>,
+    /// What the critic is told instead of the observations, and after the actions.
+    pub(crate) told: Option<[Vec<f32>; 2]>,
     pub(crate) terminated: Vec<f32>,
 }
 
@@ -24,8 +26,16 @@ impl Transitions {
             actions: draw(rows * 2),
             rewards: draw(rows),
             next_observations: draw(rows * observation.len()),
+            told: None,
             terminated: (0..rows).map(|row| f32::from(row % 3 == 1)).collect(),
         }
+    }
+
+    /// The same, and the critic is told `width` numbers of each state.
+    pub(crate) fn telling(mut self, width: usize, noise: &mut Noise) -> Self {
+        let mut draw = || (0..self.rewards.len() * width).map(|_| noise.uniform(1.0)).collect();
+        self.told = Some([draw(), draw()]);
+        self
     }
 
     /// A one-step task: the observation's first two numbers are the action that would have been right.
@@ -40,6 +50,7 @@ impl Transitions {
         Self {
             rewards: rewards.collect(),
             next_observations: observations.clone(),
+            told: None,
             terminated: vec![1.0; rows],
             observations,
             actions,
@@ -47,7 +58,13 @@ impl Transitions {
     }
 
     pub(crate) fn columns(&self) -> Columns<'_> {
+        let [states, next_states] = match &self.told {
+            Some(told) => told.each_ref(),
+            None => [&self.observations, &self.next_observations],
+        };
         Columns {
+            states,
+            next_states,
             observations: &self.observations,
             actions: &self.actions,
             rewards: &self.rewards,

@@ -8,6 +8,7 @@ use tch::Device;
 use super::samples::Transitions;
 use super::{Sac, SacMetrics};
 use crate::UpdateError;
+use crate::algorithm::Inputs;
 use crate::noise::Noise;
 use crate::state::{NamedTensor, Stateful, TensorValues};
 
@@ -24,7 +25,7 @@ fn small() -> SacSection {
 
 fn sac(engine: Engine, section: &SacSection, seed: u64) -> Sac {
     crate::device::use_threads(1);
-    Sac::new(section, OBSERVATION.len(), seed, engine, Device::Cpu)
+    Sac::new(section, Inputs::same(OBSERVATION.len()), seed, engine, Device::Cpu)
 }
 
 fn update(sac: &mut Sac, transitions: &Transitions, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {

@@ -8,7 +8,7 @@ use tch::{Device, Tensor, no_grad_guard};
 use super::SacMetrics;
 use super::batch::Batch;
 use super::losses::{critic_loss, policy_loss, soft_targets, temperature_loss};
-use crate::algorithm::Columns;
+use crate::algorithm::{Columns, Inputs};
 use crate::error::{UpdateError, finite};
 use crate::networks::{Critic, Layout, Parameters, Policy};
 use crate::noise::Noise;
@@ -18,7 +18,7 @@ use crate::state::{Part, Stateful};
 /// Policy, critic, target critic and temperature, each with its optimizer.
 #[derive(Debug)]
 pub struct TorchSac {
-    observation: usize,
+    inputs: Inputs,
     policy: Policy,
     policy_parameters: Parameters,
     policy_optimizer: Adam,
@@ -37,19 +37,19 @@ pub struct TorchSac {
 
 impl TorchSac {
     /// Untrained networks whose parameters depend on the run's seed alone.
-    pub fn new(section: &SacSection, observation: usize, run_seed: u64, device: Device) -> Self {
-        let (inputs, width) = (observation as i64, section.hidden_width as i64);
+    pub fn new(section: &SacSection, inputs: Inputs, run_seed: u64, device: Device) -> Self {
+        let width = section.hidden_width as i64;
         let mut layout = Layout::default();
-        let policy = Policy::describe(&mut layout, inputs, width);
+        let policy = Policy::describe(&mut layout, inputs.policy as i64, width);
         let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 0), device);
         let mut layout = Layout::default();
-        let critic = Critic::describe(&mut layout, inputs, width, section.critic_networks);
+        let critic = Critic::describe(&mut layout, inputs.critic as i64, width, section.critic_networks);
         let critic_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 1), device);
         let log_temperature = Tensor::from_slice(&[section.initial_temperature.ln() as f32])
             .to_device(device)
             .set_requires_grad(true);
         Self {
-            observation,
+            inputs,
             policy,
             policy_optimizer: Adam::new(policy_parameters.flat(), section.policy_learning_rate),
             policy_parameters,
@@ -77,7 +77,7 @@ impl TorchSac {
     ///
     /// Source: arXiv:1812.05905, algorithm 1.
     pub fn update(&mut self, columns: Columns<'_>, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {
-        let batch = Batch::new(columns, self.observation, self.log_temperature.device());
+        let batch = Batch::new(columns, self.inputs, self.log_temperature.device());
         let action_shape = [batch.rows(), ACTION as i64];
         let mut normal = || noise.normal(&action_shape, self.log_temperature.device());
         let temperature = self.log_temperature.detach().exp();
@@ -90,7 +90,7 @@ impl TorchSac {
                 .sample(&self.policy_parameters, &batch.next_observations, &normal());
             let next_values = self
                 .critic
-                .smaller(&self.target_parameters, &batch.next_observations, &next.actions);
+                .smaller(&self.target_parameters, &batch.next_states, &next.actions);
             let Batch {
                 rewards, terminated, ..
             } = &batch;
@@ -107,7 +107,7 @@ impl TorchSac {
         // Both estimates are drawn towards it (eq. 5).
         let values = self
             .critic
-            .forward(&self.critic_parameters, &batch.observations, &batch.actions);
+            .forward(&self.critic_parameters, &batch.states, &batch.actions);
         let critic_loss = critic_loss(&values, &targets);
         let critic_gradient = self.critic_parameters.gradient(&critic_loss);
 
@@ -117,7 +117,7 @@ impl TorchSac {
             .sample(&self.policy_parameters, &batch.observations, &normal());
         let drawn_values = self
             .critic
-            .smaller(&self.critic_parameters, &batch.observations, &drawn.actions);
+            .smaller(&self.critic_parameters, &batch.states, &drawn.actions);
         let policy_loss = policy_loss(&drawn.log_prob, &drawn_values, &temperature);
         let policy_gradient = self.policy_parameters.gradient(&policy_loss);
 
@@ -161,7 +161,7 @@ impl TorchSac {
     /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
     pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
         let _guard = no_grad_guard();
-        let observations = Tensor::from_slice(observations).view([-1, self.observation as i64]);
+        let observations = Tensor::from_slice(observations).view([-1, self.inputs.policy as i64]);
         let device = self.log_temperature.device();
         let actions = self
             .policy

@@ -1,5 +1,6 @@
 //! The update against automatic gradients, and that it learns.
 
+use skein_protocol::LATENT;
 use skein_protocol::config::Observation;
 use tch::{Device, Tensor, no_grad_guard};
 
@@ -9,6 +10,11 @@ use crate::optimizer::Adam;
 use crate::sac::samples::Transitions;
 
 const OBSERVATION: Observation = Observation::LatentVelocity;
+/// Where the critic is told something else than the policy sees.
+const TOLD: Inputs = Inputs {
+    policy: LATENT + 2,
+    critic: 19,
+};
 
 fn section() -> Td3Section {
     Td3Section {
@@ -18,10 +24,10 @@ fn section() -> Td3Section {
 }
 
 fn td3(section: &Td3Section, seed: u64) -> Td3 {
-    Td3::new(section, OBSERVATION.len(), seed, Isa::best())
+    Td3::new(section, Inputs::same(OBSERVATION.len()), seed, Isa::best())
 }
 
-/// The same algorithm on libtorch, in reading order.
+/// The same algorithm on libtorch, in reading order, with [`TOLD`].
 struct Reference {
     section: Td3Section,
     policy: Policy,
@@ -34,10 +40,11 @@ struct Reference {
 
 impl Reference {
     fn new(section: &Td3Section, seed: u64) -> Self {
-        let (inputs, width) = (OBSERVATION.len() as i64, section.hidden_width as i64);
+        let width = section.hidden_width as i64;
+        let [inputs, state] = [TOLD.policy, TOLD.critic].map(|inputs| inputs as i64);
         let (mut policy_layout, mut critic_layout) = (Layout::default(), Layout::default());
         let policy = Policy::with_outputs(&mut policy_layout, inputs, width, ACTION as i64);
-        let critic = Critic::describe(&mut critic_layout, inputs, width, section.critic_networks);
+        let critic = Critic::describe(&mut critic_layout, state, width, section.critic_networks);
         let parameters = |layout: Layout, index| {
             Parameters::initialise(layout, derive(seed, Purpose::PolicyParameters, index), Device::Cpu)
         };
@@ -59,12 +66,11 @@ impl Reference {
     fn update(&mut self, transitions: &Transitions, noise: &mut Noise) -> f64 {
         let rows = transitions.rewards.len() as i64;
         let column = |values: &[f32], width: i64| Tensor::from_slice(values).view([rows, width]);
-        let width = OBSERVATION.len() as i64;
-        let (observations, actions) = (
-            column(&transitions.observations, width),
-            column(&transitions.actions, 2),
-        );
-        let next = column(&transitions.next_observations, width);
+        let columns = transitions.columns();
+        let [inputs, state] = [TOLD.policy, TOLD.critic].map(|inputs| inputs as i64);
+        let (observations, actions) = (column(columns.observations, inputs), column(columns.actions, 2));
+        let next = column(columns.next_observations, inputs);
+        let (states, next_states) = (column(columns.states, state), column(columns.next_states, state));
         let (rewards, terminated) = (column(&transitions.rewards, 1), column(&transitions.terminated, 1));
         let [policy, critic] = &self.learned;
         let [target_policy, target_critic] = &self.targets;
@@ -74,10 +80,13 @@ impl Reference {
             let noise = noise.normal(&[rows, 2], Device::Cpu) * self.section.target_noise;
             let next_actions =
                 (self.policy.output(target_policy, &next).tanh() + noise.clamp(-bound, bound)).clamp(-1.0, 1.0);
-            let values = self.critic.smaller(target_critic, &next, &next_actions).unsqueeze(1);
+            let values = self
+                .critic
+                .smaller(target_critic, &next_states, &next_actions)
+                .unsqueeze(1);
             rewards + (1.0 - terminated) * values * self.section.discount
         };
-        let values = self.critic.forward(critic, &observations, &actions);
+        let values = self.critic.forward(critic, &states, &actions);
         let loss = (values - targets).square().sum_dim_intlist(1, false, None).mean(None) * 0.5;
         let critic_loss = loss.double_value(&[]);
         let critic_gradient = critic.gradient(&loss);
@@ -85,7 +94,7 @@ impl Reference {
         let improves = self.updates.is_multiple_of(self.section.policy_period);
         let policy_gradient = improves.then(|| {
             let actions = self.policy.output(policy, &observations).tanh();
-            let first = self.critic.forward(critic, &observations, &actions).narrow(1, 0, 1);
+            let first = self.critic.forward(critic, &states, &actions).narrow(1, 0, 1);
             policy.gradient(&-first.mean(None))
         });
         self.optimizers[1].step(self.learned[1].flat_mut(), &critic_gradient);
@@ -119,11 +128,12 @@ fn forty_updates_stay_close_to_automatic_gradients() {
         ..section()
     };
     for (seed, section) in [(1, section()), (2, section()), (3, apart), (4, cut_off)] {
-        let (mut native, mut reference) = (td3(&section, seed), Reference::new(&section, seed));
+        let mut native = Td3::new(&section, TOLD, seed, Isa::best());
+        let mut reference = Reference::new(&section, seed);
         let (mut data, mut noise, mut same_noise) = (Noise::new(seed), Noise::new(9), Noise::new(9));
         let before = native.policy_parameters.values.clone();
         for number in 1..=40 {
-            let transitions = Transitions::random(OBSERVATION, 50, &mut data);
+            let transitions = Transitions::random(OBSERVATION, 50, &mut data).telling(TOLD.critic, &mut data);
             let found = native
                 .update(&mut Team::new(1), transitions.columns(), &mut noise)
                 .unwrap();
@@ -222,7 +232,7 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
 #[test]
 fn neither_threads_nor_instructions_change_a_bit() {
     let run = |isa: Isa, members: usize| {
-        let mut algorithm = Td3::new(&section(), OBSERVATION.len(), 1, isa);
+        let mut algorithm = Td3::new(&section(), Inputs::same(OBSERVATION.len()), 1, isa);
         let (mut data, mut noise, mut team) = (Noise::new(1), Noise::new(2), Team::new(members));
         for _ in 0..4 {
             let transitions = Transitions::random(OBSERVATION, 37, &mut data);

@@ -8,6 +8,9 @@ use super::{Invalid, require};
 use crate::leg::MOST_FLOWN;
 use crate::{ACTION, LATENT};
 
+/// Earlier moments that can be seen at most.
+const MOST_HISTORY: usize = 16;
+
 /// `[learning]`: when is learned, how much, and from what.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -34,6 +37,8 @@ pub struct LearningSection {
     /// Earlier moments that it sees beside the present one, by how many steps they lie back, rising; before take-off all was as at take-off. What was in view a second ago no longer is when
     /// the drone is in an opening. Default none, as in the paper.
     pub history_steps: Vec<usize>,
+    /// What the critic sees. It is needed in training alone, where the simulator can tell it more than the drone sees. Default `observation`, as in the paper.
+    pub critic_input: CriticInput,
 }
 
 impl Default for LearningSection {
@@ -49,6 +54,7 @@ impl Default for LearningSection {
             levels: 5,
             observation: Observation::Latent,
             history_steps: Vec::new(),
+            critic_input: CriticInput::Observation,
         }
     }
 }
@@ -108,12 +114,7 @@ impl LearningSection {
             history_steps: self.history_steps.clone(),
         }
     }
-}
 
-/// Earlier moments that can be seen at most.
-const MOST_HISTORY: usize = 16;
-
-impl LearningSection {
     /// Whether flights are flown in legs, so that the weights are refreshed in the middle of them.
     pub fn in_legs(&self) -> bool {
         self.leg_steps > 0
@@ -172,7 +173,17 @@ impl fmt::Display for AlgorithmName {
     }
 }
 
-/// What the policy and the critic see of the world at a moment, in this order.
+/// What the critic judges an action by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CriticInput {
+    /// What the policy sees.
+    Observation,
+    /// What the simulator knows: where drone and openings are, how the drone moves, and what disturbs it (an asymmetric critic, arXiv:1710.06542).
+    GroundTruth,
+}
+
+/// What the policy sees of the world at a moment, in this order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Observation {
     /// The latent code of the depth image alone (the paper's state).
@@ -225,7 +236,7 @@ impl Observation {
     }
 }
 
-/// What the policy and the critic see: the present moment, then earlier ones.
+/// What the policy sees: the present moment, then earlier ones.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct View {
     /// What is seen of each.

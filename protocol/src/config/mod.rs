@@ -22,7 +22,7 @@ use crate::leg::MOST_FLOWN;
 pub use courses::CoursesSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
 pub use file::{ConfigError, culprit};
-pub use learning::{AlgorithmName, LearningSection, Observation, View};
+pub use learning::{AlgorithmName, CriticInput, LearningSection, Observation, View};
 pub use replay::{ReplaySection, SuccessRule};
 pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};

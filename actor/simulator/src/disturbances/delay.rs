@@ -24,6 +24,11 @@ impl Delay {
         self.on_the_way.resize(periods as usize, [0.0, 0.0]);
     }
 
+    /// Control periods until a command takes effect.
+    pub(crate) fn periods(&self) -> usize {
+        self.on_the_way.len()
+    }
+
     /// Takes `action` in and gives the one out that takes effect now.
     pub(crate) fn pass(&mut self, action: [f32; 2]) -> [f32; 2] {
         self.on_the_way.push_back(action);

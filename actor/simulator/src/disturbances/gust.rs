@@ -38,6 +38,11 @@ impl Gust {
         Some(gust)
     }
 
+    /// The force of the last physics step on the body's centre of mass, world frame, N.
+    pub(crate) fn force_n(&self) -> Vector3<f32> {
+        self.force_n
+    }
+
     /// The force of the next physics step on the body's centre of mass, world frame, N.
     pub(crate) fn advance(&mut self) -> Vector3<f32> {
         self.force_n = self.force_n * self.kept + self.draw() * self.kick_n;

@@ -3,6 +3,7 @@
 //! A flight is a pure function of course, settings, start, disturbances and actions. Numbers that are not finite never get further than the
 //! step they appear in: it returns [`SimulationError::NonFinite`] and the flight is over.
 
+mod ground_truth;
 mod report;
 mod settings;
 #[cfg(test)]
@@ -13,6 +14,8 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 use rand::Rng;
 
+pub(crate) use ground_truth::walls_ahead;
+pub use ground_truth::{Ahead, GroundTruth};
 pub use report::{LevelUp, Obstacle, Outcome, SimulationError, StepReport};
 pub use settings::{SimulatorError, SimulatorSettings};
 
@@ -40,13 +43,15 @@ pub struct Simulator {
 }
 
 /// Where a flight stands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 struct Flight {
     phase: Phase,
     steps: u32,
     /// Walls of the course whose back face the drone's centre has left behind, those before its start included.
     walls_behind: usize,
     walls_behind_at_start: usize,
+    /// The drone's mass, by its nominal one.
+    mass_factor: f32,
     /// Of what the camera gets wrong; `None` in a calm flight.
     depth_seed: Option<u64>,
 }
@@ -94,6 +99,7 @@ impl Simulator {
                 steps: 0,
                 walls_behind: 0,
                 walls_behind_at_start: 0,
+                mass_factor: 1.0,
                 depth_seed: None,
             },
         })
@@ -111,9 +117,9 @@ impl Simulator {
         self.world.reset(&position_m, drawn.mass_factor);
         let Drawn {
             disturbed,
+            mass_factor,
             gust_seed,
             depth_seed,
-            ..
         } = drawn;
         let gust = Gust::new(&self.disturbances.gust, self.dt_secs, gust_seed);
         self.gust = gust.filter(|_| disturbed);
@@ -128,6 +134,7 @@ impl Simulator {
             steps: 0,
             walls_behind,
             walls_behind_at_start: walls_behind,
+            mass_factor,
             depth_seed: disturbed.then_some(depth_seed),
         };
         Ok(())
@@ -182,6 +189,22 @@ impl Simulator {
     #[must_use]
     pub fn state(&self) -> VehicleState {
         self.world.state()
+    }
+
+    /// What no camera sees of this moment.
+    #[must_use]
+    pub fn ground_truth(&self) -> GroundTruth {
+        let state = self.state();
+        let corridor = self.course.corridor();
+        let [x_m, y_m, z_m] = state.position_m.coords.into();
+        GroundTruth {
+            ahead: Ahead::next_two(&self.course, &state),
+            from_middle_m: [y_m, z_m - corridor.height_m / 2.0],
+            to_end_m: corridor.length_m - x_m,
+            mass_factor: self.flight.mass_factor,
+            latency_periods: self.commands.periods() as f32,
+            gust_n: self.gust.as_ref().map_or([0.0; 3], |gust| gust.force_n().into()),
+        }
     }
 
     /// The level the drone is in: 1 before the first wall, one more behind each.

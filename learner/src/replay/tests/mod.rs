@@ -7,10 +7,11 @@ use std::convert::Infallible;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::IMAGE_PIXELS;
-use skein_protocol::config::Observation;
+use skein_protocol::config::{CriticInput, Observation};
 use skein_protocol::transition::Outcome;
 
 use super::*;
+use crate::flight::TRUE_STATE;
 use crate::flight::samples::{code, flight, shade, with_images};
 
 fn config(capacity: usize, observation: Observation) -> Config {
@@ -199,7 +200,9 @@ fn a_minibatch_is_a_function_of_content_and_seed() {
 
 #[test]
 fn rows_of_a_minibatch_belong_together() {
-    let mut replay = frozen(&config(100, Observation::LatentVelocityAction));
+    let mut config = config(100, Observation::LatentVelocityAction);
+    config.learning.critic_input = CriticInput::GroundTruth;
+    let mut replay = frozen(&config);
     for number in 0..20 {
         replay.insert(flight(number, 9, Outcome::Collided)).unwrap();
     }
@@ -216,6 +219,15 @@ fn rows_of_a_minibatch_belong_together() {
             "the next observation is one step later in the same flight"
         );
         assert_eq!(batch.rewards[index], at / 100.0);
+        for (states, seen) in [(&batch.true_states, observation), (&batch.next_true_states, next)] {
+            let state = &states[index * TRUE_STATE..][..TRUE_STATE];
+            assert_eq!(
+                state[17..19],
+                seen[LATENT..LATENT + 2],
+                "the critic is told of the same moment"
+            );
+            assert_eq!(state[21..], seen[LATENT + 2..], "and of the action before it");
+        }
         assert_eq!(
             batch.actions[2 * index..2 * index + 2],
             next[LATENT + 2..],

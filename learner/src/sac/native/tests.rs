@@ -22,11 +22,11 @@ fn section(hidden_width: usize) -> SacSection {
 }
 
 /// Both engines before their first update.
-fn both(section: &SacSection, observation: Observation, seed: u64) -> (NativeSac, TorchSac) {
+fn both(section: &SacSection, inputs: Inputs, seed: u64) -> (NativeSac, TorchSac) {
     crate::device::use_threads(1);
     (
-        NativeSac::new(section, observation.len(), seed, Isa::best()),
-        TorchSac::new(section, observation.len(), seed, Device::Cpu),
+        NativeSac::new(section, inputs, seed, Isa::best()),
+        TorchSac::new(section, inputs, seed, Device::Cpu),
     )
 }
 
@@ -103,15 +103,24 @@ fn assert_one_update_is_equal(native: &mut NativeSac, torch: &mut TorchSac, tran
 
 #[test]
 fn gradients_and_one_update_are_the_references() {
-    for (number, observation) in OBSERVATIONS.into_iter().enumerate() {
+    // Whether the critic is told something else, and how much.
+    for (number, (observation, told)) in OBSERVATIONS.into_iter().zip([None, Some(5), Some(50)]).enumerate() {
+        let inputs = Inputs {
+            critic: told.unwrap_or(observation.len()),
+            ..Inputs::same(observation.len())
+        };
         for (width, rows) in [(8, 1), (8, 33), (31, 7), (31, 8), (64, 50), (256, 256), (100, 201)] {
             let seed = (number + rows) as u64;
             let section = SacSection {
                 critic_networks: 1 + rows % 2,
                 ..section(width)
             };
-            let (mut native, mut torch) = both(&section, observation, seed);
-            let transitions = Transitions::random(observation, rows, &mut Noise::new(seed));
+            let (mut native, mut torch) = both(&section, inputs, seed);
+            let mut noise = Noise::new(seed);
+            let mut transitions = Transitions::random(observation, rows, &mut noise);
+            if let Some(told) = told {
+                transitions = transitions.telling(told, &mut noise);
+            }
             let context = format!(
                 "{observation:?}, width {width}, {rows} rows, {} networks",
                 section.critic_networks
@@ -124,7 +133,7 @@ fn gradients_and_one_update_are_the_references() {
 #[test]
 fn gradients_are_the_references_where_tanh_saturates_and_deviations_are_bounded() {
     let observation = Observation::Latent;
-    let (mut native, mut torch) = both(&section(16), observation, 1);
+    let (mut native, mut torch) = both(&section(16), Inputs::same(observation.len()), 1);
     let mut stored = native.named_tensors();
     let policy = stored
         .iter_mut()
@@ -146,7 +155,7 @@ fn gradients_are_the_references_where_tanh_saturates_and_deviations_are_bounded(
 fn a_hundred_updates_stay_close_to_the_references() {
     let observation = Observation::LatentVelocity;
     for seed in 1..=3 {
-        let (mut native, mut torch) = both(&section(64), observation, seed);
+        let (mut native, mut torch) = both(&section(64), Inputs::same(observation.len()), seed);
         let (mut data, mut team) = (Noise::new(seed), Team::new(1));
         let (mut noise, mut same_noise) = (Noise::new(seed + 1), Noise::new(seed + 1));
         let before = numbers(&mut native);
@@ -179,7 +188,7 @@ fn neither_threads_nor_instructions_change_a_bit() {
     let observation = Observation::LatentVelocityAction;
     for (width, rows) in [(40, 131), (16, 5)] {
         let run = |isa: Isa, members: usize| {
-            let mut sac = NativeSac::new(&section(width), observation.len(), 1, isa);
+            let mut sac = NativeSac::new(&section(width), Inputs::same(observation.len()), 1, isa);
             let (mut data, mut noise, mut team) = (Noise::new(1), Noise::new(2), Team::new(members));
             let metrics: Vec<_> = (0..5)
                 .map(|_| {
@@ -205,9 +214,9 @@ fn batches_of_changing_size_are_what_they_are_alone() {
     let (mut team, section) = (Team::new(1), section(16));
     let large = Transitions::random(observation, 50, &mut Noise::new(1));
     let little = Transitions::random(observation, 3, &mut Noise::new(2));
-    let mut sac = NativeSac::new(&section, observation.len(), 1, Isa::best());
+    let mut sac = NativeSac::new(&section, Inputs::same(observation.len()), 1, Isa::best());
     sac.update(&mut team, large.columns(), &mut Noise::new(3)).unwrap();
-    let mut fresh = NativeSac::new(&section, observation.len(), 2, Isa::best());
+    let mut fresh = NativeSac::new(&section, Inputs::same(observation.len()), 2, Isa::best());
     fresh.load_named(&sac.named_tensors()).unwrap();
     let run = |sac: &mut NativeSac, team: &mut Team| sac.update(team, little.columns(), &mut Noise::new(4)).unwrap();
     assert_eq!(run(&mut sac, &mut team), run(&mut fresh, &mut team));
@@ -220,6 +229,6 @@ fn columns_that_do_not_belong_together_are_refused() {
     let observation = Observation::Latent;
     let mut transitions = Transitions::random(observation, 5, &mut Noise::new(1));
     transitions.next_observations.truncate(4 * observation.len());
-    let mut sac = NativeSac::new(&section(8), observation.len(), 1, Isa::best());
+    let mut sac = NativeSac::new(&section(8), Inputs::same(observation.len()), 1, Isa::best());
     let _ = sac.update(&mut Team::new(1), transitions.columns(), &mut Noise::new(1));
 }

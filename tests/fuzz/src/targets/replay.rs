@@ -9,7 +9,7 @@ use skein_learner::replay::{Minibatch, Replay, ReplayState, RingState};
 use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LATENT};
 
 use super::{Target, USUAL, Verdict};
 use crate::script::Script;
@@ -96,6 +96,7 @@ pub(super) fn flight() -> CommittedFlight {
         velocity_mps: [0.0; 3],
         position_m: [0.0; 3],
         orientation: [0.0, 0.0, 0.0, 1.0],
+        ground_truth: [0.0; GROUND_TRUTH],
     };
     CommittedFlight {
         flight: FlightId(1),

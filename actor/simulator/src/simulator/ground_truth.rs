@@ -1,0 +1,147 @@
+//! What the simulator knows of a moment and no camera sees.
+
+use crate::course::{Course, Wall};
+use crate::vehicle::VehicleState;
+
+/// A wall is behind the drone once its tail has left the opening; m from the drone's centre to its tail, with some to spare.
+const TAIL_M: f32 = 0.6;
+
+/// What the simulator knows of a moment and no camera sees: for whoever judges a pilot in training, never for the pilot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GroundTruth {
+    /// The next two walls that the drone has not left entirely.
+    pub ahead: [Ahead; 2],
+    /// Left and up from the middle of the corridor, m.
+    pub from_middle_m: [f32; 2],
+    /// To the end wall, m.
+    pub to_end_m: f32,
+    /// The drone's mass, by its nominal one.
+    pub mass_factor: f32,
+    /// Control periods until a command takes effect.
+    pub latency_periods: f32,
+    /// The gust's force in the world: forward, left, up, N.
+    pub gust_n: [f32; 3],
+}
+
+/// An opening, seen from the drone. Behind the last wall there is the end wall, to be touched anywhere: an opening as wide as the corridor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ahead {
+    /// Forward to the wall's front face, m; negative inside and behind.
+    pub distance_m: f32,
+    /// Left and up to the opening's safe point, m.
+    pub offset_m: [f32; 2],
+    /// Radius of the free space around that, m.
+    pub clearance_m: f32,
+}
+
+impl GroundTruth {
+    /// How many numbers it is.
+    pub const NUMBERS: usize = 16;
+
+    /// All of it in the fields' order.
+    #[must_use]
+    pub fn numbers(&self) -> [f32; Self::NUMBERS] {
+        let [next, after] = self.ahead.map(|ahead| {
+            let [left, up] = ahead.offset_m;
+            [ahead.distance_m, left, up, ahead.clearance_m]
+        });
+        let [left, up] = self.from_middle_m;
+        let [gust_x, gust_y, gust_z] = self.gust_n;
+        let rest = [
+            left,
+            up,
+            self.to_end_m,
+            self.mass_factor,
+            self.latency_periods,
+            gust_x,
+            gust_y,
+            gust_z,
+        ];
+        let mut numbers = [0.0; Self::NUMBERS];
+        numbers[..4].copy_from_slice(&next);
+        numbers[4..8].copy_from_slice(&after);
+        numbers[8..].copy_from_slice(&rest);
+        numbers
+    }
+}
+
+impl Ahead {
+    /// The next two openings from where the drone is.
+    pub(super) fn next_two(course: &Course, state: &VehicleState) -> [Self; 2] {
+        let mut walls = walls_ahead(course, state).map(|wall| Self::of_wall(wall, state));
+        let mut next = || walls.next().unwrap_or_else(|| Self::of_end(course, state));
+        [next(), next()]
+    }
+
+    fn of_wall(wall: &Wall, state: &VehicleState) -> Self {
+        Self::seen(wall.x_m(), wall.safe_point(), wall.clearance_m(), state)
+    }
+
+    fn of_end(course: &Course, state: &VehicleState) -> Self {
+        let corridor = course.corridor();
+        let middle = [0.0, corridor.height_m / 2.0];
+        let clearance_m = corridor.height_m.min(corridor.width_m) / 2.0;
+        Self::seen(corridor.length_m, middle, clearance_m, state)
+    }
+
+    fn seen(x_m: f32, [y_m, z_m]: [f32; 2], clearance_m: f32, state: &VehicleState) -> Self {
+        let at = state.position_m;
+        Self {
+            distance_m: x_m - at.x,
+            offset_m: [y_m - at.y, z_m - at.z],
+            clearance_m,
+        }
+    }
+}
+
+/// The walls that the drone has not left entirely, the next one first.
+pub(crate) fn walls_ahead<'a>(course: &'a Course, state: &VehicleState) -> impl Iterator<Item = &'a Wall> {
+    let tail_m = state.position_m.x - TAIL_M;
+    course
+        .walls()
+        .iter()
+        .filter(move |wall| wall.x_m() + course.wall_thickness_m() > tail_m)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Point3;
+
+    use super::*;
+    use crate::course::test_course;
+
+    #[test]
+    fn the_next_two_openings_are_seen_from_the_drone_and_behind_the_last_there_is_the_end() {
+        let course = test_course();
+        let walls = course.walls();
+        let [y_m, z_m] = walls[0].safe_point();
+        let before = VehicleState::at_rest(Point3::new(walls[0].x_m() - 4.0, y_m - 1.0, z_m + 0.5));
+        let [next, after] = Ahead::next_two(&course, &before);
+        assert_eq!((next.distance_m, next.clearance_m), (4.0, walls[0].clearance_m()));
+        assert!((next.offset_m[0] - 1.0).abs() < 1e-5 && (next.offset_m[1] + 0.5).abs() < 1e-5);
+        let behind_first = after.distance_m - next.distance_m;
+        let expected = walls.get(1).map_or(course.corridor().length_m, Wall::x_m) - walls[0].x_m();
+        assert!((behind_first - expected).abs() < 1e-5);
+
+        let last = walls.last().unwrap();
+        let behind_all = last.x_m() + course.wall_thickness_m() + TAIL_M;
+        let behind = VehicleState::at_rest(Point3::new(behind_all, 1.0, 2.0));
+        let [next, after] = Ahead::next_two(&course, &behind);
+        assert_eq!(next, after);
+        assert_eq!(next.distance_m, course.corridor().length_m - behind_all);
+        assert_eq!(next.offset_m, [-1.0, course.corridor().height_m / 2.0 - 2.0]);
+    }
+
+    #[test]
+    fn a_wall_is_ahead_until_the_tail_has_left_it() {
+        let course = test_course();
+        let wall = &course.walls()[0];
+        let tail_leaves = wall.x_m() + course.wall_thickness_m() + TAIL_M;
+        let first = |x_m| {
+            let state = VehicleState::at_rest(Point3::new(x_m, 0.0, 1.0));
+            walls_ahead(&course, &state).next().map(Wall::label)
+        };
+        assert_eq!(first(tail_leaves - 0.01), Some(wall.label()));
+        assert_ne!(first(tail_leaves + 0.01), Some(wall.label()));
+    }
+}
