@@ -43,9 +43,7 @@ fn full(capacity: usize) -> Replay {
     config.replay.capacity = capacity;
     config.learning.observation = Observation::LatentVelocity;
     let mut replay = Replay::new(&config);
-    replay
-        .freeze_latents(1, |_| Ok::<_, std::convert::Infallible>(Vec::new()))
-        .expect("there are no images to encode");
+    replay.freeze();
     let mut rng = Pcg64Mcg::seed_from_u64(2);
     for flight in 0.. {
         if replay.len() == capacity {

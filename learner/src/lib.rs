@@ -15,6 +15,7 @@ pub mod flight;
 pub mod flights;
 pub mod lives;
 pub mod metrics;
+mod mirror;
 pub mod networks;
 pub mod noise;
 pub mod optimizer;

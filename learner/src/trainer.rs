@@ -61,6 +61,8 @@ pub struct Trainer {
     algorithm: Box<dyn Algorithm>,
     replay: Replay,
     steps: u64,
+    /// Times that stored codes should have been made anew since the run began.
+    renewals: u64,
 }
 
 impl Trainer {
@@ -84,6 +86,7 @@ impl Trainer {
             algorithm: algorithm::new(config, device),
             replay: Replay::new(config),
             steps: 0,
+            renewals: 0,
             config: config.clone(),
         })
     }
@@ -102,6 +105,7 @@ impl Trainer {
         self.algorithm.load_named(tensors)?;
         self.replay = Replay::restore(&self.config, replay)?;
         self.steps = progress.environment_steps;
+        self.renewals = self.renewals_due();
         for (what, found, expected) in [
             ("VAE steps", self.vae.updates(), progress.vae_steps),
             ("policy updates", self.algorithm.updates(), progress.policy_updates),
@@ -149,7 +153,7 @@ impl Trainer {
 
     /// What is needed of the next flights to be ordered.
     pub fn keep(&self) -> Keep {
-        if self.vae_is_frozen() {
+        if self.vae_is_frozen() && !self.config.learning.mirror {
             Keep::Latents
         } else {
             Keep::Depth
@@ -160,22 +164,41 @@ impl Trainer {
         self.replay.image_count().is_none()
     }
 
-    /// Stores a flight's transitions.
+    /// Stores a flight's transitions, and if asked for those of its mirror image.
     ///
     /// # Errors
     /// [`InsertError`] when its parts do not belong together.
     pub fn take_in(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
-        // With policy lag, flights still come in that were flown with an encoder older than the frozen one: their codes are made anew.
-        if self.vae_is_frozen()
-            && let Some(depth) = flight.depth.take()
-        {
-            let codes = self.encoder().encode_all(&mut self.team, &depth);
-            for (observation, latent) in flight.observations.iter_mut().zip(codes) {
-                observation.latent = latent;
-            }
+        let learning = &self.config.learning;
+        let mirrored = learning.mirror.then(|| flight.mirrored());
+        // With policy lag, flights still come in that were flown with an encoder older than the frozen one: their codes are made anew. Without, images come for the mirror alone.
+        if self.vae_is_frozen() && (learning.policy_lag > 0 || !learning.mirror) {
+            self.encode(&mut flight);
         }
         self.steps += flight.steps() as u64;
+        self.insert(flight)?;
+        if let Some(mut mirrored) = mirrored {
+            self.encode(&mut mirrored);
+            self.insert(mirrored)?;
+        }
+        Ok(())
+    }
+
+    fn insert(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
+        if self.vae_is_frozen() {
+            flight.depth = None;
+        }
         self.replay.insert(flight)
+    }
+
+    /// Makes a flight's codes anew with the encoder as it is, if there are images to make them from.
+    fn encode(&mut self, flight: &mut CommittedFlight) {
+        let Some(depth) = &flight.depth else { return };
+        let encoder = self.encoder();
+        let codes = encoder.encode_all(&mut self.team, depth);
+        for (observation, latent) in flight.observations.iter_mut().zip(codes) {
+            observation.latent = latent;
+        }
     }
 
     /// Trains the VAE as far as the steps flown ask for, from what snapshot `version` holds on, and freezes it when its time is over. `after_each` may do something
@@ -207,20 +230,31 @@ impl Trainer {
             after_each(&metrics)?;
             last = Some(metrics);
         }
-        if self.steps >= self.config.vae.train_steps as u64 {
-            self.freeze_vae();
+        let due = self.renewals_due();
+        let is_over = self.steps >= self.config.vae.train_steps as u64;
+        if is_over || self.renewals < due {
+            self.renew_latents();
             timer.lap(Stage::Recode, 1);
+        }
+        self.renewals = due;
+        if is_over {
+            tracing::info!(steps = self.steps, vae_updates = self.vae.updates(), "VAE frozen");
+            self.replay.freeze();
         }
         Ok(last)
     }
 
-    fn freeze_vae(&mut self) {
-        tracing::info!(steps = self.steps, vae_updates = self.vae.updates(), "VAE frozen");
+    fn renewals_due(&self) -> u64 {
+        self.steps.checked_div(self.config.vae.recode_steps as u64).unwrap_or(0)
+    }
+
+    /// Makes stored codes anew with the encoder as it is.
+    fn renew_latents(&mut self) {
         let encoder = self.encoder();
         let Self { team, replay, .. } = self;
-        let frozen: Result<(), std::convert::Infallible> =
-            replay.freeze_latents(ENCODE_CHUNK, |images| Ok(encoder.encode_all(team, images)));
-        let Ok(()) = frozen;
+        let renewed: Result<(), std::convert::Infallible> =
+            replay.renew_latents(ENCODE_CHUNK, |images| Ok(encoder.encode_all(team, images)));
+        let Ok(()) = renewed;
     }
 
     /// The encoder as actors have it, so that codes made here are those that actors send, to the last bit.

@@ -199,13 +199,19 @@ impl Replay {
             .sample(rng, count, into);
     }
 
-    /// Ends the VAE's training: every stored latent code is made anew by `encode`, and the images are dropped.
-    ///
-    /// `encode` turns up to `chunk` images, `[n, 72, 128]`, into as many codes. Does nothing if the VAE is frozen already.
+    /// Ends the VAE's training: codes stay what they are, and the images are dropped.
+    pub fn freeze(&mut self) {
+        self.images = None;
+        self.success.forget_images();
+        self.regular.forget_images();
+    }
+
+    /// Makes every stored latent code anew by `encode`, which turns up to `chunk` images, `[n, 72, 128]`, into as many codes. Does nothing if the VAE is frozen
+    /// already.
     ///
     /// # Errors
     /// The first that `encode` returns; the buffer is as before.
-    pub fn freeze_latents<E>(
+    pub fn renew_latents<E>(
         &mut self,
         chunk: usize,
         encode: impl FnMut(&[u8]) -> Result<Vec<[f32; LATENT]>, E>,
@@ -215,7 +221,6 @@ impl Replay {
             for ring in [&mut self.success, &mut self.regular] {
                 ring.replace_latents(&self.view, &latents, |image| images.first_of_flight(image));
             }
-            self.images = None;
         }
         Ok(())
     }
@@ -284,8 +289,8 @@ fn capacities(section: &ReplaySection) -> (usize, usize) {
 }
 
 /// Images that the VAE's training can leave behind: before the epoch in which it is frozen, fewer than `vae.train_steps` steps were flown, with at
-/// most as many closing images; then come the flights of one epoch.
+/// most as many closing images; then come the flights of one epoch. Their mirror images come on top.
 fn image_limit(config: &Config) -> usize {
     let epoch = config.learning.flights_per_epoch as usize * config.transport.max_records_per_flight;
-    2 * config.vae.train_steps + epoch
+    (2 * config.vae.train_steps + epoch) * (1 + usize::from(config.learning.mirror))
 }

@@ -181,16 +181,20 @@ impl Ring {
         &self.images
     }
 
-    /// Rewrites the latent parts of both observations of every row from `latents`, one per image, and forgets the images. `first_of_flight` says which image
-    /// of an image's flight was the first.
+    /// Forgets which images the rows are of.
+    pub(super) fn forget_images(&mut self) {
+        self.images = Vec::new();
+    }
+
+    /// Rewrites the latent parts of both observations of every row from `latents`, one per image. `first_of_flight` says which image of an image's flight was the
+    /// first.
     pub(super) fn replace_latents(
         &mut self,
         view: &View,
         latents: &[[f32; LATENT]],
         first_of_flight: impl Fn(u32) -> u32,
     ) {
-        let images = std::mem::take(&mut self.images);
-        for (values, image) in self.rows.chunks_exact_mut(self.layout.width()).zip(images) {
+        for (values, &image) in self.rows.chunks_exact_mut(self.layout.width()).zip(&self.images) {
             let row = self.layout.row_mut(values);
             let first = first_of_flight(image);
             let (flight, step) = (&latents[first as usize..], (image - first) as usize);

@@ -1,7 +1,7 @@
 //! A trainer restored from a checkpoint goes on bit for bit.
 
 use skein_inference::{Network, Scratch};
-use skein_protocol::config::Precision;
+use skein_protocol::config::{Observation, Precision};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{IMAGE_PIXELS, LATENT};
 
@@ -24,6 +24,7 @@ fn config() -> Config {
     config.sac.hidden_width = 16;
     config.sac.batch_size = 8;
     config.vae.train_steps = 3 * STEPS;
+    config.vae.recode_steps = 2 * STEPS;
     config.vae.updates_per_step = 0.1;
     config.vae.batch_size = 2;
     config.replay.capacity = 70;
@@ -148,21 +149,71 @@ fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
         // The last epoch comes in late: its images were ordered before.
         (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
         assert_eq!(trainer.keep(), Keep::Latents, "the VAE was never frozen");
-        let network = Network::new(&trainer.snapshot(PolicyVersion(4)), &trainer.layout, precision);
-        let code = |(flight, step)| network.encode(&[shade(flight, step); IMAGE_PIXELS], &mut Scratch::default());
-        let codes: Vec<_> = (0..4 * FLIGHTS)
-            .flat_map(|flight| (0..=STEPS / FLIGHTS as usize).map(move |step| (flight, step)))
-            .map(code)
-            .collect();
-        let mut drawn = Minibatch::default();
-        let mut rng = trainer.rng(Purpose::PolicyBatches, PolicyVersion(9));
-        trainer.replay().sample(&mut rng, 200, &mut drawn);
-        let rows = drawn.observations.chunks(drawn.observations.len() / 200);
-        for observation in rows {
-            assert!(
-                codes.iter().any(|code| code == &observation[..LATENT]),
-                "{engine}, {precision}"
-            );
-        }
+        assert!(all_codes_are_the_encoders(&trainer, 4), "{engine}, {precision}");
     }
+}
+
+#[test]
+fn flights_are_stored_a_second_time_as_seen_in_a_mirror() {
+    let mut config = config();
+    config.learning.mirror = true;
+    config.learning.observation = Observation::LatentVelocityAction;
+    config.replay.capacity = 1000;
+    let mut trainer = Trainer::new(&config).unwrap();
+    (0..3).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+    assert_eq!((trainer.steps(), trainer.replay().len()), (3 * STEPS as u64, 6 * STEPS));
+    assert_eq!(
+        trainer.keep(),
+        Keep::Depth,
+        "mirror images are encoded after the VAE is frozen, too"
+    );
+    assert!(trainer.replay().image_count().is_none(), "the VAE was never frozen");
+    assert!(
+        all_codes_are_the_encoders(&trainer, 3),
+        "images are of one shade, and look the same in a mirror"
+    );
+    let mut drawn = Minibatch::default();
+    let mut rng = trainer.rng(Purpose::PolicyBatches, PolicyVersion(9));
+    trainer.replay().sample(&mut rng, 400, &mut drawn);
+    let observations = drawn.observations.chunks(drawn.observations.len() / 400);
+    let to_the_left = observations.zip(drawn.actions.chunks(2)).filter(|(seen, action)| {
+        assert_eq!(
+            seen[LATENT] < 0.0,
+            action[0] < 0.0,
+            "velocity and action are mirrored together"
+        );
+        action[0] > 0.0
+    });
+    let count = to_the_left.count();
+    assert!(
+        (150..=250).contains(&count),
+        "{count} of 400 go to the left, as all flights do that were flown"
+    );
+}
+
+#[test]
+fn while_the_vae_is_trained_stored_codes_are_made_anew_as_often_as_asked_for() {
+    let mut trainer = Trainer::new(&config()).unwrap();
+    let mut renewed = Vec::new();
+    for epoch in 0..3 {
+        learn(&mut trainer, epoch, Keep::Depth);
+        renewed.push(all_codes_are_the_encoders(&trainer, epoch + 1));
+    }
+    assert_eq!(renewed, [false, true, true]);
+}
+
+/// Whether what is stored of the first epochs are the codes that actors would make with the encoder as it is.
+fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
+    let precision = trainer.config.vae.encoder_precision;
+    let network = Network::new(&trainer.snapshot(PolicyVersion(epochs)), &trainer.layout, precision);
+    let code = |(flight, step)| network.encode(&[shade(flight, step); IMAGE_PIXELS], &mut Scratch::default());
+    let codes: Vec<_> = (0..epochs * FLIGHTS)
+        .flat_map(|flight| (0..=STEPS / FLIGHTS as usize).map(move |step| (flight, step)))
+        .map(code)
+        .collect();
+    let mut drawn = Minibatch::default();
+    let mut rng = trainer.rng(Purpose::PolicyBatches, PolicyVersion(9));
+    trainer.replay().sample(&mut rng, 200, &mut drawn);
+    let mut rows = drawn.observations.chunks(drawn.observations.len() / 200);
+    rows.all(|observation| codes.iter().any(|code| code == &observation[..LATENT]))
 }

@@ -442,6 +442,11 @@ mod tests {
                 vec!["learning.history_steps = [2]", "leg_steps = 1", "name none"],
             ),
             (
+                "[learning]\nleg_steps = 1\nflights_per_epoch = 1\nmirror = true",
+                vec![],
+                vec!["learning.mirror = true", "leg_steps = 1", "set it to false"],
+            ),
+            (
                 "[learning]\nhistory_steps = [4, 2]",
                 vec![],
                 vec!["learning.history_steps = [4, 2]", "does not rise"],

@@ -37,6 +37,9 @@ pub struct LearningSection {
     /// Earlier moments that it sees beside the present one, by how many steps they lie back, rising; before take-off all was as at take-off. What was in view a second ago no longer is when
     /// the drone is in an opening. Default none, as in the paper.
     pub history_steps: Vec<usize>,
+    /// Whether every flight is learned from twice, the second time as seen in a mirror, where left and right change places. Twice the transitions for the same steps
+    /// flown; they fill the replay twice as fast. Default false, as in the paper.
+    pub mirror: bool,
     /// What the critic sees. It is needed in training alone, where the simulator can tell it more than the drone sees. Default `observation`, as in the paper.
     pub critic_input: CriticInput,
 }
@@ -54,6 +57,7 @@ impl Default for LearningSection {
             levels: 5,
             observation: Observation::Latent,
             history_steps: Vec::new(),
+            mirror: false,
             critic_input: CriticInput::Observation,
         }
     }
@@ -142,6 +146,15 @@ impl LearningSection {
                 ),
             )?;
         }
+        require(
+            !self.in_legs() || !self.mirror,
+            "learning.mirror",
+            self.mirror,
+            format!(
+                "does not go with learning.leg_steps = {}: a leg is stored behind the one before it, where its mirror image would come between; set it to false, or learning.leg_steps to 0",
+                self.leg_steps
+            ),
+        )?;
         require(
             !self.in_legs() || self.history_steps.is_empty(),
             "learning.history_steps",

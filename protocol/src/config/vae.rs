@@ -12,6 +12,9 @@ use super::{Invalid, require, require_learning_rate};
 pub struct VaeSection {
     /// Environment steps during which the VAE is trained; then it is frozen and stored latents are recomputed (paper: 10000). Default 10000.
     pub train_steps: usize,
+    /// Environment steps after which stored latents are recomputed while the VAE is still trained, so that a policy that learns meanwhile learns from codes of one
+    /// encoder. 0 recomputes them only when it is frozen, as in the paper. Default 0.
+    pub recode_steps: usize,
     /// VAE steps per environment step, done at the end of the epoch. Default 0.1.
     pub updates_per_step: f64,
     /// Depth images in a minibatch. Default 32.
@@ -29,6 +32,7 @@ impl Default for VaeSection {
     fn default() -> Self {
         Self {
             train_steps: 10_000,
+            recode_steps: 0,
             updates_per_step: 0.1,
             batch_size: 32,
             learning_rate: 1e-3,

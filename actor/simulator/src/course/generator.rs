@@ -61,11 +61,20 @@ pub enum GeneratedShape {
     T,
     /// Four to seven points, notches of 0.55 to 0.75 of the radius between them.
     Star,
+    /// Nine to fourteen corners around a centre, each at 0.4 to 1 of the radius: bays and points wherever they come to lie.
+    Blob,
 }
 
 impl GeneratedShape {
     /// Families for training.
-    pub const TRAINED: [Self; 5] = [Self::Rectangle, Self::Polygon, Self::Trapezoid, Self::T, Self::Star];
+    pub const TRAINED: [Self; 6] = [
+        Self::Rectangle,
+        Self::Polygon,
+        Self::Trapezoid,
+        Self::T,
+        Self::Star,
+        Self::Blob,
+    ];
 
     /// Families that training never shows: those of the gates in `configs/courses/non_rectangular.toml`.
     pub const HELD_OUT: [Self; 5] = [Self::Circle, Self::Triangle, Self::Diamond, Self::Cross, Self::L];
@@ -84,6 +93,7 @@ impl GeneratedShape {
             Self::Trapezoid => "trapezoid",
             Self::T => "t",
             Self::Star => "star",
+            Self::Blob => "blob",
         }
     }
 }
@@ -281,6 +291,13 @@ impl GeneratedShape {
                         let radius = if corner % 2 == 0 { 1.0 } else { notch };
                         polar(corner as f32 / (2 * points) as f32, radius)
                     })
+                    .collect();
+                Shape::Polygon { points_m }
+            }
+            Self::Blob => {
+                let corners = rng.random_range(9..=14);
+                let points_m = (0..corners)
+                    .map(|corner| polar(corner as f32 / corners as f32, rng.random_range(0.4..=1.0)))
                     .collect();
                 Shape::Polygon { points_m }
             }

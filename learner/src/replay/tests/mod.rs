@@ -26,7 +26,7 @@ fn config(capacity: usize, observation: Observation) -> Config {
 /// A buffer whose VAE is frozen from the start.
 fn frozen(config: &Config) -> Replay {
     let mut replay = Replay::new(config);
-    replay.freeze_latents(1, |_| Ok::<_, Infallible>(Vec::new())).unwrap();
+    replay.freeze();
     replay
 }
 
@@ -100,8 +100,8 @@ fn a_flight_stored_in_legs_is_the_flight_stored_whole() {
             whole.insert(flown).unwrap();
         }
         assert_eq!(legs.state(), whole.state());
-        legs.freeze_latents(4, encode).unwrap();
-        whole.freeze_latents(4, encode).unwrap();
+        legs.renew_latents(4, encode).unwrap();
+        whole.renew_latents(4, encode).unwrap();
         assert_eq!(legs.state(), whole.state());
     }
 }
@@ -308,7 +308,7 @@ fn images_are_dropped_when_the_vae_is_frozen_and_no_more_are_taken() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
     replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
     assert_eq!(replay.image_count(), Some(6));
-    replay.freeze_latents(4, encode).unwrap();
+    replay.freeze();
     replay.insert(with_images(flight(1, 5, Outcome::Collided))).unwrap();
     assert_eq!(replay.image_count(), None);
     assert_eq!(replay.state().images, None);
@@ -324,7 +324,7 @@ fn the_encoder_sees_pieces_of_one_size_whatever_the_flights_lengths() {
     }
     let mut pieces = Vec::new();
     replay
-        .freeze_latents(5, |images| {
+        .renew_latents(5, |images| {
             pieces.push(images.len() / IMAGE_PIXELS);
             encode(images)
         })
@@ -338,7 +338,7 @@ fn a_failed_encoder_leaves_everything_as_it_was() {
     replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
     let before = replay.state();
     let mut calls = 0;
-    let result = replay.freeze_latents(4, |images| {
+    let result = replay.renew_latents(4, |images| {
         calls += 1;
         if calls == 2 {
             Err("out of memory")

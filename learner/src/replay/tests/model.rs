@@ -159,7 +159,8 @@ proptest! {
         let (mut replay, mut model) = (Replay::new(&config), Model::new(&config));
         for (number, flight) in flights.iter().enumerate() {
             if number == freeze_after {
-                replay.freeze_latents(chunk, encode).unwrap();
+                replay.renew_latents(chunk, encode).unwrap();
+                replay.freeze();
                 model.set_latents(|vector| final_code(vector[0] as u8));
             }
             let images_live = replay.image_count().is_some();

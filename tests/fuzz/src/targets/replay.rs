@@ -56,7 +56,8 @@ fn restore(bytes: &[u8]) -> Verdict {
     // A flight more: taken in, or refused for want of room for its images.
     let _ = replay.insert(flight());
     let encode = |images: &[u8]| Ok::<_, ()>(vec![[0.5; LATENT]; images.len() / IMAGE_PIXELS]);
-    replay.freeze_latents(8, encode).unwrap();
+    replay.renew_latents(8, encode).unwrap();
+    replay.freeze();
     assert_eq!(replay.image_count(), None);
     Verdict::Accepted
 }

@@ -1,0 +1,66 @@
+//! A flight seen in a mirror: left and right change places.
+//!
+//! Corridor, drone and reward are the same on both sides, so what is seen in the mirror is a flight, too, through another course that nobody had to fly. Only a stereo camera has sides: its shadows
+//! lie to the left of what is near, and in the mirror to the right.
+
+use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_WIDTH};
+
+use crate::flight::{CommittedFlight, StepObservation};
+
+/// Places in the ground truth of what points to the left: both openings' offsets, the distance from the middle, the gust.
+const TO_THE_LEFT: [usize; 4] = [1, 5, 8, 13];
+
+impl CommittedFlight {
+    /// The flight in the mirror. Latent codes are the unmirrored flight's: whoever needs them encodes the mirrored images.
+    #[must_use]
+    pub fn mirrored(&self) -> Self {
+        let mut mirrored = self.without_images();
+        mirrored.action_before = turn(self.action_before);
+        mirrored.actions.iter_mut().for_each(|action| *action = turn(*action));
+        mirrored.observations.iter_mut().for_each(mirror);
+        mirrored.depth = self.depth.clone();
+        for row in mirrored
+            .depth
+            .iter_mut()
+            .flat_map(|depth| depth.chunks_exact_mut(IMAGE_WIDTH))
+        {
+            row.reverse();
+        }
+        mirrored
+    }
+}
+
+fn turn([left, up]: [f32; ACTION]) -> [f32; ACTION] {
+    [-left, up]
+}
+
+fn mirror(seen: &mut StepObservation) {
+    seen.position_m[1] *= -1.0;
+    seen.velocity_mps[1] *= -1.0;
+    // Roll and yaw are the other way round, pitch is not.
+    seen.orientation[0] *= -1.0;
+    seen.orientation[2] *= -1.0;
+    for place in TO_THE_LEFT {
+        seen.ground_truth[place] *= -1.0;
+    }
+}
+
+const _: () = assert!(TO_THE_LEFT[3] < GROUND_TRUTH);
+
+#[cfg(test)]
+mod tests {
+    use skein_protocol::IMAGE_PIXELS;
+    use skein_protocol::transition::Outcome;
+
+    use crate::flight::samples::{flight, with_images};
+
+    #[test]
+    fn a_flight_in_two_mirrors_is_the_flight() {
+        let mut flown = with_images(flight(3, 5, Outcome::Collided));
+        flown.depth.as_mut().unwrap()[IMAGE_PIXELS..][..3].copy_from_slice(&[1, 2, 3]);
+        let mirrored = flown.mirrored();
+        assert_eq!(mirrored.check(), Ok(()));
+        assert_ne!(mirrored, flown);
+        assert_eq!(mirrored.mirrored(), flown);
+    }
+}

@@ -1,0 +1,120 @@
+//! What `learning.mirror` takes for granted: flown with mirrored commands through a mirrored course, a flight is the mirror image of the flight, image by image.
+
+use std::sync::Arc;
+
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
+use skein_learner::flight::{CommittedFlight, StepObservation};
+use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
+use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
+use skein_simulator::course::{Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout};
+use skein_simulator::simulator::{Simulator, SimulatorSettings};
+
+const STEPS: usize = 15;
+
+/// Two openings without any symmetry, or their mirror images.
+fn course(side: f32) -> Course {
+    let wall = |label, x_m, centre_m: [f32; 2], points: [[f32; 2]; 5]| {
+        let mut points_m: Vec<_> = points.map(|[y_m, z_m]| [side * y_m, z_m]).into();
+        if side < 0.0 {
+            points_m.reverse();
+        }
+        WallLayout {
+            label: WallLabel(label),
+            x_m,
+            opening: Opening {
+                shape: Shape::Polygon { points_m },
+                centre_m: [side * centre_m[0], centre_m[1]],
+                rotation_deg: 0.0,
+            },
+        }
+    };
+    let start = StartArea {
+        jitter_y_m: 0.0,
+        jitter_z_m: 0.0,
+        ..StartArea::default()
+    };
+    let shape = [[-1.0, -1.2], [1.4, -1.0], [1.1, 0.9], [0.2, 1.5], [-1.3, 0.8]];
+    Course::new(CourseLayout {
+        name: "mirror".to_owned(),
+        corridor: Corridor::default(),
+        start,
+        wall_thickness_m: 0.3,
+        walls: vec![
+            wall(1, 10.0, [0.7, 3.9], shape),
+            wall(2, 20.0, [-0.9, 3.0], shape.map(|[y, z]| [z, y])),
+        ],
+    })
+    .expect("the course can be flown")
+}
+
+fn fly(side: f32) -> CommittedFlight {
+    let mut simulator =
+        Simulator::new(Arc::new(course(side)), &SimulatorSettings::default()).expect("the default settings are sound");
+    let [mut start, mut calm] = [1, 2].map(Pcg64Mcg::seed_from_u64);
+    simulator
+        .reset(1, &mut start, &mut calm)
+        .expect("every course has a first level");
+    let (mut observations, mut actions, mut depth) = (Vec::new(), Vec::new(), Vec::new());
+    for step in 0..=STEPS {
+        let mut image = [0; IMAGE_PIXELS];
+        simulator.render(&mut image);
+        depth.extend_from_slice(&image);
+        let state = simulator.state();
+        observations.push(StepObservation {
+            latent: [0.0; LATENT],
+            velocity_mps: state.velocity_mps.into(),
+            position_m: state.position_m.coords.into(),
+            orientation: state.world_from_body.coords.into(),
+            ground_truth: simulator.ground_truth().numbers(),
+        });
+        if step < STEPS {
+            let phase = step as f32;
+            let action = [side * (0.7 * phase).sin(), (0.4 * phase).cos()];
+            simulator.step(action).expect("nothing is hit so soon");
+            actions.push(action);
+        }
+    }
+    CommittedFlight {
+        flight: FlightId(0),
+        epoch: Epoch(0),
+        policy_version: PolicyVersion(0),
+        actor: ActorId(0),
+        level: 1,
+        first_step: 0,
+        action_before: [0.0; ACTION],
+        observations,
+        rewards: vec![0.0; STEPS],
+        reward_terms: vec![[0.0; 4]; STEPS],
+        level_up: vec![false; STEPS],
+        outcome: None,
+        walls_passed: 0,
+        course_walls: 0,
+        hit_wall: None,
+        depth: Some(depth),
+        actions,
+    }
+}
+
+#[test]
+fn the_mirror_image_of_a_flight_is_the_flight_through_the_mirrored_course() {
+    let (mirrored, flown) = (fly(1.0).mirrored(), fly(-1.0));
+    assert_eq!(mirrored.actions, flown.actions);
+    for (step, (one, other)) in mirrored.observations.iter().zip(&flown.observations).enumerate() {
+        for (what, one, other) in [
+            ("position", &one.position_m[..], &other.position_m[..]),
+            ("velocity", &one.velocity_mps, &other.velocity_mps),
+            ("orientation", &one.orientation, &other.orientation),
+            ("ground truth", &one.ground_truth, &other.ground_truth),
+        ] {
+            let apart = one.iter().zip(other).map(|(one, other)| (one - other).abs());
+            let most = apart.fold(0.0, f32::max);
+            assert!(most < 2e-3, "step {step}: {what} {one:?} and {other:?}");
+        }
+    }
+    let images = mirrored.depth.unwrap().into_iter().zip(flown.depth.unwrap());
+    let off = images.filter(|(one, other)| one.abs_diff(*other) > 1).count();
+    // Silhouettes may come to lie on the other side of a pixel's centre.
+    let pixels = (STEPS + 1) * IMAGE_PIXELS;
+    assert!(off < pixels / 200, "{off} of {pixels} pixels differ");
+}
