@@ -43,6 +43,8 @@ pub struct PlannedRun {
     pub overrides: Vec<String>,
     /// Its configuration as the experiment has it now.
     pub config: Config,
+    /// The result of the experiment's suite, if it has one; the file may not be there.
+    pub suite_json: Option<PathBuf>,
     /// What is there of it.
     pub state: State,
 }
@@ -56,6 +58,8 @@ pub enum State {
     Begun,
     /// Somebody is at it.
     UnderWay,
+    /// All of its training, and no result of the suite.
+    Trained,
     /// All of it.
     Complete,
 }
@@ -168,10 +172,13 @@ fn planned(experiment: &Experiment, root: &Path, number: usize, seed: u64) -> Pl
     let name = format!("{}/seed-{seed}", arm.name);
     let mut config = arm.config.clone();
     config.run.seed = seed;
+    let directory = RunDirectory::new(root.join(&name));
+    let suite = experiment.suite.as_ref();
     PlannedRun {
         arm: number,
         seed,
-        directory: RunDirectory::new(root.join(&name)),
+        suite_json: suite.map(|suite| directory.suite_json(&suite.result_name)),
+        directory,
         name,
         overrides: [&arm.overrides[..], &[format!("run.seed={seed}")]].concat(),
         config,
@@ -210,7 +217,8 @@ impl PlannedRun {
             ));
         }
         if Summary::of(&self.directory).is_some_and(|summary| summary.ending == Ending::Completed) {
-            return Ok(State::Complete);
+            let is_flown = self.suite_json.as_ref().is_none_or(|result| result.is_file());
+            return Ok(if is_flown { State::Complete } else { State::Trained });
         }
         match self.directory.is_under_way() {
             Ok(false) => Ok(State::Begun),
