@@ -148,8 +148,10 @@ impl Standing {
     }
 
     fn figures(&self) -> String {
+        if self.stage == Stage::Suite {
+            return "flying the suite".to_owned();
+        }
         let mut text = match self.flights >= self.total_flights {
-            _ if self.stage == Stage::Suite => return "flying the suite".to_owned(),
             true => "evaluating".to_owned(),
             false => format!("flight {}/{}", self.flights, self.total_flights),
         };
