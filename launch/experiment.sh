@@ -11,7 +11,8 @@ Usage: launch/experiment.sh NAME [--seeds K] [--jobs J] [--flights N] [--runs DI
 Builds Skein and trains every arm of the experiment configs/experiments/NAME.toml with several seeds: ordinary runs in
 runs/experiments/NAME/ARM/seed-N, side by side, one core each. Then tells what they came to, in tables and pictures with 95 %
 intervals over the seeds, in runs/experiments/NAME/report/. The same command goes on with what was interrupted or failed, and
-leaves alone what is complete. What a run says goes to ARM/seed-N.log.
+leaves alone what is complete. What a run says goes to ARM/seed-N.log. If the experiment names an evaluation suite, the best
+snapshot of every run flies it once the run is trained; the run is complete only then.
 
 Options:
   --list       print the experiments, how many runs each is, and what it is to find out
@@ -24,7 +25,8 @@ Options:
                launch/pictures/experiments/
   -h, --help   this text
 
-Ctrl-C stops in order: every run under way finishes the updates of its epoch and saves. A second Ctrl-C stops at once.
+Ctrl-C stops in order: every training under way finishes the updates of its epoch and saves; a suite under way is flown anew
+the next time. A second Ctrl-C stops at once.
 
 Exit status: 0 every run is complete, 1 a run failed or something was refused, 2 called wrongly, 130 interrupted.
 END

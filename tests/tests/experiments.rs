@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use skein_launch::inspection::compare;
+use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::summary::{Ending, Summary};
 use skein_tests::{Output, Recipe, flights, leftovers, program, repository, run_program};
@@ -30,6 +31,7 @@ impl Scene {
             folder: tempfile::tempdir().unwrap(),
         };
         fs::create_dir_all(scene.path("configs/experiments")).unwrap();
+        scene.write_suite(5);
         fs::write(scene.path("RESULTS.md"), "# Results\n\nBefore.\n").unwrap();
         scene.write("0.5");
         scene
@@ -39,12 +41,22 @@ impl Scene {
     fn write(&self, share: &str) {
         let base = repository().join("tests/small.toml");
         let text = format!(
-            "question = \"What for?\"\nbase = {base:?}\nseeds = 2\ntables = [\"evaluation\", \"outcomes\", \"learning\", \"cost\"]\n\
+            "question = \"What for?\"\nbase = {base:?}\nseeds = 2\nsuite = \"../few.toml\"\ntables = [\"evaluation\", \"outcomes\", \"suite\", \"learning\", \"cost\"]\n\
              curves = [{{ measure = \"walls_passed\", over = \"flights\" }}]\nsettings.run.flights = 60\nsettings.evaluation.window_flights = 10\n\
              [[arm]]\nname = \"one-part\"\nlabel = \"one part\"\nsettings.replay.success_share = 0.0\n\
              [[arm]]\nname = \"half\"\nlabel = \"half\"\nsettings.replay.success_share = {share}\n"
         );
         fs::write(self.path("configs/experiments/tiny.toml"), text).unwrap();
+    }
+
+    /// Writes the experiment's suite: this many flights of each entry.
+    fn write_suite(&self, flights: u64) {
+        let course = repository().join("configs/courses/training.toml");
+        let text = format!(
+            "name = \"few\"\nflights = {flights}\n[[entry]]\nname = \"as it is\"\ncourse = {course:?}\n\
+             [[entry]]\nname = \"in any order\"\norders_of = {course:?}\ndisturbances.latency_periods = 1\n"
+        );
+        fs::write(self.path("configs/few.toml"), text).unwrap();
     }
 
     fn path(&self, within: &str) -> PathBuf {
@@ -132,6 +144,8 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
         "| one part |",
         "`replay.success_share=0.0`",
         "non_rectangular",
+        "flew the suite `few.toml`",
+        "| in any order |     2 |       5 |",
         "| hit wall 1, 2, … | hit the corridor | timed out |",
         "2 seeds an arm",
     ] {
@@ -153,6 +167,7 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
     }
 
     assert_published(&scene, &text);
+    assert_only_the_suite_is_flown_again(&scene, &runs);
     assert_refused_when_changed(&scene);
 }
 
@@ -169,6 +184,85 @@ fn assert_published(scene: &Scene, report: &str) {
     assert!(results.contains(picture) && scene.path(picture).is_file());
     let published = results.replace("launch/pictures/experiments/tiny_", "");
     assert!(published.contains(report.trim_end()), "{published}\n---\n{report}");
+}
+
+/// What came of the suites of a run.
+fn suite_results(run: &RunDirectory) -> Vec<PathBuf> {
+    let folder = run.suite_json("any");
+    let entries = fs::read_dir(folder.parent().unwrap()).unwrap();
+    let mut results: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
+    results.sort();
+    results
+}
+
+/// A run that is trained flies its suite and nothing else, whatever kept it from that before: it failed, was interrupted, or is another suite now.
+fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
+    let files = |run: &RunDirectory| {
+        [run.summary_json(), run.flights_csv()].map(|file| fs::metadata(file).unwrap().modified().unwrap())
+    };
+    let before: Vec<_> = runs.iter().map(files).collect();
+    let result = suite_results(&runs[1]).pop().unwrap();
+    let flown = fs::read(&result).unwrap();
+    let report: EvaluationReport = serde_json::from_slice(&flown).unwrap();
+    let entries: Vec<_> = report
+        .courses
+        .iter()
+        .map(|entry| (entry.course.as_str(), entry.flights))
+        .collect();
+    assert_eq!(entries, [("as it is", 5), ("in any order", 5)]);
+
+    // It fails, as a run does.
+    fs::remove_file(&result).unwrap();
+    let snapshots = [runs[1].snapshots(), runs[1].root().join("aside")];
+    fs::rename(&snapshots[0], &snapshots[1]).unwrap();
+    let output = scene.finish(&[]);
+    assert_eq!(output.code, Some(1), "{}", output.stderr);
+    for part in [
+        "4 runs of 2 arms with 2 seeds each, 3 complete already, 1 trained already",
+        "half/seed-1 failed: its `skein-evaluate` exited with status 1",
+        "holds neither snapshots/best.safetensors",
+        "the same command tries them again",
+    ] {
+        assert!(
+            output.stderr.contains(part),
+            "`{part}` is missing in\n{}",
+            output.stderr
+        );
+    }
+    assert!(output.stdout.contains("**Not all of it**: 3 of 4 runs are complete."));
+    fs::rename(&snapshots[1], &snapshots[0]).unwrap();
+    let output = scene.finish(&[]);
+    assert_eq!(output.code, Some(0), "{}", output.stderr);
+    assert!(
+        output.stderr.contains("half/seed-1 is complete: it completed "),
+        "{}",
+        output.stderr
+    );
+    assert!(!output.stderr.contains("half/seed-1 is trained"), "{}", output.stderr);
+    assert_eq!(
+        fs::read(&result).unwrap(),
+        flown,
+        "the same flights came to something else"
+    );
+
+    // Another suite of the same name, too long to be flown to its end, is interrupted; the results of the first are as good as they were.
+    scene.write_suite(1_000_000);
+    let mut experiment = scene.start();
+    until("a suite is flown", || {
+        let said = fs::read_to_string(runs[0].root().with_extension("log")).unwrap();
+        said.contains("1000000 flights on each of 2 courses").then_some(())
+    });
+    kill_process(Pid::from_raw(experiment.id().cast_signed()).unwrap(), Signal::INT).unwrap();
+    let status = until("the experiment stops", || experiment.try_wait().unwrap());
+    assert_eq!(status.code(), Some(130));
+    scene
+        .finish(&["--report"])
+        .assert_refused(&["no run in", "tiny is complete"]);
+    scene.write_suite(5);
+    let output = scene.finish(&["--report"]);
+    assert_eq!(output.code, Some(0), "{}", output.stderr);
+    assert_eq!(suite_results(&runs[1]), [result]);
+    assert_eq!(runs.iter().map(files).collect::<Vec<_>>(), before, "trained again");
 }
 
 /// What was learned from another configuration is never mixed with what the file says now, and never removed.

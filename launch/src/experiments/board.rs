@@ -13,11 +13,22 @@ use crate::display::{Clock, bar_on_terminal};
 /// Between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
 
+/// What is done for a run, in order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stage {
+    /// It is trained, and flies its evaluation courses.
+    Training,
+    /// Its best snapshot flies the experiment's suite.
+    Suite,
+}
+
 /// How far one run has come.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Standing {
     /// The run.
     pub name: String,
+    /// What is done for it.
+    pub stage: Stage,
     /// Training flights learned from.
     pub flights: u64,
     /// Training flights of the whole run.
@@ -137,6 +148,9 @@ impl Standing {
     }
 
     fn figures(&self) -> String {
+        if self.stage == Stage::Suite {
+            return "flying the suite".to_owned();
+        }
         let mut text = match self.flights >= self.total_flights {
             true => "evaluating".to_owned(),
             false => format!("flight {}/{}", self.flights, self.total_flights),
@@ -162,15 +176,24 @@ mod tests {
             under_way: vec![
                 Standing {
                     name: "none/seed-2".to_owned(),
+                    stage: Stage::Training,
                     flights: 50,
                     total_flights: 100,
                     walls_passed: Some(1.234),
                 },
                 Standing {
                     name: "half/seed-10".to_owned(),
+                    stage: Stage::Training,
                     flights: 100,
                     total_flights: 100,
                     walls_passed: None,
+                },
+                Standing {
+                    name: "half/seed-9".to_owned(),
+                    stage: Stage::Suite,
+                    flights: 100,
+                    total_flights: 100,
+                    walls_passed: Some(4.5),
                 },
             ],
         };
@@ -182,7 +205,7 @@ mod tests {
         assert_eq!(head(&progress, 60.0, 600), "3 of 12 runs complete · 1:00");
         assert_eq!(
             lines(&progress.under_way),
-            "\n  none/seed-2   flight 50/100, walls passed 1.23\n  half/seed-10  evaluating"
+            "\n  none/seed-2   flight 50/100, walls passed 1.23\n  half/seed-10  evaluating\n  half/seed-9   flying the suite"
         );
     }
 }

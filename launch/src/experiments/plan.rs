@@ -43,6 +43,8 @@ pub struct PlannedRun {
     pub overrides: Vec<String>,
     /// Its configuration as the experiment has it now.
     pub config: Config,
+    /// The result of the experiment's suite, if it has one; the file may not be there.
+    pub suite_json: Option<PathBuf>,
     /// What is there of it.
     pub state: State,
 }
@@ -56,6 +58,8 @@ pub enum State {
     Begun,
     /// Somebody is at it.
     UnderWay,
+    /// All of its training, and no result of the suite.
+    Trained,
     /// All of it.
     Complete,
 }
@@ -168,10 +172,13 @@ fn planned(experiment: &Experiment, root: &Path, number: usize, seed: u64) -> Pl
     let name = format!("{}/seed-{seed}", arm.name);
     let mut config = arm.config.clone();
     config.run.seed = seed;
+    let directory = RunDirectory::new(root.join(&name));
+    let suite = experiment.suite.as_ref();
     PlannedRun {
         arm: number,
         seed,
-        directory: RunDirectory::new(root.join(&name)),
+        suite_json: suite.map(|suite| directory.suite_json(&suite.result_name)),
+        directory,
         name,
         overrides: [&arm.overrides[..], &[format!("run.seed={seed}")]].concat(),
         config,
@@ -210,7 +217,8 @@ impl PlannedRun {
             ));
         }
         if Summary::of(&self.directory).is_some_and(|summary| summary.ending == Ending::Completed) {
-            return Ok(State::Complete);
+            let is_flown = self.suite_json.as_ref().is_none_or(|result| result.is_file());
+            return Ok(if is_flown { State::Complete } else { State::Trained });
         }
         match self.directory.is_under_way() {
             Ok(false) => Ok(State::Begun),
@@ -249,13 +257,21 @@ mod tests {
     use crate::prepare::prepare;
 
     fn experiment(folder: &Path, share: &str) -> Experiment {
+        experiment_with(folder, share, "tables = []")
+    }
+
+    fn experiment_with(folder: &Path, share: &str, keys: &str) -> Experiment {
         let base: PathBuf = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/smoke.toml");
         let text = format!(
-            "question = \"?\"\nbase = {base:?}\nseeds = 2\ntables = []\ncurves = []\n[[arm]]\nname = \"a\"\nlabel = \"A\"\nsettings.replay.success_share = {share}\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n"
+            "question = \"?\"\nbase = {base:?}\nseeds = 2\n{keys}\ncurves = []\n[[arm]]\nname = \"a\"\nlabel = \"A\"\nsettings.replay.success_share = {share}\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n"
         );
         fs::write(folder.join("test.toml"), text).unwrap();
         Experiment::load(folder, "test", None).unwrap()
     }
+
+    const SUMMARY: &str = r#"{"skein_version":"0","run":7,"seed":2,"ending":"ENDING","policy_sha256":"","final_version":8,"best_version":7,
+        "best_confirmed_walls_passed":4.9,"flights":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_flights":4,
+        "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
 
     fn begin(run: &PlannedRun, experiment: &Experiment) {
         prepare(&experiment.base, &run.overrides, run.directory.root(), ACTORS).unwrap();
@@ -279,11 +295,8 @@ mod tests {
         let plan = Plan::new(&experiment, &root, 2).unwrap();
         begin(&plan.runs[0], &experiment);
         begin(&plan.runs[3], &experiment);
-        let summary = r#"{"skein_version":"0","run":7,"seed":2,"ending":"ENDING","policy_sha256":"","final_version":8,"best_version":7,
-            "best_confirmed_walls_passed":4.9,"flights":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_flights":4,
-            "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
         let states = |ending| {
-            fs::write(plan.runs[3].directory.summary_json(), summary.replace("ENDING", ending)).unwrap();
+            fs::write(plan.runs[3].directory.summary_json(), SUMMARY.replace("ENDING", ending)).unwrap();
             let plan = Plan::new(&experiment, &root, 2).unwrap();
             plan.runs.iter().map(|run| run.state).collect::<Vec<_>>()
         };
@@ -295,6 +308,31 @@ mod tests {
             states("completed"),
             [State::Begun, State::New, State::New, State::Complete]
         );
+    }
+
+    #[test]
+    fn a_run_is_complete_when_its_suite_was_flown_and_not_another() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("runs");
+        let suite = |flights: u64| {
+            let course = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/courses/training.toml");
+            let text =
+                format!("name = \"few\"\nflights = {flights}\n[[entry]]\nname = \"12345\"\ncourse = {course:?}\n");
+            fs::write(folder.path().join("few.toml"), text).unwrap();
+            let experiment = experiment_with(folder.path(), "0.25", "tables = [\"suite\"]\nsuite = \"few.toml\"");
+            (Plan::new(&experiment, &root, 1).unwrap(), experiment)
+        };
+        let (plan, experiment) = suite(5);
+        let run = &plan.runs[0];
+        begin(run, &experiment);
+        assert_eq!(suite(5).0.runs[0].state, State::Begun);
+        fs::write(run.directory.summary_json(), SUMMARY.replace("ENDING", "completed")).unwrap();
+        assert_eq!(suite(5).0.runs[0].state, State::Trained);
+        let result = run.suite_json.as_ref().unwrap();
+        fs::create_dir(result.parent().unwrap()).unwrap();
+        fs::write(result, "").unwrap();
+        assert_eq!(suite(5).0.runs[0].state, State::Complete);
+        assert_eq!(suite(6).0.runs[0].state, State::Trained);
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use skein_protocol::config::Config;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::summary::Summary;
@@ -24,6 +25,8 @@ pub struct RunResult {
     pub summary: Summary,
     /// How its best snapshot flew.
     pub evaluation: EvaluationReport,
+    /// How it flew the experiment's suite, if it has one and this was flown.
+    pub suite: Option<EvaluationReport>,
     /// Its training flights, in order.
     pub(super) flights: Vec<FlightRow>,
     window: usize,
@@ -36,6 +39,14 @@ pub enum ResultError {
     /// A file is not there, or not what it should be.
     #[error("{}: {problem}; to have the run done again, move its directory away", path.display())]
     File {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// The result of the suite is not there, or not what it should be.
+    #[error("{}: {problem}; to have the suite flown again, move this file away", path.display())]
+    Suite {
         /// The file.
         path: PathBuf,
         /// What is wrong with it.
@@ -54,24 +65,34 @@ pub fn read(plan: &Plan) -> Result<Vec<RunResult>, ResultError> {
     plan.runs
         .iter()
         .filter(|run| run.state == State::Complete)
-        .map(RunResult::of)
+        .map(|run| RunResult::trained(run)?.with_suite(run))
         .collect()
 }
 
 impl RunResult {
-    pub(super) fn of(run: &PlannedRun) -> Result<Self, ResultError> {
+    /// What its training came to.
+    pub(super) fn trained(run: &PlannedRun) -> Result<Self, ResultError> {
         let Config {
             evaluation, learning, ..
         } = &run.config;
         Ok(Self {
             arm: run.arm,
             seed: run.seed,
-            summary: json(&run.directory.summary_json())?,
-            evaluation: json(&run.directory.evaluation_json())?,
+            summary: of_training(&run.directory.summary_json())?,
+            evaluation: of_training(&run.directory.evaluation_json())?,
+            suite: None,
             flights: read_flights(&run.directory.flights_csv())?,
             window: evaluation.window_flights as usize,
             warmup_steps: learning.warmup_steps as u64,
         })
+    }
+
+    /// The same with what came of the experiment's suite, if it has one.
+    fn with_suite(mut self, run: &PlannedRun) -> Result<Self, ResultError> {
+        if let Some(path) = &run.suite_json {
+            self.suite = Some(of_suite(path)?);
+        }
+        Ok(self)
     }
 
     /// Walls passed a flight over the last window of training flights; `None` if there were none.
@@ -142,11 +163,22 @@ impl RunResult {
     }
 }
 
-fn json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, ResultError> {
-    let problem = |problem: String| ResultError::File {
+fn of_training<T: DeserializeOwned>(path: &Path) -> Result<T, ResultError> {
+    json(path).map_err(|problem| ResultError::File {
         path: path.to_owned(),
         problem,
-    };
-    let bytes = fs::read(path).map_err(|error| problem(error.to_string()))?;
-    serde_json::from_slice(&bytes).map_err(|error| problem(error.to_string()))
+    })
+}
+
+/// How a suite was flown.
+pub(super) fn of_suite(path: &Path) -> Result<EvaluationReport, ResultError> {
+    json(path).map_err(|problem| ResultError::Suite {
+        path: path.to_owned(),
+        problem,
+    })
+}
+
+fn json<T: DeserializeOwned>(path: &Path) -> Result<T, String> {
+    let bytes = fs::read(path).map_err(|error| error.to_string())?;
+    serde_json::from_slice(&bytes).map_err(|error| error.to_string())
 }

@@ -1,26 +1,28 @@
-//! Runs side by side: as many at a time as there are cores for, each by a `skein run` of its own, exactly as a user would start it.
+//! Runs side by side: as many at a time as there are cores for, each by a `skein run` of its own, exactly as a user would start it. Once one is trained, its
+//! best snapshot flies the experiment's suite, by a `skein-evaluate` of its own.
 //!
 //! A run that fails is told and the others go on. An interruption is passed on to every run under way, which stops in order and can be gone on with; no
-//! other is begun then.
+//! other is begun then. A suite that was not flown to its end is flown from its beginning the next time.
 
 use std::collections::VecDeque;
 use std::fs::{self, OpenOptions};
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process};
+use skein_protocol::durable;
 use skein_protocol::run::RunDirectory;
 use tokio::process::{Child, Command};
 use tokio::sync::mpsc;
 use tokio::time::sleep;
 
-use super::board::{Board, Progress, Standing};
-use super::definition::Experiment;
+use super::board::{Board, Progress, Stage, Standing};
+use super::definition::{Experiment, FlownSuite};
 use super::plan::{ACTORS, Plan, PlannedRun, State};
 use crate::display::Clock;
-use crate::experiments::results::RunResult;
+use crate::experiments::results::{RunResult, of_suite};
 use crate::interrupts::INTERRUPTED;
 use crate::orphans::signal_when_orphaned;
 use crate::reports::curves::{FlightRow, trailing_mean};
@@ -36,6 +38,8 @@ const LOOKS_A_UPDATE: u32 = 5;
 pub struct Manner<'a> {
     /// The program `skein`.
     pub skein: &'a Path,
+    /// The program `skein-evaluate`.
+    pub evaluate: &'a Path,
     /// Runs at a time.
     pub jobs: usize,
 }
@@ -53,6 +57,7 @@ struct UnderWay<'a> {
     /// Its place in the plan.
     place: usize,
     run: &'a PlannedRun,
+    stage: Stage,
     child: Child,
 }
 
@@ -67,21 +72,30 @@ pub async fn run(
 ) -> Session {
     let mut session = Session::default();
     // Of an earlier session that was killed before it came to it.
-    for run in plan.runs.iter().filter(|run| run.state == State::Complete) {
+    let is_trained = |run: &&PlannedRun| [State::Trained, State::Complete].contains(&run.state);
+    for run in plan.runs.iter().filter(is_trained) {
         remove_checkpoints(run, board);
     }
-    let incomplete = |(_, run): &(usize, &PlannedRun)| run.state != State::Complete;
-    let mut waiting: VecDeque<_> = plan.runs.iter().enumerate().filter(incomplete).collect();
+    let mut waiting = waiting(plan);
     let mut under_way: Vec<UnderWay<'_>> = Vec::new();
     let mut tally = Tally::of(plan);
     for look in 0_u32.. {
         while under_way.len() < manner.jobs
             && session.interruptions == 0
-            && let Some((place, run)) = waiting.pop_front()
+            && let Some((place, run, stage)) = waiting.pop_front()
         {
-            match start(experiment, run, manner.skein) {
-                Ok(child) => under_way.push(UnderWay { place, run, child }),
-                Err(error) => session.fail(run, &format!("cannot be started: {error}"), board),
+            let (what, started) = match (stage, &experiment.suite) {
+                (Stage::Suite, Some(suite)) => ("its suite", fly(suite, run, manner.evaluate)),
+                _ => ("it", train(experiment, run, manner.skein)),
+            };
+            match started {
+                Ok(child) => under_way.push(UnderWay {
+                    place,
+                    run,
+                    stage,
+                    child,
+                }),
+                Err(error) => session.fail(run, &format!("{what} cannot be started: {error}"), board),
             }
         }
         if under_way.is_empty() {
@@ -94,8 +108,11 @@ pub async fn run(
         under_way.retain_mut(|one| match one.child.try_wait() {
             Ok(None) => true,
             Ok(Some(status)) => {
-                let ending = session.ended(one.run, status.code(), board);
+                let ending = session.ended(one, status.code(), board);
                 tally.ended(one, ending);
+                if (one.stage, ending) == (Stage::Training, State::Trained) {
+                    waiting.push_front((one.place, one.run, Stage::Suite));
+                }
                 false
             }
             Err(error) => {
@@ -110,15 +127,20 @@ pub async fn run(
     session
 }
 
-/// Starts a run, or goes on with it. Whatever it says goes to the file beside its directory.
-///
-/// It leads a process group of its own: Ctrl-C in the terminal reaches this process alone, which passes it on once. Should this process die, the kernel
-/// interrupts it, and it stops in order.
-fn start(experiment: &Experiment, run: &PlannedRun, skein: &Path) -> io::Result<Child> {
-    let said = run.said();
-    if let Some(folder) = said.parent() {
-        fs::create_dir_all(folder)?;
-    }
+/// What is to be done, in the order of `plan`. What is trained needs the suite alone.
+fn waiting(plan: &Plan) -> VecDeque<(usize, &PlannedRun, Stage)> {
+    let stage = |run: &PlannedRun| match run.state {
+        State::Complete => None,
+        State::Trained => Some(Stage::Suite),
+        State::New | State::Begun | State::UnderWay => Some(Stage::Training),
+    };
+    let runs = plan.runs.iter().enumerate();
+    runs.filter_map(|(place, run)| Some((place, run, stage(run)?)))
+        .collect()
+}
+
+/// Starts a run, or goes on with it.
+fn train(experiment: &Experiment, run: &PlannedRun, skein: &Path) -> io::Result<Child> {
     let mut command = Command::new(skein);
     command.arg("run");
     let mut log = OpenOptions::new();
@@ -131,9 +153,47 @@ fn start(experiment: &Experiment, run: &PlannedRun, skein: &Path) -> io::Result<
         command.args(run.overrides.iter().flat_map(|setting| ["--set", setting]));
         log.write(true).truncate(true);
     }
-    let log = log.create(true).open(said)?;
+    command.args(["--actors", &ACTORS.to_string()]);
+    spawn(command, &log, run)
+}
+
+/// Flies the suite with the best snapshot of a run. What comes of it is brought to its place when it is whole: see [`Session::flown`].
+fn fly(suite: &FlownSuite, run: &PlannedRun, evaluate: &Path) -> io::Result<Child> {
+    // It is read again by the other program, and training takes hours.
+    if FlownSuite::load(&suite.path).as_ref() != Ok(suite) {
+        let file = suite.path.display();
+        return Err(io::Error::other(format!(
+            "{file} is not what it was when the experiment was begun: begin it again"
+        )));
+    }
+    let result = run.directory.suite_json(&suite.result_name);
+    if let Some(folder) = result.parent() {
+        durable::create_private_directory(folder)?;
+    }
+    let mut command = Command::new(evaluate);
+    command.arg("--run").arg(run.directory.root());
+    command.arg("--suite").arg(&suite.path);
+    command.arg("--json").arg(unfinished(&result));
+    command.args(["--threads", "1"]);
+    spawn(command, OpenOptions::new().append(true), run)
+}
+
+/// What `skein-evaluate` writes, before it is known to be whole.
+fn unfinished(result: &Path) -> PathBuf {
+    result.with_extension("part")
+}
+
+/// Starts a program for a run. Whatever it says goes to the file beside the run's directory.
+///
+/// It leads a process group of its own: Ctrl-C in the terminal reaches this process alone, which passes it on once. Should this process die, the kernel
+/// interrupts it, and it stops in order.
+fn spawn(mut command: Command, log: &OpenOptions, run: &PlannedRun) -> io::Result<Child> {
+    let said = run.said();
+    if let Some(folder) = said.parent() {
+        fs::create_dir_all(folder)?;
+    }
+    let log = log.clone().create(true).open(said)?;
     command
-        .args(["--actors", &ACTORS.to_string()])
         .stdin(Stdio::null())
         .stdout(log.try_clone()?)
         .stderr(log)
@@ -147,7 +207,7 @@ impl Session {
         self.interruptions += 1;
         let signal = match self.interruptions {
             1 => {
-                board.say("stopping in order: every run finishes the updates of its epoch; Ctrl-C again stops at once, without saving");
+                board.say("stopping in order: every training finishes the updates of its epoch; Ctrl-C again stops at once, without saving");
                 Signal::INT
             }
             2 => Signal::INT,
@@ -161,13 +221,21 @@ impl Session {
         }
     }
 
-    fn ended(&mut self, run: &PlannedRun, code: Option<i32>, board: &Board) -> State {
-        let how = match code {
-            Some(0) => return self.completed(run, board),
-            Some(code) if code == i32::from(INTERRUPTED) && self.interruptions > 0 => return State::Begun,
-            None if self.interruptions > 2 => return State::Begun,
-            Some(code) => format!("its `skein run` exited with status {code}"),
-            None => "its `skein run` was killed".to_owned(),
+    /// What is there of a run after one of its programs ended.
+    fn ended(&mut self, one: &UnderWay<'_>, code: Option<i32>, board: &Board) -> State {
+        let UnderWay { run, stage, .. } = *one;
+        // `skein-evaluate` has nothing to put in order: the first interruption ends it.
+        let (program, before, kills) = match stage {
+            Stage::Training => ("skein run", State::Begun, 3),
+            Stage::Suite => ("skein-evaluate", State::Trained, 1),
+        };
+        let how = match (code, stage) {
+            (Some(0), Stage::Training) => return self.trained(run, board),
+            (Some(0), Stage::Suite) => return self.flown(run, board),
+            (Some(code), _) if code == i32::from(INTERRUPTED) && self.interruptions > 0 => return before,
+            (None, _) if self.interruptions >= kills => return before,
+            (Some(code), _) => format!("its `{program}` exited with status {code}"),
+            (None, _) => format!("its `{program}` was killed"),
         };
         let said = run.said();
         self.fail(
@@ -175,11 +243,11 @@ impl Session {
             &format!("{how}; {} ends with\n{}", said.display(), log_tail(&said)),
             board,
         );
-        State::Begun
+        before
     }
 
-    fn completed(&mut self, run: &PlannedRun, board: &Board) -> State {
-        let result = match RunResult::of(run) {
+    fn trained(&mut self, run: &PlannedRun, board: &Board) -> State {
+        let result = match RunResult::trained(run) {
             Ok(result) => result,
             Err(error) => {
                 self.fail(run, &error.to_string(), board);
@@ -191,9 +259,41 @@ impl Session {
             format!(", R {:.3} on {}", course.r, course.course)
         });
         let wall = Clock(result.summary.wall_secs);
-        board.say(&format!("{} is complete after {wall}{flown}", run.name));
+        let (what, state) = match &run.suite_json {
+            None => ("complete", State::Complete),
+            Some(_) => ("trained", State::Trained),
+        };
+        board.say(&format!("{} is {what} after {wall}{flown}", run.name));
         remove_checkpoints(run, board);
-        State::Complete
+        state
+    }
+
+    /// Brings the result of a suite to its place: a file that is there is whole.
+    fn flown(&mut self, run: &PlannedRun, board: &Board) -> State {
+        let Some(result) = &run.suite_json else {
+            return State::Complete;
+        };
+        let unfinished = unfinished(result);
+        let report = of_suite(&unfinished).map_err(|error| error.to_string());
+        let kept = report.and_then(|report| {
+            let moved = durable::sync(&unfinished).and_then(|()| fs::rename(&unfinished, result));
+            moved.map_err(|error| format!("{}: {error}", result.display()))?;
+            Ok(report)
+        });
+        match kept {
+            Ok(report) => {
+                let entries = report.courses.iter();
+                let rates: Vec<_> = entries
+                    .map(|entry| format!("{:.1} % of \"{}\"", 100.0 * entry.completed, entry.course))
+                    .collect();
+                board.say(&format!("{} is complete: it completed {}", run.name, rates.join(", ")));
+                State::Complete
+            }
+            Err(problem) => {
+                self.fail(run, &problem, board);
+                State::Trained
+            }
+        }
     }
 
     fn fail(&mut self, run: &PlannedRun, why: &str, board: &Board) {
@@ -212,7 +312,7 @@ struct Tally {
 impl Tally {
     fn of(plan: &Plan) -> Self {
         let flights = |run: &PlannedRun| match run.state {
-            State::Complete => run.config.run.flights,
+            State::Trained | State::Complete => run.config.run.flights,
             State::New => 0,
             State::Begun | State::UnderWay => flown(&run.directory).len() as u64,
         };
@@ -229,11 +329,12 @@ impl Tally {
 
     fn progress(&mut self, plan: &Plan, under_way: &[UnderWay<'_>]) -> Progress {
         let mut standings = Vec::with_capacity(under_way.len());
-        for &UnderWay { place, run, .. } in under_way {
+        for &UnderWay { place, run, stage, .. } in under_way {
             let walls = flown(&run.directory);
             self.flights[place] = walls.len() as u64;
             standings.push(Standing {
                 name: run.name.clone(),
+                stage,
                 flights: walls.len() as u64,
                 total_flights: run.config.run.flights,
                 walls_passed: trailing_mean(&walls, run.config.evaluation.window_flights as usize).pop(),
@@ -260,7 +361,7 @@ fn flown(run: &RunDirectory) -> Vec<f64> {
         .collect()
 }
 
-/// Nothing goes on from a run that is complete, and its checkpoints are most of what it takes of the disk.
+/// Nothing goes on from a run that is trained, and its checkpoints are most of what it takes of the disk.
 fn remove_checkpoints(run: &PlannedRun, board: &Board) {
     let checkpoints = run.directory.checkpoints();
     match fs::remove_dir_all(&checkpoints) {

@@ -94,6 +94,11 @@ impl RunDirectory {
         self.logs().join(format!("actor-{actor}.log"))
     }
 
+    /// How the best snapshot flies the suite called `suite`, as `skein-evaluate` tells it; an experiment has it written.
+    pub fn suite_json(&self, suite: &str) -> PathBuf {
+        self.root.join("suites").join(format!("{suite}.json"))
+    }
+
     /// Flights committed in the newest of the run's checkpoints, by their names; whether one is sound, only reading it can tell.
     pub fn newest_checkpoint(&self) -> Option<u64> {
         let flights = |entry: fs::DirEntry| entry.file_name().to_str()?.strip_prefix("flight-")?.parse().ok();

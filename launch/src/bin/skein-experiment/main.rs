@@ -129,17 +129,14 @@ impl Cli {
             Some(jobs) => jobs.into(),
             None => thread::available_parallelism().map_or(1, Into::into),
         };
-        let this = std::env::current_exe().context("cannot tell where this program lies")?;
-        let skein = this.with_file_name("skein");
-        if !skein.is_file() {
-            bail!(
-                "{} is missing: build it with `cargo build --release --workspace --bins`",
-                skein.display()
-            );
-        }
+        let (skein, evaluate) = (built("skein")?, built("skein-evaluate")?);
         announce(experiment, &plan, jobs);
         let mut board = Board::new();
-        let manner = Manner { skein: &skein, jobs };
+        let manner = Manner {
+            skein: &skein,
+            evaluate: &evaluate,
+            jobs,
+        };
         let session = runtime().context("cannot start the runtime")?.block_on(async {
             let mut interrupts = interrupts().context("cannot listen for signals")?;
             anyhow::Ok(runner::run(experiment, &plan, manner, &mut interrupts, &mut board).await)
@@ -209,14 +206,31 @@ enum Options {
     OfTheResult,
 }
 
+/// The program `name`, which is built beside this one.
+fn built(name: &str) -> Result<PathBuf> {
+    let this = std::env::current_exe().context("cannot tell where this program lies")?;
+    let program = this.with_file_name(name);
+    if !program.is_file() {
+        bail!(
+            "{} is missing: build it with `cargo build --release --workspace --bins`",
+            program.display()
+        );
+    }
+    Ok(program)
+}
+
 fn announce(experiment: &Experiment, plan: &Plan, jobs: usize) {
     eprintln!("skein: {}", experiment.question);
-    let there = [(State::Complete, "complete"), (State::Begun, "begun")]
-        .map(|(state, what)| (plan.count(state), what))
-        .into_iter()
-        .filter(|(count, _)| *count > 0)
-        .map(|(count, what)| format!(", {count} {what} already"))
-        .collect::<String>();
+    let there = [
+        (State::Complete, "complete"),
+        (State::Trained, "trained"),
+        (State::Begun, "begun"),
+    ]
+    .map(|(state, what)| (plan.count(state), what))
+    .into_iter()
+    .filter(|(count, _)| *count > 0)
+    .map(|(count, what)| format!(", {count} {what} already"))
+    .collect::<String>();
     eprintln!(
         "skein: {} of {} with {} each{there}; {jobs} at a time, in {}",
         plural(plan.runs.len(), "run"),
@@ -224,6 +238,13 @@ fn announce(experiment: &Experiment, plan: &Plan, jobs: usize) {
         plural(plan.seeds as usize, "seed"),
         plan.root.display()
     );
+    if let Some(flown) = &experiment.suite {
+        eprintln!(
+            "skein: the best snapshot of each then flies the suite {}: {}",
+            flown.file_name(),
+            plural(flown.flights() as usize, "flight")
+        );
+    }
     if experiment.is_shortened() {
         eprintln!(
             "skein: shortened: {} training flights a run instead of the {} of {}",

@@ -6,7 +6,7 @@ use std::path::Path;
 use skein_protocol::config::Config;
 
 use super::file::{ArmFile, File, as_overrides};
-use super::{Arm, DefinitionError, Experiment, MOST_ARMS};
+use super::{Arm, DefinitionError, Experiment, FlownSuite, MOST_ARMS, TableKind};
 use crate::experiments::plan::{ACTORS, REPORT};
 use crate::prepare::{self, PrepareError};
 
@@ -49,6 +49,7 @@ pub(super) fn resolve(
         arms.push(arm_of(arm, own, overrides, &base, flights, path)?);
     }
     check_comparable(&arms, path)?;
+    let suite = suite_of(&file, folder, &arms, path)?;
     Ok(Experiment {
         name: name.to_owned(),
         question: file.question,
@@ -57,6 +58,7 @@ pub(super) fn resolve(
         base_flights: base_config.run.flights,
         settings,
         seeds: file.seeds,
+        suite,
         tables: file.tables,
         curves: file.curves,
         arms,
@@ -98,6 +100,37 @@ fn arm_of(
         overrides,
         config,
     })
+}
+
+/// The suite that `file` names, if every arm can be put to it and a table tells what came of it.
+fn suite_of(file: &File, folder: &Path, arms: &[Arm], path: &Path) -> Result<Option<FlownSuite>, DefinitionError> {
+    let is_told = file.tables.contains(&TableKind::Suite);
+    let Some(named) = &file.suite else {
+        let problem = "has the results of a suite, and none is named: add suite = \"FILE\", or take it out";
+        return match is_told {
+            true => Err(value_error(path, "tables", "\"suite\"", problem.to_owned())),
+            false => Ok(None),
+        };
+    };
+    let refuse = |problem| value_error(path, "suite", format!("{named:?}"), problem);
+    if !is_told {
+        let problem = "would be flown, and no table tells it: add \"suite\" to tables, or leave it out";
+        return Err(refuse(problem.to_owned()));
+    }
+    let suite = FlownSuite::load(&folder.join(named)).map_err(|problem| {
+        refuse(format!(
+            "cannot be flown: {problem}; name a suite file, relative to this one, or leave it out"
+        ))
+    })?;
+    for arm in arms {
+        suite.check(arm).map_err(|problem| {
+            refuse(format!(
+                "cannot be flown by arm {}: {problem}; name another suite, or leave it out",
+                arm.name
+            ))
+        })?;
+    }
+    Ok(Some(suite))
 }
 
 fn refuse_ours(overrides: Vec<String>) -> Result<Vec<String>, String> {

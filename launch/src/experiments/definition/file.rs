@@ -17,6 +17,8 @@ pub(super) struct File {
     pub(super) base: PathBuf,
     #[serde(default = "three")]
     pub(super) seeds: u64,
+    /// Relative to the file.
+    pub(super) suite: Option<PathBuf>,
     /// In what all arms differ from the base.
     #[serde(default)]
     pub(super) settings: Table,

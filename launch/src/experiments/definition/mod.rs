@@ -2,6 +2,7 @@
 
 mod check;
 mod file;
+mod suite;
 #[cfg(test)]
 mod tests;
 
@@ -13,6 +14,7 @@ use skein_protocol::config::Config;
 use crate::prepare::PrepareError;
 
 pub use file::names;
+pub use suite::FlownSuite;
 
 /// More arms than this could not be told apart in one picture.
 pub const MOST_ARMS: usize = 8;
@@ -34,6 +36,8 @@ pub struct Experiment {
     pub settings: Vec<String>,
     /// Runs of each arm, with seeds from 1.
     pub seeds: u64,
+    /// What the best snapshot of every run flies beside the evaluation courses.
+    pub suite: Option<FlownSuite>,
     /// What is set in tables.
     pub tables: Vec<TableKind>,
     /// What is drawn.
@@ -65,6 +69,8 @@ pub enum TableKind {
     Evaluation,
     /// How the evaluation flights went: wall by wall, and what ended those that did not get through.
     Outcomes,
+    /// Completed courses and R of the best snapshot, for each entry of the suite.
+    Suite,
     /// What it took until the agent was trained, and how well and steadily it flew at the end of training.
     Learning,
     /// How much training swung, and how much of what was learned was lost again.

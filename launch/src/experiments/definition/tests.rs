@@ -98,8 +98,45 @@ fn course_files_are_named_relative_to_the_experiment() {
 }
 
 #[test]
+fn a_suite_is_named_relative_to_the_experiment_and_its_result_after_all_that_is_flown() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
+    let course = fs::read_to_string(shipped("courses/training.toml")).unwrap();
+    let suite = "name = \"x\"\nflights = 5\n[[entry]]\nname = \"as it is\"\ncourse = \"mine.toml\"\n";
+    write(
+        "test.toml",
+        &format!("suite = \"few.toml\"\n{}{ARM}", head().replace("evaluation", "suite")),
+    );
+    write("mine.toml", &course);
+    write("few.toml", suite);
+    let load = || Experiment::load(folder.path(), "test", None).unwrap().suite.unwrap();
+    let first = load();
+    assert_eq!(
+        (first.path.clone(), first.flights()),
+        (folder.path().join("few.toml"), 5)
+    );
+    assert!(first.result_name.starts_with("few-"), "{}", first.result_name);
+    // Words about it change nothing.
+    write("few.toml", &format!("# Few flights.\n{suite}"));
+    write("mine.toml", &format!("# Five walls.\n{course}"));
+    assert_eq!(load(), first);
+    write("few.toml", &suite.replace('5', "6"));
+    assert_ne!(load().result_name, first.result_name);
+    write("few.toml", suite);
+    write(
+        "mine.toml",
+        &fs::read_to_string(shipped("courses/rearranged_34125.toml")).unwrap(),
+    );
+    assert_ne!(load().result_name, first.result_name);
+}
+
+#[test]
 fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
     let with_arm = |rest: &str| format!("{}{ARM}{rest}", head());
+    let with_suite = |suite: &Path| {
+        let head = head().replace("\"evaluation\"", "\"evaluation\", \"suite\"");
+        format!("suite = {suite:?}\n{head}{ARM}")
+    };
     for (text, flights, expected) in [
         (
             "question = 1".to_owned(),
@@ -190,6 +227,44 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             head().replace("smoke.toml", "nowhere.toml") + ARM,
             None,
             vec!["test.toml: base: ", "nowhere.toml"],
+        ),
+        (
+            with_suite(Path::new("nowhere.toml")),
+            None,
+            vec![
+                "test.toml: suite = \"nowhere.toml\" cannot be flown",
+                "No such file",
+                "relative to this one",
+            ],
+        ),
+        (
+            with_suite(&shipped("courses/training.toml")),
+            None,
+            vec![
+                "training.toml\" cannot be flown",
+                "unknown field",
+                "relative to this one",
+            ],
+        ),
+        // Its drone has no mass.
+        (
+            with_suite(&shipped("evaluations/generalist.toml")),
+            None,
+            vec![
+                "by arm a: entry \"all disturbances",
+                "mass_spread",
+                "name another suite",
+            ],
+        ),
+        (
+            format!("suite = \"few.toml\"\n{}{ARM}", head()),
+            None,
+            vec!["suite = \"few.toml\" would be flown", "add \"suite\" to tables"],
+        ),
+        (
+            head().replace("evaluation", "suite") + ARM,
+            None,
+            vec!["tables = \"suite\" has the results", "add suite = "],
         ),
     ] {
         let error = load(&text, flights).unwrap_err();

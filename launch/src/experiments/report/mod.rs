@@ -4,6 +4,8 @@ mod curves;
 mod document;
 mod publication;
 mod tables;
+#[cfg(test)]
+mod tests;
 
 use std::fs;
 use std::path::{Path, PathBuf};

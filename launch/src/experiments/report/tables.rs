@@ -27,6 +27,7 @@ impl Findings<'_> {
         match kind {
             TableKind::Evaluation => self.evaluation(),
             TableKind::Outcomes => vec![self.outcomes()],
+            TableKind::Suite => self.suite().into_iter().collect(),
             TableKind::Learning => vec![self.learning()],
             TableKind::Steadiness => vec![self.steadiness()],
             TableKind::Cost => vec![self.cost()],
@@ -35,8 +36,6 @@ impl Findings<'_> {
 
     fn evaluation(&self) -> Vec<Titled> {
         let flights = self.experiment.arms[0].config.evaluation.flights;
-        let rate = |estimate: Estimate| with_interval(estimate, |value| format!("{value:.3}"));
-        let percent = |estimate: Estimate| with_interval(estimate, |value| format!("{:.1} %", 100.0 * value));
         vec![
             Titled {
                 title: format!(
@@ -56,7 +55,7 @@ impl Findings<'_> {
         let courses = self.courses();
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
-            let mut row = self.head(number, arm);
+            let mut row = self.head(number, arm).to_vec();
             row.extend(courses.iter().map(|name| {
                 let of_course = |result: &RunResult| course_of(result, name).map(&value);
                 self.estimate(number, of_course).map_or(NOTHING.to_owned(), &show)
@@ -130,12 +129,46 @@ impl Findings<'_> {
         }
     }
 
+    /// A row for each arm and entry of the suite.
+    fn suite(&self) -> Option<Titled> {
+        let flown = self.experiment.suite.as_ref()?;
+        let mut rows = Vec::new();
+        for (number, arm) in self.experiment.arms.iter().enumerate() {
+            for entry in &flown.suite.entries {
+                let estimate = |value: fn(&CourseEvaluation) -> f64| {
+                    let of_entry = |result: &RunResult| {
+                        let courses = &result.suite.as_ref()?.courses;
+                        courses.iter().find(|course| course.course == entry.name).map(value)
+                    };
+                    self.estimate(number, of_entry)
+                };
+                let [label, seeds] = self.head(number, arm);
+                rows.push(vec![
+                    label,
+                    entry.name.clone(),
+                    seeds,
+                    entry.flights.to_string(),
+                    estimate(|course| course.completed).map_or(NOTHING.to_owned(), percent),
+                    estimate(|course| course.r).map_or(NOTHING.to_owned(), rate),
+                ]);
+            }
+        }
+        let header = ["arm", "entry", "seeds", "flights", "completed", "R"];
+        Some(Titled {
+            title: format!(
+                "How the best snapshot flew the suite `{}` without exploration: the share of flights that completed their course, and R",
+                flown.file_name()
+            ),
+            table: grid(header.map(str::to_owned).to_vec(), rows, 2),
+        })
+    }
+
     fn learning(&self) -> Titled {
         let evaluation = &self.experiment.arms[0].config.evaluation;
         let count = |value: f64| format!("{value:.0}");
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
-            let mut row = self.head(number, arm);
+            let mut row = self.head(number, arm).to_vec();
             let trained = self
                 .of_arm(number)
                 .filter(|result| result.summary.trained.is_some())
@@ -189,7 +222,7 @@ impl Findings<'_> {
     fn steadiness(&self) -> Titled {
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
-            let mut row = self.head(number, arm);
+            let mut row = self.head(number, arm).to_vec();
             row.extend(self.measured(
                 number,
                 &[RunResult::dispersion_across_time, RunResult::largest_drawdown],
@@ -240,7 +273,7 @@ impl Findings<'_> {
             };
             let count =
                 |of: &dyn Fn(&RunResult) -> f64| mean(of).map_or(NOTHING.to_owned(), |value| format!("{value:.0}"));
-            let mut row = self.head(number, arm);
+            let mut row = self.head(number, arm).to_vec();
             row.push(count(&|run| run.summary.flights as f64));
             row.push(count(&|run| run.summary.steps as f64));
             row.push(count(&|run| run.summary.updates as f64));
@@ -256,13 +289,13 @@ impl Findings<'_> {
     }
 
     /// The first cells of an arm's row: its label, and how many of its runs are complete.
-    fn head(&self, number: usize, arm: &Arm) -> Vec<String> {
+    fn head(&self, number: usize, arm: &Arm) -> [String; 2] {
         let (complete, planned) = (self.of_arm(number).count() as u64, self.plan.seeds);
         let seeds = match complete == planned {
             true => planned.to_string(),
             false => format!("{complete} of {planned}"),
         };
-        vec![arm.label.clone(), seeds]
+        [arm.label.clone(), seeds]
     }
 
     /// The estimate of what `of_run` says of the complete runs of an arm; `None` when it says nothing of one of them.
@@ -283,6 +316,14 @@ impl Findings<'_> {
 
 fn course_of<'a>(result: &'a RunResult, name: &str) -> Option<&'a CourseEvaluation> {
     result.evaluation.courses.iter().find(|course| course.course == name)
+}
+
+fn rate(estimate: Estimate) -> String {
+    with_interval(estimate, |value| format!("{value:.3}"))
+}
+
+fn percent(estimate: Estimate) -> String {
+    with_interval(estimate, |value| format!("{:.1} %", 100.0 * value))
 }
 
 /// `IQM [low, high]`.

@@ -1,0 +1,98 @@
+//! Tables from the files that runs leave.
+
+use std::fs;
+use std::path::Path;
+
+use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::transition::Outcome;
+
+use super::*;
+use crate::experiments::definition::TableKind;
+use crate::experiments::plan::PlannedRun;
+use crate::experiments::results;
+
+const SUMMARY: &str = r#"{"skein_version":"0","run":7,"seed":1,"ending":"completed","policy_sha256":"","final_version":8,"best_version":7,
+    "best_confirmed_walls_passed":4.9,"flights":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_flights":4,
+    "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
+
+/// `completed` of four flights passed both walls of a course, the others none.
+fn flown(entry: &str, completed: usize) -> CourseEvaluation {
+    let score = |number: usize| FlightScore {
+        walls_passed: if number < completed { 2 } else { 0 },
+        flight_return: 0.0,
+        outcome: match number < completed {
+            true => Outcome::ReachedEnd,
+            false => Outcome::TimedOut,
+        },
+        hit_wall: None,
+    };
+    let flights: Vec<_> = (0..4).map(score).collect();
+    CourseEvaluation::of(entry, 2, &flights)
+}
+
+fn leave(run: &PlannedRun, suite: &[CourseEvaluation]) {
+    let result = run.suite_json.as_ref().unwrap();
+    fs::create_dir_all(result.parent().unwrap()).unwrap();
+    let report = |courses: &[CourseEvaluation]| {
+        let report = EvaluationReport {
+            policy_version: PolicyVersion(7),
+            policy_sha256: String::new(),
+            courses: courses.to_vec(),
+        };
+        serde_json::to_string(&report).unwrap()
+    };
+    fs::write(result, report(suite)).unwrap();
+    fs::write(run.directory.evaluation_json(), report(&[])).unwrap();
+    fs::write(run.directory.summary_json(), SUMMARY).unwrap();
+    fs::write(run.directory.flights_csv(), "steps,walls_passed,return\n4,2,1.0\n").unwrap();
+}
+
+#[test]
+fn a_suite_is_told_entry_by_entry_over_the_seeds() {
+    let folder = tempfile::tempdir().unwrap();
+    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+    let (base, course) = (configs.join("smoke.toml"), configs.join("courses/training.toml"));
+    let entry = |name: &str| format!("[[entry]]\nname = \"{name}\"\ncourse = {course:?}\n");
+    let suite = format!("name = \"few\"\nflights = 4\n{}{}", entry("calm"), entry("windy"));
+    fs::write(folder.path().join("few.toml"), suite).unwrap();
+    let experiment = format!(
+        "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\ncurves = []\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
+    );
+    fs::write(folder.path().join("test.toml"), experiment).unwrap();
+    let experiment = Experiment::load(folder.path(), "test", None).unwrap();
+    let mut plan = Plan::new(&experiment, &folder.path().join("runs"), 2).unwrap();
+    for (run, calm) in plan.runs.iter_mut().zip([2, 4]) {
+        leave(run, &[flown("calm", calm), flown("windy", 1)]);
+        run.state = State::Complete;
+    }
+    let told = |plan: &Plan| {
+        let findings = Findings {
+            experiment: &experiment,
+            plan,
+            results: &results::read(plan).unwrap(),
+            command: String::new(),
+        };
+        let tables = findings.tables(TableKind::Suite);
+        assert!(tables[0].title.contains("`few.toml`"), "{}", tables[0].title);
+        tables[0].table.clone()
+    };
+    assert_eq!(
+        told(&plan),
+        "| arm | entry | seeds | flights |                completed |                    R |\n\
+         |-----|-------|------:|--------:|-------------------------:|---------------------:|\n\
+         | A   | calm  |     2 |       4 | 75.0 % [50.0 %, 100.0 %] | 0.750 [0.500, 1.000] |\n\
+         | A   | windy |     2 |       4 |  25.0 % [25.0 %, 25.0 %] | 0.250 [0.250, 0.250] |"
+    );
+    // A run that did not fly it says nothing, and nothing is made up for it.
+    plan.runs[1].state = State::Trained;
+    assert!(told(&plan).contains("| 1 of 2 |"), "{}", told(&plan));
+
+    let result = plan.runs[0].suite_json.clone().unwrap();
+    fs::write(&result, "{").unwrap();
+    let error = results::read(&plan).unwrap_err().to_string();
+    assert!(
+        error.contains(&result.display().to_string()) && error.contains("move this file away"),
+        "{error}"
+    );
+}
