@@ -1,9 +1,9 @@
 //! A trainer restored from a checkpoint goes on bit for bit.
 
 use skein_inference::{Network, Scratch};
+use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::Precision;
 use skein_protocol::transition::Outcome;
-use skein_protocol::{IMAGE_PIXELS, LATENT};
 
 use super::*;
 use crate::checkpoint::{CheckpointState, CheckpointStore};
@@ -141,9 +141,15 @@ fn a_state_that_lacks_a_tensor_or_miscounts_is_refused_by_name() {
 
 #[test]
 fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
-    for (engine, precision) in [(Engine::Native, Precision::Bf16), (Engine::Libtorch, Precision::F32)] {
+    for (engine, precision, latent) in [
+        (Engine::Native, Precision::Bf16, 32),
+        (Engine::Libtorch, Precision::F32, 32),
+        (Engine::Native, Precision::F32, 8),
+        (Engine::Libtorch, Precision::F32, 64),
+    ] {
         let mut config = config();
         (config.run.engine, config.vae.encoder_precision) = (Some(engine), precision);
+        config.vae.latent = latent;
         let mut trainer = Trainer::new(&config).unwrap();
         // The last epoch comes in late: its images were ordered before.
         (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
@@ -160,8 +166,8 @@ fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
         let rows = drawn.observations.chunks(drawn.observations.len() / 200);
         for observation in rows {
             assert!(
-                codes.iter().any(|code| code == &observation[..LATENT]),
-                "{engine}, {precision}"
+                codes.iter().any(|code| code[..latent] == *observation),
+                "{engine}, {precision}, {latent} numbers"
             );
         }
     }

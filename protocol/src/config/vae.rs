@@ -5,11 +5,17 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require, require_learning_rate};
+use crate::LONGEST_LATENT;
+
+/// Lengths a latent code may have. Records have room for the longest; mean and log-variance of the shortest fill the 16 lanes that the learner adds up at a time.
+const LATENTS: [usize; 4] = [8, 16, 32, LONGEST_LATENT];
 
 /// `[vae]`: the variational auto-encoder (paper, section 3.3), trained together with the agent and then frozen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VaeSection {
+    /// Length of the latent code: 8, 16, 32 or 64 (paper: 32). Default 32.
+    pub latent: usize,
     /// Environment steps during which the VAE is trained; then it is frozen and stored latents are recomputed (paper: 10000). Default 10000.
     pub train_steps: usize,
     /// VAE steps per environment step, done at the end of the epoch. Default 0.1.
@@ -28,6 +34,7 @@ pub struct VaeSection {
 impl Default for VaeSection {
     fn default() -> Self {
         Self {
+            latent: 32,
             train_steps: 10_000,
             updates_per_step: 0.1,
             batch_size: 32,
@@ -40,6 +47,14 @@ impl Default for VaeSection {
 
 impl VaeSection {
     pub(super) fn validate(&self) -> Result<(), Invalid> {
+        require(
+            LATENTS.contains(&self.latent),
+            "vae.latent",
+            self.latent,
+            format!(
+                "is none of {LATENTS:?}: no record and no network is laid out for such a code; set it to one of them, of which the paper has 32"
+            ),
+        )?;
         require(
             self.train_steps >= 1,
             "vae.train_steps",
