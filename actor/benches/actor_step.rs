@@ -28,7 +28,7 @@ use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{RecordKind, TransitionRecord};
 use skein_protocol::{ACTION, IMAGE_PIXELS};
 
-use common::{Learner, OBSERVATION, ticket};
+use common::{Learner, ticket};
 
 const ACTOR: ActorId = ActorId(0);
 const INCARNATION: Incarnation = Incarnation(0);
@@ -48,7 +48,7 @@ fn main() {
         ACTOR,
         INCARNATION,
         Simulators::new(Arc::clone(&courses)),
-        Agent::new(View::present(OBSERVATION)),
+        Agent::new(config.view()),
     );
     let flights: Vec<Vec<TransitionRecord>> = tickets
         .iter()
@@ -69,7 +69,7 @@ fn main() {
         });
     });
     environment(&mut group, &tickets, &flights, &mut Simulators::new(courses));
-    inference(&mut group, &flights, &network);
+    inference(&mut group, &flights, &network, &config.view());
     sending(&mut group, &tickets, &flights, &transport);
     group.finish();
     criterion.final_summary();
@@ -109,7 +109,12 @@ fn environment(
 }
 
 /// Encoder and policy: the same images and observations.
-fn inference(group: &mut BenchmarkGroup<'_, WallTime>, flights: &[Vec<TransitionRecord>], network: &Network) {
+fn inference(
+    group: &mut BenchmarkGroup<'_, WallTime>,
+    flights: &[Vec<TransitionRecord>],
+    network: &Network,
+    view: &View,
+) {
     let mut scratch = Scratch::default();
     group.bench_function("encoder", |bencher| {
         bencher.iter(|| {
@@ -119,11 +124,11 @@ fn inference(group: &mut BenchmarkGroup<'_, WallTime>, flights: &[Vec<Transition
         });
     });
     let mut noise = Pcg64Mcg::seed_from_u64(3);
-    let mut observed = vec![0.0; OBSERVATION.len()];
+    let mut observed = vec![0.0; view.len()];
     group.bench_function("policy", |bencher| {
         bencher.iter(|| {
             for record in flights.iter().flat_map(|records| steps_of(records)) {
-                OBSERVATION.write(&record.latent, &record.velocity_mps, &[0.0; ACTION], &mut observed);
+                view.write_moment(&record.latent, &record.velocity_mps, &[0.0; ACTION], &mut observed);
                 black_box(network.distribution(&observed, &mut scratch).sample(&mut noise));
             }
         });

@@ -4,16 +4,17 @@ use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion};
 use skein_inference::{Network, Scratch};
-use skein_protocol::config::{Observation, Precision};
+use skein_protocol::config::{Observation, Precision, VaeSection, View};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     let mut group = criterion.benchmark_group("policy_width");
-    let observation = vec![0.1; Observation::LatentVelocity.len()];
+    let view = View::present(Observation::LatentVelocity, VaeSection::default().latent);
+    let observation = vec![0.1; view.len()];
     for width in [64, 128, 256, 512, 1024] {
-        let layout = SnapshotLayout::new(observation.len(), width);
+        let layout = SnapshotLayout::new(&view, width);
         let snapshot = Snapshot {
             version: PolicyVersion(0),
             // Small, so that numbers neither vanish nor explode on their way through the layers.

@@ -14,7 +14,7 @@ use skein_inference::{Network, Scratch};
 #[derive(Debug)]
 pub struct Agent {
     view: View,
-    /// What was seen of each moment of the flight so far, `[steps, Observation::len]`.
+    /// What was seen of each moment of the flight so far, `[steps, View::moment_len]`.
     moments: Vec<f32>,
     /// The policy's input, `[View::len]`.
     observed: Vec<f32>,
@@ -69,7 +69,7 @@ impl Agent {
                 observed,
                 scratch,
             } = self;
-            let len = view.moment.len();
+            let len = view.moment_len();
             view.write(record.step as usize, observed, |step, into| {
                 into.copy_from_slice(&moments[step * len..][..len]);
             });
@@ -84,10 +84,10 @@ impl Agent {
 
     /// Keeps what is seen of the moment in `record`, and forgets what was seen in an earlier flight.
     fn remember(&mut self, record: &TransitionRecord, previous_action: &[f32; ACTION]) {
-        let moment = self.view.moment;
-        let first = record.step as usize * moment.len();
-        self.moments.resize(first + moment.len(), 0.0);
-        moment.write(
+        let len = self.view.moment_len();
+        let first = record.step as usize * len;
+        self.moments.resize(first + len, 0.0);
+        self.view.write_moment(
             &record.latent,
             &record.velocity_mps,
             previous_action,

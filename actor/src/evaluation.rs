@@ -189,7 +189,7 @@ impl Evaluation<'_> {
         next: &AtomicU64,
     ) -> Vec<(u64, Result<EvaluatedFlight, EvaluationError>)> {
         let simulators = Simulators::new(Arc::clone(&self.courses));
-        let agent = Agent::new(self.config.learning.view());
+        let agent = Agent::new(self.config.view());
         let mut pilot = Pilot::new(ActorId(0), Incarnation(0), simulators, agent);
         let mut flown = Vec::new();
         loop {

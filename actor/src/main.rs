@@ -77,7 +77,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
     let _presence = Presence::enter(&identity)?;
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config)?));
     // Each learner that is joined gives it an incarnation.
-    let mut pilot = Pilot::new(actor, Incarnation(0), simulators, Agent::new(config.learning.view()));
+    let mut pilot = Pilot::new(actor, Incarnation(0), simulators, Agent::new(config.view()));
     Ok(Service::new(&identity, &config, actor, &told_to_end).serve(&mut pilot)?)
 }
 

@@ -3,16 +3,18 @@
 //! One row for every observation: the steps of a flight in order, its closing observation last; flights in order, courses in order. [`COLUMNS`] lists the
 //! arrays. The format is a zip file with one `.npy` file an array; rows are written as they lie in memory, so nothing is held twice.
 
+use std::fmt;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use skein_protocol::transition::{RecordKind, TransitionRecord};
-use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_WIDTH, LATENT};
+use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_WIDTH};
 use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
 
 use crate::evaluation::EvaluatedFlight;
+use Axis::{Latent, Of};
 
 // The arrays' types below say little-endian, and rows are copied from memory.
 const _: () = assert!(cfg!(target_endian = "little"));
@@ -24,16 +26,45 @@ pub struct Column {
     /// NumPy's name for its type.
     pub kind: &'static str,
     /// Its shape after the first axis, which counts rows.
-    pub shape: &'static [usize],
+    pub shape: &'static [Axis],
     /// What it holds.
     pub meaning: &'static str,
     write: fn(&Row<'_>, &mut Vec<u8>),
+}
+
+/// An axis of an array.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Axis {
+    /// So long.
+    Of(usize),
+    /// As long as the run's latent code.
+    Latent,
+}
+
+impl Axis {
+    fn len(self, latent: usize) -> usize {
+        match self {
+            Of(len) => len,
+            Latent => latent,
+        }
+    }
+}
+
+impl fmt::Display for Axis {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Of(len) => len.fmt(f),
+            Latent => f.write_str("latent"),
+        }
+    }
 }
 
 /// One observation of a recording.
 struct Row<'a> {
     course: i32,
     flight: i32,
+    /// Length of the latent code.
+    latent: usize,
     record: &'a TransitionRecord,
 }
 
@@ -60,7 +91,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "position_m",
         "<f4",
-        &[3],
+        &[Of(3)],
         "along the corridor, left, up; metres, world frame",
         |row, out| {
             put(out, &row.record.position_m);
@@ -69,7 +100,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "orientation",
         "<f4",
-        &[4],
+        &[Of(4)],
         "world from body, unit quaternion (i, j, k, w)",
         |row, out| {
             put(out, &row.record.orientation);
@@ -78,7 +109,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "velocity_mps",
         "<f4",
-        &[3],
+        &[Of(3)],
         "forward, left, up; metres per second, world frame",
         |row, out| {
             put(out, &row.record.velocity_mps);
@@ -87,7 +118,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "depth",
         "|u1",
-        &[IMAGE_HEIGHT, IMAGE_WIDTH],
+        &[Of(IMAGE_HEIGHT), Of(IMAGE_WIDTH)],
         "depth image, top row first; 255 is farthest",
         |row, out| {
             out.extend_from_slice(&row.record.depth);
@@ -96,14 +127,14 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "latent",
         "<f4",
-        &[LATENT],
+        &[Latent],
         "latent code of the depth image",
-        |row, out| put(out, &row.record.latent),
+        |row, out| put(out, &row.record.latent[..row.latent]),
     ),
     Column::new(
         "action",
         "<f4",
-        &[ACTION],
+        &[Of(ACTION)],
         "commanded velocity left, up, in [-1, 1]; 0 in closing rows",
         |row, out| {
             put(out, &row.record.action);
@@ -112,7 +143,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "reward_terms",
         "<f4",
-        &[4],
+        &[Of(4)],
         "collision, level-up, destination, action; for the action above",
         |row, out| {
             put(out, &row.record.reward_terms);
@@ -154,7 +185,7 @@ impl Column {
     const fn new(
         name: &'static str,
         kind: &'static str,
-        shape: &'static [usize],
+        shape: &'static [Axis],
         meaning: &'static str,
         write: fn(&Row<'_>, &mut Vec<u8>),
     ) -> Self {
@@ -179,13 +210,18 @@ pub struct RecordingError {
     pub source: io::Error,
 }
 
-/// Writes the records of `flights`, course by course, to `path`; in place at once, or not at all.
+/// Writes the records of `flights`, course by course, to `path`; in place at once, or not at all. Their codes have `latent` numbers.
 ///
 /// # Errors
 /// [`RecordingError`] names the file.
-pub fn write_recording(path: &Path, courses: &[&str], flights: &[Vec<EvaluatedFlight>]) -> Result<(), RecordingError> {
+pub fn write_recording(
+    path: &Path,
+    courses: &[&str],
+    latent: usize,
+    flights: &[Vec<EvaluatedFlight>],
+) -> Result<(), RecordingError> {
     let aside = aside(path);
-    write_npz(&aside, courses, flights)
+    write_npz(&aside, courses, latent, flights)
         .and_then(|()| fs::rename(&aside, path))
         .map_err(|source| {
             // Half a recording is of no use; where there is none to remove, nothing remains either.
@@ -221,14 +257,15 @@ fn failed(path: &Path, source: io::Error) -> RecordingError {
     }
 }
 
-fn write_npz(path: &Path, courses: &[&str], flights: &[Vec<EvaluatedFlight>]) -> io::Result<()> {
+fn write_npz(path: &Path, courses: &[&str], latent: usize, flights: &[Vec<EvaluatedFlight>]) -> io::Result<()> {
     let rows: Vec<Row<'_>> = (0i32..)
         .zip(flights)
-        .flat_map(|(course, flights)| rows_of(course, flights))
+        .flat_map(|(course, flights)| rows_of(course, latent, flights))
         .collect();
     let mut zip = ZipWriter::new(BufWriter::new(File::create(path)?));
     for column in &COLUMNS {
-        start_array(&mut zip, column.name, column.kind, rows.len(), column.shape)?;
+        let shape: Vec<_> = column.shape.iter().map(|axis| axis.len(latent)).collect();
+        start_array(&mut zip, column.name, column.kind, rows.len(), &shape)?;
         let mut bytes = Vec::new();
         for row in &rows {
             bytes.clear();
@@ -251,10 +288,15 @@ fn write_npz(path: &Path, courses: &[&str], flights: &[Vec<EvaluatedFlight>]) ->
     zip.finish().map_err(io::Error::from)?.into_inner()?.sync_all()
 }
 
-fn rows_of(course: i32, flights: &[EvaluatedFlight]) -> impl Iterator<Item = Row<'_>> {
-    (0i32..)
-        .zip(flights)
-        .flat_map(move |(flight, flown)| flown.records.iter().map(move |record| Row { course, flight, record }))
+fn rows_of(course: i32, latent: usize, flights: &[EvaluatedFlight]) -> impl Iterator<Item = Row<'_>> {
+    (0i32..).zip(flights).flat_map(move |(flight, flown)| {
+        flown.records.iter().map(move |record| Row {
+            course,
+            flight,
+            latent,
+            record,
+        })
+    })
 }
 
 /// Begins a `.npy` file. Source: numpy.lib.format, version 1.0.
@@ -298,6 +340,7 @@ mod tests {
         let record = |number: u8| {
             let mut record = Box::new(TransitionRecord::zeroed());
             record.depth.fill(number);
+            record.latent = std::array::from_fn(|place| f32::from(number) + place as f32);
             record.position_m = [f32::from(number), 0.5, -1.0];
             record
         };
@@ -344,7 +387,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("flights.npz");
         let flights = [vec![flight(1, 2), flight(3, 1)], vec![flight(4, 1)]];
-        write_recording(&file, &["near", "far \u{e4}"], &flights).unwrap();
+        write_recording(&file, &["near", "far \u{e4}"], 8, &flights).unwrap();
 
         let (header, depth) = array(&file, "depth");
         assert!(
@@ -361,6 +404,9 @@ mod tests {
         let (header, position) = array(&file, "position_m");
         assert!(header.contains("'<f4'") && header.contains("(4, 3,)"), "{header}");
         assert_eq!(values::<f32>(&position)[3..6], [2.0, 0.5, -1.0]);
+        let (header, latent) = array(&file, "latent");
+        assert!(header.contains("(4, 8,)"), "{header}");
+        assert_eq!(values::<f32>(&latent)[14..18], [8.0, 9.0, 3.0, 4.0]);
         let (header, names) = array(&file, "course_names");
         assert!(header.contains("'<U5'") && header.contains("(2,)"), "{header}");
         assert_eq!(values::<u32>(&names)[9], 0xe4);
@@ -370,10 +416,10 @@ mod tests {
     fn every_array_has_as_many_values_as_its_header_says() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("flights.npz");
-        write_recording(&file, &["near"], &[vec![flight(0, 3)]]).unwrap();
+        write_recording(&file, &["near"], 8, &[vec![flight(0, 3)]]).unwrap();
         for column in &COLUMNS {
             let value_bytes: usize = column.kind[2..].parse().unwrap();
-            let expected = 3 * column.shape.iter().product::<usize>() * value_bytes;
+            let expected = 3 * column.shape.iter().map(|axis| axis.len(8)).product::<usize>() * value_bytes;
             assert_eq!(array(&file, column.name).1.len(), expected, "{}", column.name);
         }
     }
@@ -381,7 +427,7 @@ mod tests {
     #[test]
     fn a_file_that_cannot_be_written_is_named() {
         let file = Path::new("/nonexistent/flights.npz");
-        for error in [write_recording(file, &[], &[]), check_recordable(file)] {
+        for error in [write_recording(file, &[], 32, &[]), check_recordable(file)] {
             assert!(error.unwrap_err().to_string().contains("/nonexistent/flights.npz"));
         }
     }
@@ -402,7 +448,7 @@ mod tests {
         fs::write(at("earlier.npz"), b"earlier").unwrap();
         assert!(check_recordable(&at("folder")).is_err());
         assert!(check_recordable(Path::new("/dev/null")).is_err());
-        write_recording(&at("folder"), &["near"], &[vec![flight(0, 1)]]).unwrap_err();
+        write_recording(&at("folder"), &["near"], 32, &[vec![flight(0, 1)]]).unwrap_err();
         check_recordable(&at("earlier.npz")).unwrap();
         check_recordable(&at("new.npz")).unwrap();
         assert_eq!(names(), ["earlier.npz", "folder"]);

@@ -89,9 +89,10 @@ impl Weights {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use skein_protocol::config::{Observation, View};
 
     fn weights(versions: impl IntoIterator<Item = u64>) -> Weights {
-        let layout = SnapshotLayout::new(32, 1);
+        let layout = SnapshotLayout::new(&View::present(Observation::Latent, 32), 1);
         let values = layout.values();
         let mut weights = Weights::new(layout, Precision::F32, 4);
         for version in versions {

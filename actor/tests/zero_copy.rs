@@ -103,12 +103,7 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
         leg: None,
     };
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config).unwrap()));
-    let mut pilot = Pilot::new(
-        ActorId(0),
-        Incarnation(0),
-        simulators,
-        Agent::new(config.learning.view()),
-    );
+    let mut pilot = Pilot::new(ActorId(0), Incarnation(0), simulators, Agent::new(config.view()));
     let mut watched = Watched {
         ports: &actor,
         loaned: Vec::new(),

@@ -10,7 +10,7 @@ use skein_learner::replay::{Minibatch, Replay};
 use skein_protocol::config::{Config, Observation};
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, LONGEST_LATENT};
 
 /// Transitions a minibatch.
 const BATCH: usize = 256;
@@ -68,7 +68,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedFlight {
         action_before: [0.0; ACTION],
         observations: (0..=STEPS)
             .map(|_| StepObservation {
-                latent: [(); LATENT].map(|()| draw()),
+                latent: [(); LONGEST_LATENT].map(|()| draw()),
                 velocity_mps: [(); 3].map(|()| draw()),
                 position_m: [0.0; 3],
                 orientation: [0.0, 0.0, 0.0, 1.0],

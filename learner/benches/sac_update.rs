@@ -7,10 +7,11 @@ use skein_learner::device::use_threads;
 use skein_learner::noise::Noise;
 use skein_learner::sac::Sac;
 use skein_protocol::ACTION;
-use skein_protocol::config::{Engine, Observation, SacSection};
+use skein_protocol::config::{Engine, SacSection};
 use tch::Device;
 
-const OBSERVATION: Observation = Observation::LatentVelocity;
+/// Numbers in an observation, as in `local.toml`.
+const OBSERVATION: usize = 34;
 /// The default.
 const WIDTH: usize = 256;
 
@@ -20,8 +21,7 @@ fn main() {
     let rows = SacSection::default().batch_size;
     let mut noise = Noise::new(1);
     let mut draw = |width: usize| -> Vec<f32> { (0..rows * width).map(|_| noise.uniform(1.0)).collect() };
-    let [observations, actions, rewards, next_observations] =
-        [OBSERVATION.len(), ACTION, 1, OBSERVATION.len()].map(&mut draw);
+    let [observations, actions, rewards, next_observations] = [OBSERVATION, ACTION, 1, OBSERVATION].map(&mut draw);
     let columns = Columns {
         observations: &observations,
         actions: &actions,
@@ -43,7 +43,7 @@ fn update(criterion: &mut Criterion, engine: Engine, width: usize, columns: Colu
         hidden_width: width,
         ..SacSection::default()
     };
-    let mut sac = Sac::new(&section, Inputs::same(OBSERVATION.len()), 1, engine, Device::Cpu);
+    let mut sac = Sac::new(&section, Inputs::same(OBSERVATION), 1, engine, Device::Cpu);
     let (mut team, mut noise) = (Team::new(1), Noise::new(2));
     let mut group = criterion.benchmark_group("sac_update");
     group.throughput(Throughput::Elements(operations(columns.rewards.len(), width)));
@@ -58,7 +58,7 @@ fn update(criterion: &mut Criterion, engine: Engine, width: usize, columns: Colu
 
 /// Floating-point operations that the products of one update cannot do without, a multiplication and an addition counted as two; nothing else is counted.
 fn operations(rows: usize, width: usize) -> u64 {
-    let (observation, estimates) = (OBSERVATION.len(), 2);
+    let (observation, estimates) = (OBSERVATION, 2);
     // Weights: the layers of the policy, and those of the critic.
     let policy_first = observation * width;
     let policy_rest = 2 * width * width + width * 2 * ACTION;

@@ -72,7 +72,7 @@ pub struct Inputs {
 impl Inputs {
     /// Those of the run configured by `config`.
     pub fn of(config: &Config) -> Self {
-        let policy = config.learning.view().len();
+        let policy = config.view().len();
         match config.learning.critic_input {
             CriticInput::Observation => Self::same(policy),
             CriticInput::GroundTruth => Self {

@@ -4,16 +4,16 @@
 //! observation is what the last step led to, and a flight that was cut off bootstraps from it. Of a flight in legs each leg is one of these, and what has been
 //! flown of it so far is one as well.
 
-use skein_protocol::config::{Observation, View};
+use skein_protocol::config::View;
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
 
 /// What the vehicle saw and where it was at the beginning of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepObservation {
     /// The VAE's latent mean of the depth image.
-    pub latent: [f32; LATENT],
+    pub latent: LatentCode,
     /// Velocity in the world in metres per second: forward, left, up.
     pub velocity_mps: [f32; 3],
     /// Position in the world in metres: along the corridor, lateral, up.
@@ -153,7 +153,7 @@ impl CommittedFlight {
 
     /// Writes the observation vector at the beginning of `step`, at most T, as the actor saw it.
     pub fn write_observation(&self, step: usize, view: &View, into: &mut [f32]) {
-        view.write(step, into, |step, into| self.write_moment(step, view.moment, into));
+        view.write(step, into, |step, into| self.write_moment(step, view, into));
     }
 
     /// Writes what a critic that is told the [ground truth](CriticInput::GroundTruth) gets at the beginning of `step`, `[TRUE_STATE]`: that, the velocity, the tilt
@@ -176,10 +176,10 @@ impl CommittedFlight {
             .map_or(self.action_before, |previous| self.actions[previous])
     }
 
-    fn write_moment(&self, step: usize, observation: Observation, into: &mut [f32]) {
+    fn write_moment(&self, step: usize, view: &View, into: &mut [f32]) {
         let previous_action = self.action_before(step);
         let seen = &self.observations[step];
-        observation.write(&seen.latent, &seen.velocity_mps, &previous_action, into);
+        view.write_moment(&seen.latent, &seen.velocity_mps, &previous_action, into);
     }
 
     /// Checks that every part has the length that the number of actions asks for, and that there is a step.
@@ -266,13 +266,15 @@ pub(crate) mod samples {
     }
 
     /// Latent code of an image of gray value `shade`.
-    pub(crate) fn code(shade: u8) -> [f32; LATENT] {
+    pub(crate) fn code(shade: u8) -> LatentCode {
         std::array::from_fn(|index| f32::from(shade) + index as f32 / 64.0)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use skein_protocol::config::Observation;
+
     use super::*;
 
     #[test]
@@ -298,13 +300,14 @@ mod tests {
     #[test]
     fn the_previous_action_is_zero_at_take_off_and_then_the_one_before() {
         let flight = samples::flight(3, 5, Outcome::Collided);
-        let mut vector = [f32::NAN; LATENT + 2 + ACTION];
-        let view = View::present(Observation::LatentVelocityAction);
+        let view = View::present(Observation::LatentVelocityAction, 16);
+        let mut vector = [f32::NAN; 16 + 2 + ACTION];
         flight.write_observation(0, &view, &mut vector);
-        assert_eq!(vector[LATENT + 2..], [0.0, 0.0]);
+        assert_eq!(vector[18..], [0.0, 0.0]);
         flight.write_observation(5, &view, &mut vector);
-        assert_eq!(vector[LATENT + 2..], flight.actions[4]);
-        assert_eq!(vector[..LATENT], flight.observations[5].latent);
+        assert_eq!(vector[18..], flight.actions[4]);
+        assert_eq!(vector[..16], flight.observations[5].latent[..16]);
+        assert_eq!(vector[16..18], flight.observations[5].velocity_mps[1..]);
     }
 
     #[test]
@@ -312,15 +315,16 @@ mod tests {
         let flight = samples::flight(3, 5, Outcome::Collided);
         let view = View {
             moment: Observation::LatentVelocity,
+            latent: 8,
             history_steps: vec![1, 4],
         };
         let mut vector = vec![f32::NAN; view.len()];
         for (step, moments) in [(5, [5, 4, 1]), (2, [2, 1, 0]), (0, [0, 0, 0])] {
             flight.write_observation(step, &view, &mut vector);
-            for (seen, moment) in vector.chunks_exact(LATENT + 2).zip(moments) {
+            for (seen, moment) in vector.chunks_exact(8 + 2).zip(moments) {
                 let observation = &flight.observations[moment];
-                assert_eq!(seen[..LATENT], observation.latent);
-                assert_eq!(seen[LATENT..], observation.velocity_mps[1..]);
+                assert_eq!(seen[..8], observation.latent[..8]);
+                assert_eq!(seen[8..], observation.velocity_mps[1..]);
             }
         }
     }

@@ -29,7 +29,7 @@ pub mod transition;
 
 /// Version of everything in this crate that crosses a process boundary; part of every service's attributes, so that a process of another version is
 /// refused when it opens a service.
-pub const PROTOCOL_VERSION: u32 = 7;
+pub const PROTOCOL_VERSION: u32 = 8;
 
 /// Width of the depth image in pixels (paper, section 3.3).
 pub const IMAGE_WIDTH: usize = 128;
@@ -37,8 +37,10 @@ pub const IMAGE_WIDTH: usize = 128;
 pub const IMAGE_HEIGHT: usize = 72;
 /// Pixels, and bytes, of one 8-bit depth image.
 pub const IMAGE_PIXELS: usize = IMAGE_WIDTH * IMAGE_HEIGHT;
-/// Length of the VAE's latent code (paper, section 3.3).
-pub const LATENT: usize = 32;
+/// Length of the longest latent code that `vae.latent` allows; records have room for it.
+pub const LONGEST_LATENT: usize = 64;
+/// Room for a latent code of any length. What lies behind a shorter one is zero.
+pub type LatentCode = [f32; LONGEST_LATENT];
 /// Length of an action: lateral and vertical velocity, each in [-1, 1].
 pub const ACTION: usize = 2;
 /// Numbers of what the simulator knows of a moment, [`transition::TransitionRecord::ground_truth`].

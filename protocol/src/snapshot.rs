@@ -14,9 +14,9 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use sha2::{Digest, Sha256};
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
-use crate::config::{AlgorithmName, Config};
+use crate::config::{AlgorithmName, Config, View};
 use crate::ids::{PolicyVersion, RunId};
-use crate::{ACTION, LATENT, durable};
+use crate::{ACTION, durable};
 
 /// Channels of the encoder's four 4×4 convolutions of stride 2; the first is the image's (paper, section 3.3; widths as in arXiv:1803.10122).
 pub const ENCODER_CHANNELS: [usize; 5] = [1, 32, 64, 128, 256];
@@ -66,13 +66,13 @@ pub struct SnapshotLayout {
 }
 
 impl SnapshotLayout {
-    /// The layout for policies that see `observation` values, have hidden layers of `hidden_width`, and give a squashed Gaussian.
-    pub fn new(observation: usize, hidden_width: usize) -> Self {
-        Self::with_head(observation, hidden_width, PolicyHead::SquashedGaussian)
+    /// The layout for policies that see `view`, have hidden layers of `hidden_width`, and give a squashed Gaussian.
+    pub fn new(view: &View, hidden_width: usize) -> Self {
+        Self::with_head(view, hidden_width, PolicyHead::SquashedGaussian)
     }
 
     /// The same for policies that give what `head` says.
-    pub fn with_head(observation: usize, hidden_width: usize, head: PolicyHead) -> Self {
+    pub fn with_head(view: &View, hidden_width: usize, head: PolicyHead) -> Self {
         let mut layout = Self {
             tensors: Vec::new(),
             encoder_values: 0,
@@ -82,9 +82,9 @@ impl SnapshotLayout {
             let shape = [pair[1], pair[0], ENCODER_KERNEL, ENCODER_KERNEL];
             layout.push_layer(&format!("encoder.conv{}", index + 1), &shape);
         }
-        layout.push_layer("encoder.mean", &[LATENT, ENCODER_FEATURES]);
+        layout.push_layer("encoder.mean", &[view.latent, ENCODER_FEATURES]);
         layout.encoder_values = layout.values();
-        let widths = [observation, hidden_width, hidden_width, hidden_width, head.outputs()];
+        let widths = [view.len(), hidden_width, hidden_width, hidden_width, head.outputs()];
         for (index, pair) in widths.windows(2).enumerate() {
             layout.push_layer(&format!("policy.layer{}", index + 1), &[pair[1], pair[0]]);
         }
@@ -100,7 +100,7 @@ impl SnapshotLayout {
                 PolicyHead::Noisy(config.td3.exploration_noise as f32),
             ),
         };
-        Self::with_head(config.learning.view().len(), hidden_width, head)
+        Self::with_head(&config.view(), hidden_width, head)
     }
 
     /// What the policy's numbers are.
@@ -198,7 +198,7 @@ pub enum SnapshotError {
     },
     /// Its tensors are not ours.
     #[error(
-        "the snapshot has another layout: learning.algorithm, its hidden_width, learning.observation or learning.history_steps differ"
+        "the snapshot has another layout: learning.algorithm, its hidden_width, learning.observation, learning.history_steps or vae.latent differ"
     )]
     OtherLayout,
     /// Its length is not that of the layout.
@@ -428,6 +428,11 @@ fn values_of(bytes: &[u8]) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Observation;
+
+    fn view() -> View {
+        View::present(Observation::LatentVelocity, 32)
+    }
 
     fn snapshot(layout: &SnapshotLayout) -> Snapshot {
         let values = (0..layout.values()).map(|index| (index as f32).sin()).collect();
@@ -439,7 +444,7 @@ mod tests {
 
     #[test]
     fn tensors_lie_back_to_back_and_encoder_before_policy() {
-        let layout = SnapshotLayout::new(34, 256);
+        let layout = SnapshotLayout::new(&view(), 256);
         let mut end = 0;
         for tensor in layout.tensors() {
             assert_eq!(tensor.range.start, end);
@@ -454,7 +459,7 @@ mod tests {
 
     #[test]
     fn a_received_snapshot_is_the_one_sent() {
-        let layout = SnapshotLayout::new(32, 64);
+        let layout = SnapshotLayout::new(&view(), 64);
         let sent = snapshot(&layout);
         let header = sent.header(RunId(1), &layout);
         let bytes = bytemuck::cast_slice(&sent.values);
@@ -463,7 +468,7 @@ mod tests {
 
     #[test]
     fn a_foreign_damaged_or_poisoned_snapshot_is_refused() {
-        let layout = SnapshotLayout::new(32, 64);
+        let layout = SnapshotLayout::new(&view(), 64);
         let mut sent = snapshot(&layout);
         let header = sent.header(RunId(1), &layout);
         let mut bytes = bytemuck::cast_slice(&sent.values).to_vec();
@@ -472,11 +477,14 @@ mod tests {
             receive(&bytes, RunId(2), &layout),
             Err(SnapshotError::OtherRun { .. })
         ));
-        let other = SnapshotLayout::new(34, 64);
-        assert!(matches!(
-            receive(&bytes, RunId(1), &other),
-            Err(SnapshotError::OtherLayout)
-        ));
+        // An observation more, and a code that is longer by as many numbers as are not seen beside it.
+        for (moment, latent) in [(Observation::Latent, 32), (Observation::Latent, 34)] {
+            let other = SnapshotLayout::new(&View::present(moment, latent), 64);
+            assert!(matches!(
+                receive(&bytes, RunId(1), &other),
+                Err(SnapshotError::OtherLayout)
+            ));
+        }
         assert!(matches!(
             receive(&bytes[4..], RunId(1), &layout),
             Err(SnapshotError::Length { .. })

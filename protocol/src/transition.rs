@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::ids::{ActorId, Incarnation};
 use crate::ticket::Ticket;
-use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LATENT};
+use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
 
 /// No number of a sound record is larger: rewards end at 4 · 10⁶ by their settings, corridors at 1 km. The learner squares what it learns from, and single
 /// precision ends at 3 · 10³⁸.
@@ -19,7 +19,7 @@ pub const LARGEST_NUMBER: f32 = 1e7;
 /// One step of a flight on the wire. Every bit pattern is a valid value of every field's type; [`TransitionRecord::check`] says whether it makes sense.
 #[derive(Debug, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
-#[type_name("skein.TransitionRecord.v3")]
+#[type_name("skein.TransitionRecord.v4")]
 pub struct TransitionRecord {
     /// The run.
     pub run: u64,
@@ -49,8 +49,8 @@ pub struct TransitionRecord {
     pub orientation: [f32; 4],
     /// Velocity in the world in metres per second: forward, left, up.
     pub velocity_mps: [f32; 3],
-    /// The VAE's latent mean of `depth`, `[32]`.
-    pub latent: [f32; LATENT],
+    /// The VAE's latent mean of `depth`; zero from `vae.latent` on.
+    pub latent: LatentCode,
     /// Lateral and vertical velocity command, each in [-1, 1].
     pub action: [f32; ACTION],
     /// Sum of `reward_terms`.
@@ -74,9 +74,9 @@ pub struct TransitionRecord {
     pub depth: [u8; IMAGE_PIXELS],
 }
 
-// The header is five cache lines, so that in samples aligned to one (see `services`) the image starts on one; nothing is padding, so that the record is plain data.
-const _: () = assert!(std::mem::offset_of!(TransitionRecord, depth) == 320);
-const _: () = assert!(size_of::<TransitionRecord>() == 320 + IMAGE_PIXELS);
+// The header is seven cache lines, so that in samples aligned to one (see `services`) the image starts on one; nothing is padding, so that the record is plain data.
+const _: () = assert!(std::mem::offset_of!(TransitionRecord, depth) == 448);
+const _: () = assert!(size_of::<TransitionRecord>() == 448 + IMAGE_PIXELS);
 const _: () = assert!(align_of::<TransitionRecord>() == 8);
 
 /// What a record is within its flight.
@@ -204,6 +204,19 @@ impl TransitionRecord {
         Ok(kind)
     }
 
+    /// Whether the latent code is not longer than `latent` numbers.
+    ///
+    /// # Errors
+    /// [`RecordFault::Contradiction`]; such a record was made with another encoder.
+    pub fn check_latent(&self, latent: usize) -> Result<(), RecordFault> {
+        match self.latent[latent..].iter().all(|&value| value == 0.0) {
+            true => Ok(()),
+            false => Err(RecordFault::Contradiction {
+                what: "the latent code is longer than vae.latent",
+            }),
+        }
+    }
+
     fn check_numbers(&self) -> Result<(), RecordFault> {
         let usual = -LARGEST_NUMBER..=LARGEST_NUMBER;
         // A NaN is in no range.
@@ -327,6 +340,7 @@ pub enum RecordFault {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::LONGEST_LATENT;
     use crate::ids::{Attempt, FlightId, PolicyVersion, RunId};
     use crate::ticket::{CourseChoice, Exploration};
 
@@ -392,6 +406,19 @@ mod tests {
             (r.walls_passed, r.course_walls) = (6, 5);
         };
         assert!(check(closes).contains("walls_passed has the impossible value 6"));
+    }
+
+    #[test]
+    fn a_latent_code_ends_where_the_configuration_says() {
+        let mut record = record();
+        record.latent[..16].fill(0.5);
+        assert_eq!(record.check_latent(16), Ok(()));
+        assert_eq!(record.check_latent(LONGEST_LATENT), Ok(()));
+        for value in [1e-30, f32::NAN] {
+            record.latent[15] = value;
+            let refused = record.check_latent(15).unwrap_err().to_string();
+            assert!(refused.contains("longer than vae.latent"), "{refused}");
+        }
     }
 
     #[test]

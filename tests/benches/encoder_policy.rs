@@ -8,10 +8,10 @@ use skein_learner::algorithm::Inputs;
 use skein_learner::device::use_threads;
 use skein_learner::sac::TorchSac;
 use skein_learner::vae::{TorchVae, images_from_bytes};
-use skein_protocol::config::{Config, Observation, Precision};
+use skein_protocol::config::{Config, Observation, Precision, View};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout};
-use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LATENT};
+use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LONGEST_LATENT, LatentCode};
 use tch::Device;
 
 /// As in `local.toml`.
@@ -23,8 +23,9 @@ fn main() {
     use_threads(1);
     let mut config = Config::default();
     config.learning.observation = OBSERVATION;
+    let view = config.view();
     let vae = TorchVae::new(&config.vae, 1, Device::Cpu);
-    let sac = TorchSac::new(&config.sac, Inputs::same(OBSERVATION.len()), 1, Device::Cpu);
+    let sac = TorchSac::new(&config.sac, Inputs::of(&config), 1, Device::Cpu);
     let layout = SnapshotLayout::of(&config);
     let mut values = vec![0.0; layout.values()];
     vae.publish(&mut values[layout.encoder()]);
@@ -33,13 +34,13 @@ fn main() {
     let snapshot = Snapshot { version, values };
 
     let image: [u8; IMAGE_PIXELS] = std::array::from_fn(|pixel| (pixel * 7) as u8);
-    let mut observation = vec![0.0; OBSERVATION.len()];
-    let mut observe = |latent: [f32; LATENT]| {
-        OBSERVATION.write(&latent, &[1.0, 0.1, 0.1], &[0.0; ACTION], &mut observation);
+    let mut observation = vec![0.0; view.len()];
+    let mut observe = |latent: LatentCode| {
+        view.write_moment(&latent, &[1.0, 0.1, 0.1], &[0.0; ACTION], &mut observation);
         observation.clone()
     };
     let mut group = criterion.benchmark_group("encoder_policy");
-    group.throughput(Throughput::Elements(operations(config.sac.hidden_width)));
+    group.throughput(Throughput::Elements(operations(&view, config.sac.hidden_width)));
     for (name, precision) in [("native", Precision::F32), ("native-bf16", Precision::Bf16)] {
         let network = Network::new(&snapshot, &layout, precision);
         group.bench_function(name, |bencher| {
@@ -52,9 +53,9 @@ fn main() {
     }
     group.bench_function("libtorch", |bencher| {
         bencher.iter(|| {
-            let mut latent = [0.0; LATENT];
+            let mut latent = [0.0; LONGEST_LATENT];
             vae.encode(&images_from_bytes(black_box(&image)))
-                .copy_data(&mut latent, LATENT);
+                .copy_data(&mut latent, view.latent);
             black_box(sac.mode(&observe(latent)))
         });
     });
@@ -63,14 +64,14 @@ fn main() {
 }
 
 /// Floating-point operations of the products of both networks, a multiplication and an addition counted as two; nothing else is counted.
-fn operations(width: usize) -> u64 {
+fn operations(view: &View, width: usize) -> u64 {
     let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
     let mut products = 0;
     for channels in ENCODER_CHANNELS.windows(2) {
         size = size.map(|length| (length - ENCODER_KERNEL) / STRIDE + 1);
         products += size[0] * size[1] * ENCODER_KERNEL * ENCODER_KERNEL * channels[0] * channels[1];
     }
-    products += ENCODER_FEATURES * LATENT;
-    products += OBSERVATION.len() * width + 2 * width * width + width * 2 * ACTION;
+    products += ENCODER_FEATURES * view.latent;
+    products += view.len() * width + 2 * width * width + width * 2 * ACTION;
     2 * products as u64
 }

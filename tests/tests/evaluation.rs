@@ -37,11 +37,28 @@ fn a_runs_snapshot_flies_later_as_it_flew_in_the_run() {
     let fewer = evaluate(folder.path(), &["--run", directory, "--flights", "3"]);
     assert!(fewer.courses.iter().all(|course| course.flights == 3));
 
-    a_recording_holds_every_step_of_every_flight(&run, folder.path());
+    a_recording_holds_every_step_of_every_flight(&run, 32, folder.path());
+}
+
+#[test]
+fn a_code_of_another_length_is_learned_flown_and_recorded() {
+    for latent in [8, 64] {
+        let run = Recipe::small()
+            .set(&format!("vae.latent={latent}"))
+            .set("evaluation.flights=8")
+            .finish();
+        let summary = run.summary();
+        assert!(summary.vae_updates > 0 && summary.updates > 0, "{summary:?}");
+        let directory = run.directory.root().to_str().unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let later = evaluate(folder.path(), &["--run", directory]);
+        assert_eq!(later, run.evaluation(), "{latent} numbers");
+        a_recording_holds_every_step_of_every_flight(&run, latent, folder.path());
+    }
 }
 
 /// Read as NumPy documents its format, without any of our code.
-fn a_recording_holds_every_step_of_every_flight(run: &Ended, folder: &Path) {
+fn a_recording_holds_every_step_of_every_flight(run: &Ended, latent: usize, folder: &Path) {
     let file = folder.join("flights.npz");
     evaluate(
         folder,
@@ -62,7 +79,7 @@ fn a_recording_holds_every_step_of_every_flight(run: &Ended, folder: &Path) {
         ("orientation", "<f4", &[4]),
         ("velocity_mps", "<f4", &[3]),
         ("depth", "|u1", &[72, 128]),
-        ("latent", "<f4", &[32]),
+        ("latent", "<f4", &[latent]),
         ("action", "<f4", &[2]),
         ("reward_terms", "<f4", &[4]),
         ("reward", "<f4", &[]),
@@ -73,6 +90,12 @@ fn a_recording_holds_every_step_of_every_flight(run: &Ended, folder: &Path) {
         let array = array(&file, name, kind);
         assert_eq!(array.shape, [&[rows], row].concat(), "{name}");
     }
+    let codes = array(&file, "latent", "<f4");
+    let last = codes.words().skip(latent - 1).step_by(latent);
+    assert!(
+        last.map(f32::from_le_bytes).any(|number| number != 0.0),
+        "no code is as long as that"
+    );
     let flights = closing.data.iter().filter(|&&closing| closing == 1).count();
     assert_eq!(flights, 16, "eight flights on each of two courses");
 

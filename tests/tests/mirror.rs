@@ -6,7 +6,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_learner::flight::{CommittedFlight, StepObservation};
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
-use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
+use skein_protocol::{ACTION, IMAGE_PIXELS, LONGEST_LATENT};
 use skein_simulator::course::{Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout};
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 
@@ -62,7 +62,7 @@ fn fly(side: f32) -> CommittedFlight {
         depth.extend_from_slice(&image);
         let state = simulator.state();
         observations.push(StepObservation {
-            latent: [0.0; LATENT],
+            latent: [0.0; LONGEST_LATENT],
             velocity_mps: state.velocity_mps.into(),
             position_m: state.position_m.coords.into(),
             orientation: state.world_from_body.coords.into(),

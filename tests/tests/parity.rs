@@ -12,7 +12,7 @@ use skein_learner::vae::{NativeVae, TorchVae as Vae, images_from_bytes};
 use skein_protocol::config::{Config, Engine, Observation};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
-use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
+use skein_protocol::{ACTION, IMAGE_PIXELS};
 use tch::{Device, Tensor};
 
 const TOLERANCE: f32 = 1e-5;
@@ -28,6 +28,12 @@ const ENGINES: [Engine; 2] = [Engine::Native, Engine::Libtorch];
 fn config(observation: Observation) -> Config {
     let mut config = Config::default();
     config.learning.observation = observation;
+    config
+}
+
+fn with_latent(latent: usize) -> Config {
+    let mut config = config(Observation::Latent);
+    config.vae.latent = latent;
     config
 }
 
@@ -81,8 +87,8 @@ fn gaussian(network: &Network, observed: &[f32]) -> [[f32; ACTION]; 2] {
 
 #[test]
 fn the_native_encoder_is_the_learners() {
-    let config = config(Observation::Latent);
-    for seed in SEEDS {
+    for (seed, latent) in SEEDS.zip([32, 8, 64]) {
+        let config = with_latent(latent);
         let vae = vae(&config, seed);
         let network = network(&config, &vae, |_| {});
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
@@ -91,9 +97,9 @@ fn the_native_encoder_is_the_learners() {
         let learner = rows(&vae.encode(&images_from_bytes(&images.concat())));
         let mut scratch = Scratch::default();
         for (image, learner) in images.iter().zip(&learner) {
-            let native: [f32; LATENT] = network.encode(image, &mut scratch);
-            assert_alive("latent", &native);
-            assert_close("latent", &native, learner);
+            let native = &network.encode(image, &mut scratch)[..latent];
+            assert_alive("latent", native);
+            assert_close("latent", native, learner);
         }
     }
 }
@@ -103,13 +109,13 @@ fn the_native_policy_is_the_learners() {
     for (seed, observation) in SEEDS.zip(OBSERVATIONS) {
         let config = config(observation);
         let mut layout = Layout::default();
-        let policy = Policy::describe(&mut layout, observation.len() as i64, config.sac.hidden_width as i64);
+        let policy = Policy::describe(&mut layout, config.view().len() as i64, config.sac.hidden_width as i64);
         let parameters = Parameters::initialise(layout, seed, Device::Cpu);
         let network = network(&config, &vae(&config, seed), |into| {
             parameters.copy_range(0..into.len(), into)
         });
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
-        let observed: Vec<f32> = (0..observation.len()).map(|_| rng.random_range(-3.0..3.0)).collect();
+        let observed: Vec<f32> = (0..config.view().len()).map(|_| rng.random_range(-3.0..3.0)).collect();
         let (mean, log_std) = policy.distribution(&parameters, &Tensor::from_slice(&observed).unsqueeze(0));
         let [native_mean, native_log_std] = gaussian(&network, &observed);
         assert_alive("mean", &native_mean);
@@ -123,7 +129,7 @@ fn the_native_policy_is_the_learners() {
 fn both_bound_an_extreme_spread_alike() {
     let config = config(Observation::Latent);
     let mut layout = Layout::default();
-    let policy = Policy::describe(&mut layout, LATENT as i64, config.sac.hidden_width as i64);
+    let policy = Policy::describe(&mut layout, config.view().len() as i64, config.sac.hidden_width as i64);
     let mut parameters = Parameters::initialise(layout, 0, Device::Cpu);
     // The last two values are the biases of the logarithms of the standard deviations.
     let count = parameters.layout().len();
@@ -138,7 +144,7 @@ fn both_bound_an_extreme_spread_alike() {
     let network = network(&config, &vae(&config, 0), |into| {
         parameters.copy_range(0..into.len(), into)
     });
-    let observed = [0.5; LATENT];
+    let observed = vec![0.5; config.view().len()];
     let (_, log_std) = policy.distribution(&parameters, &Tensor::from_slice(&observed).unsqueeze(0));
     let [_, native_log_std] = gaussian(&network, &observed);
     assert_eq!(native_log_std.to_vec(), rows(&log_std)[0]);
@@ -151,9 +157,9 @@ fn what_the_learner_publishes_flies_as_the_learner_says() {
         .flat_map(|observation| ENGINES.map(|engine| (observation, engine)))
     {
         let config = config(observation);
-        let sac = Sac::new(&config.sac, Inputs::same(observation.len()), 9, engine, Device::Cpu);
+        let sac = Sac::new(&config.sac, Inputs::of(&config), 9, engine, Device::Cpu);
         let network = network(&config, &vae(&config, 9), |into| sac.publish(into));
-        let observed = vec![0.3; observation.len()];
+        let observed = vec![0.3; config.view().len()];
         let learner = sac.mode(&observed);
         let native = network.distribution(&observed, &mut Scratch::default()).mode();
         assert_alive("action", &native);
@@ -163,18 +169,20 @@ fn what_the_learner_publishes_flies_as_the_learner_says() {
 
 #[test]
 fn the_native_engine_encodes_as_the_actor_does_bit_for_bit() {
-    let config = config(Observation::Latent);
-    let mut native = NativeVae::new(&config.vae, 3, 2);
-    let torch = vae(&config, 3);
-    let mut rng = Pcg64Mcg::seed_from_u64(3);
-    let images: Vec<[u8; IMAGE_PIXELS]> = (0..3).map(|_| std::array::from_fn(|_| rng.random())).collect();
-    let learner = native.encode(&images.concat());
-    // Both engines begin with the same parameters.
-    let network = network(&config, &torch, |_| {});
-    let mut scratch = Scratch::default();
-    for (image, learner) in images.iter().zip(learner) {
-        let actor = network.encode(image, &mut scratch);
-        assert_alive("latent", &actor);
-        assert_eq!(actor, learner);
+    for latent in [32, 16, 64] {
+        let config = with_latent(latent);
+        let mut native = NativeVae::new(&config.vae, 3, 2);
+        let torch = vae(&config, 3);
+        let mut rng = Pcg64Mcg::seed_from_u64(3);
+        let images: Vec<[u8; IMAGE_PIXELS]> = (0..3).map(|_| std::array::from_fn(|_| rng.random())).collect();
+        let learner = native.encode(&images.concat());
+        // Both engines begin with the same parameters.
+        let network = network(&config, &torch, |_| {});
+        let mut scratch = Scratch::default();
+        for (image, learner) in images.iter().zip(learner.chunks_exact(latent)) {
+            let actor = network.encode(image, &mut scratch);
+            assert_alive("latent", &actor);
+            assert_eq!(actor[..latent], *learner);
+        }
     }
 }

@@ -78,7 +78,7 @@ impl Run {
 
     /// A desk with one order.
     fn desk(&self) -> Desk {
-        let mut desk = Desk::new(self.identity.run, &self.config.transport);
+        let mut desk = Desk::new(self.identity.run, &self.config.transport, self.config.vae.latent);
         desk.order(Order {
             ticket: self.ticket(0),
             epoch: Epoch(0),

@@ -125,7 +125,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     if let Some(file) = &arguments.record {
         let names: Vec<_> = courses.evaluation().map(|entry| entry.name.as_str()).collect();
-        write_recording(file, &names, &evaluated.flights)?;
+        write_recording(file, &names, config.vae.latent, &evaluated.flights)?;
     }
     Ok(())
 }
@@ -267,7 +267,7 @@ fn threads_help() -> String {
 fn columns_help() -> String {
     let rows = COLUMNS.iter().map(|column| {
         let shape: Vec<_> = std::iter::once("n".to_owned())
-            .chain(column.shape.iter().map(usize::to_string))
+            .chain(column.shape.iter().map(ToString::to_string))
             .collect();
         format!(
             "  {:<13} {:<4} {:<14} {}\n",

@@ -67,14 +67,14 @@ pub(super) fn ticket(exploration: Exploration, seed: u64) -> Ticket {
 
 const NETWORK: skein_protocol::ids::PolicyVersion = skein_protocol::ids::PolicyVersion(4);
 
+/// What the policies here see.
+fn view() -> View {
+    View::present(Observation::LatentVelocityAction, 32)
+}
+
 pub(super) fn pilot(simulator: &str) -> Pilot {
     let courses = Courses::of_run(&config(simulator)).unwrap();
-    Pilot::new(
-        ACTOR,
-        LIFE,
-        Simulators::new(Arc::new(courses)),
-        Agent::new(View::present(Observation::LatentVelocityAction)),
-    )
+    Pilot::new(ACTOR, LIFE, Simulators::new(Arc::new(courses)), Agent::new(view()))
 }
 
 /// Everything that may disturb a flight.
@@ -82,7 +82,7 @@ pub(super) const STORMY: &str =
     "disturbances = { mass_spread = 0.2, latency_periods = 1, gust.force_rms_n = 0.15, depth.model = \"stereo\" }";
 
 pub(super) fn network(change: impl Fn(&mut [f32])) -> Network {
-    let layout = SnapshotLayout::new(Observation::LatentVelocityAction.len(), 16);
+    let layout = SnapshotLayout::new(&view(), 16);
     let mut snapshot = random_snapshot(&layout, NETWORK.0);
     change(&mut snapshot.values[layout.policy()]);
     Network::new(&snapshot, &layout, Precision::F32)
@@ -275,12 +275,12 @@ fn a_disturbed_flight_is_a_function_of_its_ticket_too() {
 
 #[test]
 fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
-    const MOMENT: Observation = Observation::LatentVelocityAction;
     let view = View {
-        moment: MOMENT,
+        moment: Observation::LatentVelocityAction,
+        latent: 16,
         history_steps: vec![1, 3],
     };
-    let layout = SnapshotLayout::new(view.len(), 16);
+    let layout = SnapshotLayout::new(&view, 16);
     let network = Network::new(&random_snapshot(&layout, NETWORK.0), &layout, Precision::F32);
     let courses = Arc::new(Courses::of_run(&config("")).unwrap());
     let mut pilot = Pilot::new(ACTOR, LIFE, Simulators::new(courses), Agent::new(view.clone()));
@@ -296,7 +296,8 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
             let mut observed = Vec::new();
             for moment in [step, step.max(1) - 1, step.max(3) - 3] {
                 let seen = &tape.sent[moment];
-                observed.extend(seen.latent);
+                observed.extend(&seen.latent[..16]);
+                assert_eq!(seen.latent[16..], [0.0; 48]);
                 observed.extend(&seen.velocity_mps[1..]);
                 observed.extend(if moment == 0 {
                     [0.0; 2]
@@ -315,7 +316,7 @@ fn what_was_hit_is_in_the_closing_record() {
     // A pilot that wants straight on hits the first wall; one that wants up, the ceiling.
     let closing = |bias: f32| {
         let mut tape = Tape::default();
-        let layout = SnapshotLayout::new(Observation::LatentVelocityAction.len(), 16);
+        let layout = SnapshotLayout::new(&view(), 16);
         let steady = network(|policy| {
             policy.fill(0.0);
             // The last layer's bias begins with the means: lateral, vertical.

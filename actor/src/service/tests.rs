@@ -50,7 +50,7 @@ impl Run {
         started.actor = Some(std::thread::spawn(move || {
             let _presence = Presence::enter(&identity).unwrap();
             let courses = Arc::new(Courses::of_run(&config).unwrap());
-            let agent = Agent::new(config.learning.view());
+            let agent = Agent::new(config.view());
             let mut pilot = Pilot::new(ACTOR, Incarnation(0), Simulators::new(courses), agent);
             Service::new(&identity, &config, ACTOR, &told_to_end).serve(&mut pilot)
         }));

@@ -119,7 +119,7 @@ pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
 fn checkpoint_bytes(config: &Config) -> u64 {
     let records = config.transport.max_records_per_flight as u64;
     let rows = (config.replay.capacity as u64).min(config.run.flights.saturating_mul(records));
-    let row = 4 * (2 * config.learning.view().len() + ACTION + 2) as u64;
+    let row = 4 * (2 * config.view().len() + ACTION + 2) as u64;
     let images = 2 * config.vae.train_steps as u64 + config.learning.flights_per_epoch * records;
     let images = images.min(config.run.flights.saturating_mul(records));
     let snapshot = 4 * SnapshotLayout::of(config).values() as u64;

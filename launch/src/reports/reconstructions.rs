@@ -84,7 +84,7 @@ pub(super) fn draw(pairs: &Pairs, path: &Path) -> Result<(), ReportError> {
     };
 
     canvas.draw(|area| {
-        let title = "Depth image (above) and its reconstruction from 32 numbers (below); brighter is farther";
+        let title = "Depth image (above) and its reconstruction from the latent code (below); brighter is farther";
         area.draw_text(title, &font(19), (px(GAP) as i32, px(14) as i32))?;
         for (i, (depth, reconstruction)) in pairs.iter().take(shown).enumerate() {
             let (x, y) = corner(i);

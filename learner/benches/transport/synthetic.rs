@@ -29,6 +29,8 @@ struct Actor {
     tickets: VecDeque<Ticket>,
     has_told_of_waiting: bool,
     is_over: bool,
+    /// Length of the latent codes.
+    latent: usize,
     image: Box<[u8; IMAGE_PIXELS]>,
 }
 
@@ -60,6 +62,7 @@ impl Actor {
             tickets: VecDeque::new(),
             has_told_of_waiting: false,
             is_over: false,
+            latent: config.vae.latent,
             image: Box::new([id.0 as u8; IMAGE_PIXELS]),
         }
     }
@@ -114,7 +117,7 @@ impl Actor {
         record.position_m = [0.5 * step as f32, 0.0, 3.5];
         record.orientation = [0.0, 0.0, 0.0, 1.0];
         record.velocity_mps = [1.0, 0.0, 0.0];
-        record.latent.fill(0.5);
+        record.latent[..self.latent].fill(0.5);
         record.depth.copy_from_slice(&self.image[..]);
         record
     }

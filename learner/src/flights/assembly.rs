@@ -22,6 +22,7 @@ pub struct Assembly {
     /// Of a later leg: where it is to begin.
     begins: Option<LegEnd>,
     longest_records: usize,
+    latent: usize,
     /// How the last step left the flight; its walls passed are in `flight`.
     last_step: StepEnd,
 }
@@ -84,11 +85,12 @@ pub enum Assembled {
 }
 
 impl Assembly {
-    /// Nothing yet of what `order` asks for, of a flight of at most `longest_records`. A later leg `begins` where the one before it ended.
+    /// Nothing yet of what `order` asks for, of a flight of at most `longest_records` with codes of `latent` numbers. A later leg `begins` where the one before it ended.
     pub fn new(
         order: Order,
         begins: Option<LegEnd>,
         longest_records: usize,
+        latent: usize,
         actor: ActorId,
         incarnation: Incarnation,
     ) -> Self {
@@ -102,6 +104,7 @@ impl Assembly {
             incarnation,
             begins,
             longest_records,
+            latent,
             last_step: StepEnd::Onward,
         }
     }
@@ -136,6 +139,7 @@ impl Assembly {
         if kind == RecordKind::Failed {
             return Ok(Assembled::Failed);
         }
+        record.check_latent(self.latent)?;
         if self.flight.observations.len() == self.longest_records {
             let most = self.longest_records;
             return Err(RecordFault::TooLong { most });

@@ -10,6 +10,8 @@ use super::*;
 
 const ACTOR: ActorId = ActorId(2);
 const LIFE: Incarnation = Incarnation(11);
+/// Length of the latent codes.
+const LATENT: usize = 16;
 /// Steps of the flight here.
 const STEPS: u32 = 3;
 
@@ -37,7 +39,7 @@ fn order(ticket: Ticket, keep: Keep) -> Order {
 }
 
 fn assembly(keep: Keep) -> Assembly {
-    Assembly::new(order(ticket(), keep), None, STEPS as usize + 1, ACTOR, LIFE)
+    Assembly::new(order(ticket(), keep), None, STEPS as usize + 1, LATENT, ACTOR, LIFE)
 }
 
 /// Record `step`, its image filled with its number.
@@ -81,6 +83,18 @@ fn no_flight_mixes_policy_versions() {
 }
 
 #[test]
+fn a_code_that_is_longer_than_configured_is_refused() {
+    let mut assembly = assembly(Keep::Latents);
+    let mut longer = record(0);
+    longer.latent[..LATENT].fill(0.5);
+    assembly.push(&longer).unwrap();
+    longer.step = 1;
+    longer.latent[LATENT] = 0.5;
+    let fault = assembly.push(&longer).unwrap_err().to_string();
+    assert!(fault.contains("longer than vae.latent"), "{fault}");
+}
+
+#[test]
 fn a_flight_that_never_ends_is_refused_at_its_limit() {
     let mut assembly = assembly(Keep::Depth);
     let onward = |step| {
@@ -112,7 +126,7 @@ fn leg(begins: Option<LegEnd>) -> Assembly {
         leg: Some(leg),
         ..ticket()
     };
-    Assembly::new(order(ticket, Keep::Depth), begins, 100, ACTOR, LIFE)
+    Assembly::new(order(ticket, Keep::Depth), begins, 100, LATENT, ACTOR, LIFE)
 }
 
 fn changed(mut record: TransitionRecord, change: impl FnOnce(&mut TransitionRecord)) -> TransitionRecord {
@@ -176,7 +190,7 @@ fn a_leg_that_is_too_short_or_too_long_or_of_a_whole_flight_is_refused() {
 #[test]
 fn a_leg_begins_where_the_one_before_it_ended_with_the_walls_that_were_passed() {
     let seen = StepObservation {
-        latent: [9.0; skein_protocol::LATENT],
+        latent: [9.0; skein_protocol::LONGEST_LATENT],
         velocity_mps: [1.0, 0.5, 0.0],
         position_m: [3.0, 0.0, 2.0],
         orientation: [0.0, 0.0, 0.0, 1.0],

@@ -33,6 +33,8 @@ const MOST_SPOILED: u32 = 3;
 pub struct Desk {
     run: RunId,
     limits: TransportSection,
+    /// Length of the latent codes that actors send.
+    latent: usize,
     /// Orders without an actor, first to be flown first.
     waiting: VecDeque<Order>,
     actors: BTreeMap<ActorId, Actor>,
@@ -88,11 +90,12 @@ impl Issued {
 }
 
 impl Desk {
-    /// A desk of `run` without orders and actors.
-    pub fn new(run: RunId, limits: &TransportSection) -> Self {
+    /// A desk of `run` without orders and actors; records hold codes of `latent` numbers.
+    pub fn new(run: RunId, limits: &TransportSection, latent: usize) -> Self {
         Self {
             run,
             limits: limits.clone(),
+            latent,
             waiting: VecDeque::new(),
             actors: BTreeMap::new(),
             failures: Failures::default(),
@@ -361,7 +364,7 @@ impl Desk {
             messages.push(Message::fly(&order.ticket, id, actor.incarnation));
             let begins = self.leg_end.filter(|end| end.is_before(&order));
             let longest = self.limits.max_records_per_flight;
-            let assembly = Assembly::new(order, begins, longest, id, actor.incarnation);
+            let assembly = Assembly::new(order, begins, longest, self.latent, id, actor.incarnation);
             self.is_wake_due |= actor.may_wait || actor.tickets.is_empty();
             actor.tickets.push_back(Issued {
                 since: now,

@@ -112,7 +112,7 @@ pub(super) fn feed(desk: &mut Desk, records: &[TransitionRecord], now: Instant) 
 
 /// A desk with one actor that holds tickets 0 and 1 of three orders.
 pub(super) fn desk(now: Instant) -> (Desk, Vec<Ticket>) {
-    let mut desk = Desk::new(RUN, &limits());
+    let mut desk = Desk::new(RUN, &limits(), 32);
     (0..3).for_each(|flight| desk.order(order(flight)));
     attach(&mut desk, 0, LIFE, now);
     let tickets = tickets_for(&desk.issue(now), 0, LIFE);
@@ -132,7 +132,7 @@ fn credit_bounds_what_is_in_the_air_and_returns_with_each_flight() {
 #[test]
 fn every_actor_gets_its_first_ticket_before_any_its_second() {
     let now = Instant::now();
-    let mut desk = Desk::new(RUN, &limits());
+    let mut desk = Desk::new(RUN, &limits(), 32);
     (0..3).for_each(|flight| desk.order(order(flight)));
     attach(&mut desk, 0, LIFE, now);
     attach(&mut desk, 1, LIFE, now);
@@ -268,7 +268,7 @@ fn a_flight_that_the_only_actor_always_fails_is_given_up_with_the_reason() {
 #[test]
 fn an_actor_that_sends_garbage_for_ever_fails_no_run_while_another_flies() {
     let now = Instant::now();
-    let mut desk = Desk::new(RUN, &limits());
+    let mut desk = Desk::new(RUN, &limits(), 32);
     (0..6).for_each(|flight| desk.order(order(flight)));
     attach(&mut desk, 0, LIFE, now);
     desk.issue(now);
@@ -291,7 +291,7 @@ fn an_actor_that_sends_garbage_for_ever_fails_no_run_while_another_flies() {
 #[test]
 fn a_flight_that_two_actors_fail_is_given_up() {
     let now = Instant::now();
-    let mut desk = Desk::new(RUN, &limits());
+    let mut desk = Desk::new(RUN, &limits(), 32);
     desk.order(order(0));
     attach(&mut desk, 0, LIFE, now);
     desk.issue(now);
@@ -326,6 +326,7 @@ fn actors_beyond_the_limit_get_no_tickets_until_there_is_room() {
             max_actors: 2,
             ..limits()
         },
+        32,
     );
     (0..3).for_each(|actor| attach(&mut desk, actor, LIFE, start));
     assert_eq!(desk.actors().count(), 2);
@@ -369,7 +370,7 @@ proptest! {
     fn every_order_is_committed_exactly_once_and_whole(events in prop::collection::vec(event(), 0..60)) {
         const ORDERS: u64 = 12;
         let mut now = Instant::now();
-        let mut desk = Desk::new(RUN, &limits());
+        let mut desk = Desk::new(RUN, &limits(), 32);
         (0..ORDERS).for_each(|flight| desk.order(order(flight)));
         let mut lives = [LIFE; 3];
         let mut held: [VecDeque<Ticket>; 3] = Default::default();
@@ -442,7 +443,7 @@ proptest! {
 #[test]
 fn the_times_of_all_lives_of_all_actors_are_summed_up_and_none_twice() {
     let now = Instant::now();
-    let mut desk = Desk::new(RUN, &limits());
+    let mut desk = Desk::new(RUN, &limits(), 32);
     let flies = |desk: &mut Desk, actor, life, secs| flown(desk, actor, life, ActorState::Serving, secs, now);
     let physics = |desk: &Desk| desk.actor_times().of(Stage::Physics);
     let next_life = Incarnation(LIFE.0 + 1);

@@ -35,7 +35,7 @@ fn flown(ticket: &Ticket, actor: u32, x_m: f32) -> [TransitionRecord; 2] {
 
 /// A desk whose first leg was flown by actor 0 of two, from 0 m to 1 m, and whose second is given to it.
 fn desk(now: Instant) -> (Desk, Ticket) {
-    let mut desk = Desk::new(RUN, &limits());
+    let mut desk = Desk::new(RUN, &limits(), 32);
     attach(&mut desk, 0, LIFE, now);
     attach(&mut desk, 1, LIFE, now);
     desk.order(leg(0));

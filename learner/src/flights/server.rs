@@ -82,7 +82,7 @@ impl Server {
     pub(super) fn new(identity: &RunIdentity, config: &Config, ports: LearnerPorts) -> Self {
         Self {
             run: identity.run,
-            desk: Desk::new(identity.run, &config.transport),
+            desk: Desk::new(identity.run, &config.transport, config.vae.latent),
             deliveries: BTreeMap::new(),
             ports,
             outbox: VecDeque::new(),

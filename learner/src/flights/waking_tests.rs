@@ -85,7 +85,7 @@ struct World {
 
 impl World {
     fn new(flights: u64) -> Self {
-        let mut desk = Desk::new(RUN, &limits());
+        let mut desk = Desk::new(RUN, &limits(), 32);
         (0..flights).for_each(|flight| desk.order(order(flight)));
         let mut actors = vec![Actor::default(), Actor::default(), Actor::default()];
         actors.iter_mut().for_each(|actor| actor.words = 1);

@@ -1,6 +1,5 @@
 //! The VAE's decoder: latent code to depth image.
 
-use skein_protocol::LATENT;
 use tch::Tensor;
 
 use super::{Layout, Linear, Parameters, TransposedConvolution};
@@ -14,9 +13,9 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// Describes the layers.
-    pub fn describe(layout: &mut Layout) -> Self {
-        let unfold = Linear::describe(layout, "decoder.linear", LATENT as i64, 1024 * 3);
+    /// Describes the layers, for codes of `latent` numbers.
+    pub fn describe(layout: &mut Layout, latent: usize) -> Self {
+        let unfold = Linear::describe(layout, "decoder.linear", latent as i64, 1024 * 3);
         let mut convolution = |number: usize, inputs: i64, outputs: i64, kernel: [i64; 2]| {
             TransposedConvolution::describe(layout, &format!("decoder.conv{number}"), inputs, outputs, kernel)
         };
@@ -31,7 +30,7 @@ impl Decoder {
         }
     }
 
-    /// `[n, 32]` to `[n, 1, 72, 128]`, depth in [0, 1].
+    /// `[n, latent]` to `[n, 1, 72, 128]`, depth in [0, 1].
     pub fn forward(&self, parameters: &Parameters, latents: &Tensor) -> Tensor {
         let mut image = self.unfold.forward(parameters, latents).relu_().view([-1, 1024, 1, 3]);
         let [hidden @ .., last] = &self.convolutions;

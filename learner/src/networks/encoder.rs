@@ -1,7 +1,7 @@
 //! The VAE's encoder: depth image to the distribution of its latent code.
 
 use skein_protocol::snapshot::{ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL};
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_WIDTH, LATENT};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_WIDTH};
 use tch::{Kind, Tensor};
 
 use super::{Convolution, Layout, Linear, Parameters};
@@ -22,15 +22,15 @@ pub struct Encoder {
 }
 
 impl Encoder {
-    /// Describes the part that actors need, convolutions and mean head, and then the log-variance head.
-    pub fn describe(layout: &mut Layout) -> Self {
+    /// Describes the part that actors need, convolutions and mean head, and then the log-variance head; each head gives `latent` numbers.
+    pub fn describe(layout: &mut Layout, latent: usize) -> Self {
         let convolutions = std::array::from_fn(|index| {
             let [inputs, outputs] = [ENCODER_CHANNELS[index] as i64, ENCODER_CHANNELS[index + 1] as i64];
             let kernel = [ENCODER_KERNEL as i64; 2];
             Convolution::describe(layout, &format!("encoder.conv{}", index + 1), inputs, outputs, kernel)
         });
         let head =
-            |layout: &mut Layout, name: &str| Linear::describe(layout, name, ENCODER_FEATURES as i64, LATENT as i64);
+            |layout: &mut Layout, name: &str| Linear::describe(layout, name, ENCODER_FEATURES as i64, latent as i64);
         let mean = head(layout, "encoder.mean");
         let published_len = layout.len();
         Self {
@@ -46,7 +46,7 @@ impl Encoder {
         self.published_len
     }
 
-    /// Mean and log-variance of the latent code, `[n, 32]` each. `pixels`: `[n, 1, 72, 128]` in [0, 1].
+    /// Mean and log-variance of the latent code, `[n, latent]` each. `pixels`: `[n, 1, 72, 128]` in [0, 1].
     pub fn distribution(&self, parameters: &Parameters, pixels: &Tensor) -> (Tensor, Tensor) {
         let features = self.features(parameters, pixels);
         let log_variance = self.log_variance.forward(parameters, &features);
@@ -56,7 +56,7 @@ impl Encoder {
         )
     }
 
-    /// Mean of the latent code, `[n, 32]`: what the policy sees.
+    /// Mean of the latent code, `[n, latent]`: what the policy sees.
     pub fn mean(&self, parameters: &Parameters, pixels: &Tensor) -> Tensor {
         self.mean.forward(parameters, &self.features(parameters, pixels))
     }

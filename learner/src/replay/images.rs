@@ -8,7 +8,7 @@
 use std::sync::Arc;
 
 use rand::{Rng, RngExt};
-use skein_protocol::{IMAGE_PIXELS, LATENT};
+use skein_protocol::{IMAGE_PIXELS, LatentCode};
 
 /// Images, by number.
 #[derive(Debug)]
@@ -88,8 +88,8 @@ impl ImageStore {
     pub(super) fn encode<E>(
         &self,
         chunk: usize,
-        mut encode: impl FnMut(&[u8]) -> Result<Vec<[f32; LATENT]>, E>,
-    ) -> Result<Vec<[f32; LATENT]>, E> {
+        mut encode: impl FnMut(&[u8]) -> Result<Vec<LatentCode>, E>,
+    ) -> Result<Vec<LatentCode>, E> {
         let mut latents = Vec::with_capacity(self.len);
         let mut images = Vec::with_capacity(chunk.min(self.len) * IMAGE_PIXELS);
         let mut pending = self

@@ -19,7 +19,7 @@ use std::sync::Arc;
 use rand::{Rng, RngExt};
 use skein_protocol::config::{Config, ReplaySection, View};
 use skein_protocol::ids::FlightId;
-use skein_protocol::{ACTION, IMAGE_PIXELS, LATENT};
+use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode};
 
 use crate::flight::{CommittedFlight, FlightFault};
 use images::ImageStore;
@@ -104,7 +104,7 @@ pub enum InsertError {
 impl Replay {
     /// An empty buffer for the run configured by `config`.
     pub fn new(config: &Config) -> Self {
-        let view = config.learning.view();
+        let view = config.view();
         let layout = RowLayout::of(config);
         let (success, regular) = capacities(&config.replay);
         Self {
@@ -214,7 +214,7 @@ impl Replay {
     pub fn renew_latents<E>(
         &mut self,
         chunk: usize,
-        encode: impl FnMut(&[u8]) -> Result<Vec<[f32; LATENT]>, E>,
+        encode: impl FnMut(&[u8]) -> Result<Vec<LatentCode>, E>,
     ) -> Result<(), E> {
         if let Some(images) = &self.images {
             let latents = images.encode(chunk, encode)?;

@@ -4,7 +4,7 @@
 //! is bound by cache misses, and a row costs one run of neighbouring cache lines where a table per quantity would cost one miss each.
 
 use skein_protocol::config::{Config, CriticInput, View};
-use skein_protocol::{ACTION, LATENT};
+use skein_protocol::{ACTION, LatentCode};
 
 use crate::flight::TRUE_STATE;
 
@@ -44,7 +44,7 @@ impl RowLayout {
     /// That of the run configured by `config`.
     pub(super) fn of(config: &Config) -> Self {
         Self {
-            observation: config.learning.view().len(),
+            observation: config.view().len(),
             true_state: match config.learning.critic_input {
                 CriticInput::Observation => 0,
                 CriticInput::GroundTruth => TRUE_STATE,
@@ -191,7 +191,7 @@ impl Ring {
     pub(super) fn replace_latents(
         &mut self,
         view: &View,
-        latents: &[[f32; LATENT]],
+        latents: &[LatentCode],
         first_of_flight: impl Fn(u32) -> u32,
     ) {
         for (values, &image) in self.rows.chunks_exact_mut(self.layout.width()).zip(&self.images) {
@@ -199,9 +199,9 @@ impl Ring {
             let first = first_of_flight(image);
             let (flight, step) = (&latents[first as usize..], (image - first) as usize);
             for (step, observation) in [(step, row.observation), (step + 1, row.next_observation)] {
-                let moments = observation.chunks_exact_mut(view.moment.len());
+                let moments = observation.chunks_exact_mut(view.moment_len());
                 for (moment, seen) in view.moments(step).zip(moments) {
-                    seen[..LATENT].copy_from_slice(&flight[moment]);
+                    view.write_code(&flight[moment], seen);
                 }
             }
         }

@@ -1,7 +1,5 @@
 //! Transitions for tests.
 
-use skein_protocol::config::Observation;
-
 use crate::algorithm::Columns;
 use crate::noise::Noise;
 
@@ -18,14 +16,14 @@ pub(crate) struct Transitions {
 }
 
 impl Transitions {
-    /// Numbers without a meaning; every third transition is the last of its task.
-    pub(crate) fn random(observation: Observation, rows: usize, noise: &mut Noise) -> Self {
+    /// Numbers without a meaning, observations of `width`; every third transition is the last of its task.
+    pub(crate) fn random(width: usize, rows: usize, noise: &mut Noise) -> Self {
         let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(1.0)).collect() };
         Self {
-            observations: draw(rows * observation.len()),
+            observations: draw(rows * width),
             actions: draw(rows * 2),
             rewards: draw(rows),
-            next_observations: draw(rows * observation.len()),
+            next_observations: draw(rows * width),
             told: None,
             terminated: (0..rows).map(|row| f32::from(row % 3 == 1)).collect(),
         }
@@ -39,8 +37,7 @@ impl Transitions {
     }
 
     /// A one-step task: the observation's first two numbers are the action that would have been right.
-    pub(crate) fn guessing(observation: Observation, rows: usize, noise: &mut Noise) -> Self {
-        let width = observation.len();
+    pub(crate) fn guessing(width: usize, rows: usize, noise: &mut Noise) -> Self {
         let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(0.8)).collect() };
         let (observations, actions) = (draw(rows * width), draw(rows * 2));
         let rewards = (0..rows).map(|row| {

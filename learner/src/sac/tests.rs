@@ -1,7 +1,7 @@
 //! The whole update, on both engines: exactness, determinism, and that it learns.
 
 use skein_kernels::Team;
-use skein_protocol::config::{Engine, Observation, SacSection};
+use skein_protocol::config::{Engine, Observation, SacSection, View};
 use skein_protocol::snapshot::SnapshotLayout;
 use tch::Device;
 
@@ -12,7 +12,8 @@ use crate::algorithm::Inputs;
 use crate::noise::Noise;
 use crate::state::{NamedTensor, Stateful, TensorValues};
 
-const OBSERVATION: Observation = Observation::Latent;
+/// Numbers in an observation.
+const OBSERVATION: usize = 32;
 pub(super) const ENGINES: [Engine; 2] = [Engine::Native, Engine::Libtorch];
 
 fn small() -> SacSection {
@@ -25,7 +26,7 @@ fn small() -> SacSection {
 
 fn sac(engine: Engine, section: &SacSection, seed: u64) -> Sac {
     crate::device::use_threads(1);
-    Sac::new(section, Inputs::same(OBSERVATION.len()), seed, engine, Device::Cpu)
+    Sac::new(section, Inputs::same(OBSERVATION), seed, engine, Device::Cpu)
 }
 
 fn update(sac: &mut Sac, transitions: &Transitions, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {
@@ -129,7 +130,7 @@ fn truncated_flight_still_bootstraps() {
 fn the_published_part_is_the_snapshots_policy() {
     for engine in ENGINES {
         let mut sac = sac(engine, &small(), 1);
-        let layout = SnapshotLayout::new(OBSERVATION.len(), 32);
+        let layout = SnapshotLayout::new(&View::present(Observation::Latent, OBSERVATION), 32);
         assert_eq!(layout.policy().len(), sac.published_len());
         let policys = layout
             .tensors()
@@ -167,7 +168,7 @@ fn the_right_action_is_learned_in_a_one_step_task() {
             train(&mut sac, 600, seed);
             let test = Transitions::guessing(OBSERVATION, 256, &mut Noise::new(seed + 100));
             let actions = sac.mode(&test.observations);
-            let observations = test.observations.chunks_exact(OBSERVATION.len());
+            let observations = test.observations.chunks_exact(OBSERVATION);
             let squared = observations
                 .zip(actions.chunks_exact(2))
                 .map(|(wanted, done)| (wanted[0] - done[0]).powi(2) + (wanted[1] - done[1]).powi(2));

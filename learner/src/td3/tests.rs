@@ -1,7 +1,5 @@
 //! The update against automatic gradients, and that it learns.
 
-use skein_protocol::LATENT;
-use skein_protocol::config::Observation;
 use tch::{Device, Tensor, no_grad_guard};
 
 use super::*;
@@ -9,10 +7,11 @@ use crate::networks::Parameters;
 use crate::optimizer::Adam;
 use crate::sac::samples::Transitions;
 
-const OBSERVATION: Observation = Observation::LatentVelocity;
+/// Numbers in an observation.
+const OBSERVATION: usize = 34;
 /// Where the critic is told something else than the policy sees.
 const TOLD: Inputs = Inputs {
-    policy: LATENT + 2,
+    policy: OBSERVATION,
     critic: 19,
 };
 
@@ -24,7 +23,7 @@ fn section() -> Td3Section {
 }
 
 fn td3(section: &Td3Section, seed: u64) -> Td3 {
-    Td3::new(section, Inputs::same(OBSERVATION.len()), seed, Isa::best())
+    Td3::new(section, Inputs::same(OBSERVATION), seed, Isa::best())
 }
 
 /// The same algorithm on libtorch, in reading order, with [`TOLD`].
@@ -202,7 +201,7 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
                 &asked.observations,
                 &mut actions,
             );
-            let wanted = asked.observations.chunks(OBSERVATION.len()).flat_map(|row| &row[..2]);
+            let wanted = asked.observations.chunks(OBSERVATION).flat_map(|row| &row[..2]);
             let squares = actions
                 .iter()
                 .zip(wanted)
@@ -232,7 +231,7 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
 #[test]
 fn neither_threads_nor_instructions_change_a_bit() {
     let run = |isa: Isa, members: usize| {
-        let mut algorithm = Td3::new(&section(), Inputs::same(OBSERVATION.len()), 1, isa);
+        let mut algorithm = Td3::new(&section(), Inputs::same(OBSERVATION), 1, isa);
         let (mut data, mut noise, mut team) = (Noise::new(1), Noise::new(2), Team::new(members));
         for _ in 0..4 {
             let transitions = Transitions::random(OBSERVATION, 37, &mut data);

@@ -1,9 +1,9 @@
 //! A trainer restored from a checkpoint goes on bit for bit.
 
 use skein_inference::{Network, Scratch};
+use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{Observation, Precision};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{IMAGE_PIXELS, LATENT};
 
 use super::*;
 use crate::checkpoint::{CheckpointState, CheckpointStore};
@@ -142,14 +142,23 @@ fn a_state_that_lacks_a_tensor_or_miscounts_is_refused_by_name() {
 
 #[test]
 fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
-    for (engine, precision) in [(Engine::Native, Precision::Bf16), (Engine::Libtorch, Precision::F32)] {
+    for (engine, precision, latent) in [
+        (Engine::Native, Precision::Bf16, 32),
+        (Engine::Libtorch, Precision::F32, 32),
+        (Engine::Native, Precision::F32, 8),
+        (Engine::Libtorch, Precision::F32, 64),
+    ] {
         let mut config = config();
         (config.run.engine, config.vae.encoder_precision) = (Some(engine), precision);
+        config.vae.latent = latent;
         let mut trainer = Trainer::new(&config).unwrap();
         // The last epoch comes in late: its images were ordered before.
         (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
         assert_eq!(trainer.keep(), Keep::Latents, "the VAE was never frozen");
-        assert!(all_codes_are_the_encoders(&trainer, 4), "{engine}, {precision}");
+        assert!(
+            all_codes_are_the_encoders(&trainer, 4),
+            "{engine}, {precision}, {latent} numbers"
+        );
     }
 }
 
@@ -178,7 +187,7 @@ fn flights_are_stored_a_second_time_as_seen_in_a_mirror() {
     let observations = drawn.observations.chunks(drawn.observations.len() / 400);
     let to_the_left = observations.zip(drawn.actions.chunks(2)).filter(|(seen, action)| {
         assert_eq!(
-            seen[LATENT] < 0.0,
+            seen[32] < 0.0,
             action[0] < 0.0,
             "velocity and action are mirrored together"
         );
@@ -215,5 +224,6 @@ fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
     let mut rng = trainer.rng(Purpose::PolicyBatches, PolicyVersion(9));
     trainer.replay().sample(&mut rng, 200, &mut drawn);
     let mut rows = drawn.observations.chunks(drawn.observations.len() / 200);
-    rows.all(|observation| codes.iter().any(|code| code == &observation[..LATENT]))
+    let latent = trainer.config.vae.latent;
+    rows.all(|observation| codes.iter().any(|code| code[..latent] == observation[..latent]))
 }

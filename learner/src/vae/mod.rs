@@ -1,6 +1,6 @@
 //! The variational auto-encoder: gives the policy its eyes.
 //!
-//! It learns to reproduce depth images through a code of 32 numbers, during the first steps of a run, and is then frozen (paper, section 3.3). The
+//! It learns to reproduce depth images through a short code, during the first steps of a run, and is then frozen (paper, section 3.3). The
 //! policy sees the code's mean. Two engines compute it, which begin with the same parameters and are held to each other by tests.
 
 mod native;

@@ -17,9 +17,9 @@ mod stopwatch;
 mod unfold;
 
 use skein_kernels::{AdamStep, Isa, Team};
+use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::VaeSection;
 use skein_protocol::seeds::{Purpose, derive};
-use skein_protocol::{IMAGE_PIXELS, LATENT};
 
 use self::batch::Batch;
 use self::buffer::Buffer;
@@ -71,8 +71,8 @@ impl NativeVae {
 
     pub(crate) fn with_isa(section: &VaeSection, run_seed: u64, threads: usize, isa: Isa) -> Self {
         let mut layout = Layout::default();
-        let published_len = Encoder::describe(&mut layout).published_len();
-        let _ = Decoder::describe(&mut layout);
+        let published_len = Encoder::describe(&mut layout, section.latent).published_len();
+        let _ = Decoder::describe(&mut layout, section.latent);
         let order = Order::of(&layout);
         let initial = layout.initial_values(derive(run_seed, Purpose::VaeParameters, 0));
         let len = initial.len();
@@ -82,7 +82,7 @@ impl NativeVae {
             members: (0..team.size()).map(|_| Member::new(isa)).collect(),
             team,
             published_len,
-            network: Network::new(isa, &order),
+            network: Network::new(isa, section.latent, &order),
             packed: false,
             parameters: Buffer::zeroed(len),
             moments: [len, len].map(Buffer::zeroed),
@@ -105,7 +105,7 @@ impl NativeVae {
     /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was changed then.
     pub fn update(&mut self, images: &[u8], noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
         let count = images.len() / IMAGE_PIXELS;
-        self.noise.resize(count * LATENT, 0.0);
+        self.noise.resize(count * self.network.latent(), 0.0);
         noise.fill_normal(&mut self.noise);
 
         let objective = self.objective(images);
@@ -196,19 +196,20 @@ impl NativeVae {
         }
     }
 
-    /// The code's mean for each image, `[n, 32]`. `images`: `[n, 72, 128]`, any number of them.
-    pub fn encode(&mut self, images: &[u8]) -> Vec<[f32; LATENT]> {
+    /// The code's mean for each image, `[n, latent]`. `images`: `[n, 72, 128]`, any number of them.
+    pub fn encode(&mut self, images: &[u8]) -> Vec<f32> {
         self.pack();
         let (network, parameters) = (&self.network, &*self.parameters);
-        let mut codes = vec![[0.0; LATENT]; images.len() / IMAGE_PIXELS];
-        share(&mut self.team, &mut self.members, &mut codes, |index, code, member| {
+        let mut codes = vec![0.0; images.len() / IMAGE_PIXELS * network.latent()];
+        let mut parts: Vec<_> = codes.chunks_exact_mut(network.latent()).collect();
+        share(&mut self.team, &mut self.members, &mut parts, |index, code, member| {
             let depth = &images[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
             for (image, len) in member.images.iter_mut().zip(network.seen_lens()) {
                 image.resize(len);
             }
             let images = member.images.each_mut().map(|image| &mut **image);
             network.see(parameters, depth, images, &mut member.watch);
-            *code = network.mean(parameters, &member.images[4]);
+            network.mean(parameters, &member.images[4], code);
         });
         codes
     }
@@ -218,17 +219,13 @@ impl NativeVae {
         let mut seen = Vec::with_capacity(images.len());
         for images in images.chunks(CHUNK * IMAGE_PIXELS) {
             let codes = self.encode(images);
-            let (isa, count) = (self.isa, codes.len());
+            let (isa, count) = (self.isa, images.len() / IMAGE_PIXELS);
             let (network, parameters, batch) = (&mut self.network, &*self.parameters, &mut self.batch);
             batch.resize(network, count);
             let finish = skein_kernels::Finish::Rectified;
-            network.linear.forward(
-                &mut self.team,
-                parameters,
-                codes.as_flattened(),
-                finish,
-                &mut batch.unfolded,
-            );
+            network
+                .linear
+                .forward(&mut self.team, parameters, &codes, finish, &mut batch.unfolded);
             network.unfold.multiply(&mut self.team, &batch.unfolded);
             let network = &*network;
             let mut drawn = by_image(batch.drawn.each_mut().map(|buffer| &mut **buffer), count);
@@ -293,7 +290,7 @@ impl NativeVae {
         self.packed = false;
     }
 
-    /// Loss, squared error and divergence, and the whole gradient in PyTorch's order. `noise`: standard normal, `[n, 32]`.
+    /// Loss, squared error and divergence, and the whole gradient in PyTorch's order. `noise`: standard normal, `[n, latent]`.
     pub(super) fn loss_and_gradient(&mut self, images: &[u8], noise: &[f32]) -> ([f32; 3], Vec<f32>) {
         self.noise = noise.to_vec();
         let Objective {

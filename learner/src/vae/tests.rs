@@ -1,7 +1,7 @@
 //! The native engine against libtorch's automatic gradients, and against itself on other instructions and threads.
 
 use skein_kernels::Isa;
-use skein_protocol::{IMAGE_PIXELS, LATENT};
+use skein_protocol::IMAGE_PIXELS;
 
 use super::*;
 
@@ -19,13 +19,32 @@ pub(super) fn synthetic_bytes(count: usize, seed: u64) -> Vec<u8> {
     bytes
 }
 
+/// Length of the codes, where it is not said.
+const LATENT: usize = 32;
+
+fn with_latent(latent: usize) -> VaeSection {
+    VaeSection {
+        latent,
+        ..VaeSection::default()
+    }
+}
+
+/// Both engines with codes of `latent` numbers.
+fn both(latent: usize, seed: u64) -> (NativeVae, TorchVae) {
+    crate::device::use_threads(1);
+    let section = with_latent(latent);
+    (
+        NativeVae::new(&section, seed, 2),
+        TorchVae::new(&section, seed, Device::Cpu),
+    )
+}
+
 fn native(seed: u64) -> NativeVae {
-    NativeVae::new(&VaeSection::default(), seed, 2)
+    NativeVae::new(&with_latent(LATENT), seed, 2)
 }
 
 fn torch(seed: u64) -> TorchVae {
-    crate::device::use_threads(1);
-    TorchVae::new(&VaeSection::default(), seed, Device::Cpu)
+    both(LATENT, seed).1
 }
 
 fn bits(values: &[f32]) -> Vec<u32> {
@@ -51,13 +70,22 @@ fn state(vae: &mut NativeVae) -> Vec<crate::state::NamedTensor> {
 #[test]
 fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_precision() {
     // Seeds of which no sum lies so near nought that rounding takes it across: a ReLU would then be open in one and shut in the other.
-    for (seed, count) in [(1, 1), (2, 3), (4, 16), (5, 16)] {
+    for (seed, count, latent) in [
+        (1, 1, 32),
+        (2, 3, 32),
+        (4, 16, 32),
+        (5, 16, 32),
+        (1, 3, 8),
+        (2, 3, 16),
+        (1, 3, 64),
+    ] {
         let images = synthetic_bytes(count, seed);
-        let mut noise = vec![0.0; count * LATENT];
+        let mut noise = vec![0.0; count * latent];
         Noise::new(seed).fill_normal(&mut noise);
-        let (found, gradient) = native(seed).loss_and_gradient(&images, &noise);
+        let (mut native, torch) = both(latent, seed);
+        let (found, gradient) = native.loss_and_gradient(&images, &noise);
 
-        let reference = torch(seed).in_double();
+        let reference = torch.in_double();
         let (expected, expected_gradient) = reference.loss_and_gradient(&images_from_bytes(&images), &noise);
         for (found, expected) in found.iter().zip(expected) {
             // A divergence near nought is a sum of differences of numbers near one.
@@ -68,7 +96,11 @@ fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_pr
         for tensor in reference.layout().tensors() {
             let range = start..start + tensor.len();
             let error = relative_distance(&gradient[range.clone()], &expected_gradient[range]);
-            assert!(error < 5e-6, "{} of {count} images is off by {error}", tensor.name);
+            assert!(
+                error < 5e-6,
+                "{} of {count} images, {latent} numbers, is off by {error}",
+                tensor.name
+            );
             start += tensor.len();
         }
         assert_eq!(start, gradient.len());
@@ -77,8 +109,8 @@ fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_pr
 
 #[test]
 fn both_engines_begin_with_the_same_numbers() {
-    for seed in 1..4 {
-        let (native, torch) = (native(seed), torch(seed));
+    for (seed, latent) in [(1, 32), (2, 8), (3, 64)] {
+        let (native, torch) = both(latent, seed);
         assert_eq!(native.published_len(), torch.published_len());
         let [mut ours, mut theirs] = [0; 2].map(|_| vec![f32::NAN; native.published_len()]);
         native.publish(&mut ours);
@@ -90,17 +122,20 @@ fn both_engines_begin_with_the_same_numbers() {
 #[test]
 fn both_engines_encode_and_reconstruct_alike() {
     let images = synthetic_bytes(35, 4);
-    let (mut native, torch) = (native(5), torch(5));
-    let codes = native.encode(&images);
-    let expected = flat(&torch.encode(&images_from_bytes(&images)));
-    assert!(relative_distance(codes.as_flattened(), &expected) < 2e-6);
-    let seen = native.reconstruct(&images);
-    let expected = flat(&torch.reconstruct(&images_from_bytes(&images)));
-    assert_eq!(seen.len(), expected.len());
-    for (seen, expected) in seen.iter().zip(&expected) {
-        assert!((seen - expected).abs() < 1e-6, "{seen} is not {expected}");
+    for latent in [8, 32, 64] {
+        let (mut native, torch) = both(latent, 5);
+        let codes = native.encode(&images);
+        assert_eq!(codes.len(), 35 * latent);
+        let expected = flat(&torch.encode(&images_from_bytes(&images)));
+        assert!(relative_distance(&codes, &expected) < 2e-6);
+        let seen = native.reconstruct(&images);
+        let expected = flat(&torch.reconstruct(&images_from_bytes(&images)));
+        assert_eq!(seen.len(), expected.len());
+        for (seen, expected) in seen.iter().zip(&expected) {
+            assert!((seen - expected).abs() < 1e-6, "{seen} is not {expected}");
+        }
+        assert!(native.encode(&[]).is_empty() && native.reconstruct(&[]).is_empty());
     }
-    assert!(native.encode(&[]).is_empty() && native.reconstruct(&[]).is_empty());
 }
 
 #[test]
@@ -124,21 +159,25 @@ fn twenty_steps_of_both_engines_lead_to_the_same_place() {
 #[test]
 fn neither_threads_nor_instructions_change_a_bit() {
     let images = synthetic_bytes(2, 9);
-    let run = |isa: Isa, threads: usize| {
-        let mut vae = NativeVae::with_isa(&VaeSection::default(), 1, threads, isa);
+    let run = |latent: usize, isa: Isa, threads: usize| {
+        let mut vae = NativeVae::with_isa(&with_latent(latent), 1, threads, isa);
         let metrics = [1, 2].map(|seed| vae.update(&images, &mut Noise::new(seed)).unwrap());
         (
             metrics,
-            vae.encode(&images),
+            bits(&vae.encode(&images)),
             bits(&vae.reconstruct(&images)),
             state(&mut vae),
         )
     };
-    let expected = run(Isa::best(), 1);
+    for latent in [8, 64] {
+        let expected = run(latent, Isa::best(), 1);
+        assert!(run(latent, Isa::Portable, 2) == expected, "{latent} numbers");
+    }
+    let expected = run(LATENT, Isa::best(), 1);
     for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
         // The slowest once: 3 threads, of which one has no image.
         for threads in (1..4).filter(|threads| isa != Isa::Portable || *threads == 3) {
-            assert!(run(isa, threads) == expected, "{isa}, {threads} threads");
+            assert!(run(LATENT, isa, threads) == expected, "{isa}, {threads} threads");
         }
     }
 }
@@ -149,7 +188,7 @@ fn an_image_is_encoded_and_seen_the_same_in_any_company() {
     let (codes, seen) = (vae.encode(&images), vae.reconstruct(&images));
     for index in [0, 33] {
         let alone = &images[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
-        assert_eq!(vae.encode(alone), [codes[index]]);
+        assert_eq!(vae.encode(alone), codes[index * LATENT..][..LATENT]);
         assert_eq!(vae.reconstruct(alone), seen[index * IMAGE_PIXELS..][..IMAGE_PIXELS]);
     }
 }

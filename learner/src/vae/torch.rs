@@ -1,11 +1,11 @@
 //! The variational auto-encoder: gives the policy its eyes.
 //!
-//! It learns to reproduce depth images through a code of 32 numbers, during the first steps of a run, and is then frozen (paper, section 3.3). The
+//! It learns to reproduce depth images through a short code, during the first steps of a run, and is then frozen (paper, section 3.3). The
 //! policy sees the code's mean.
 
 use skein_protocol::config::VaeSection;
 use skein_protocol::seeds::{Purpose, derive};
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LATENT};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
 use tch::{Device, Kind, Tensor, no_grad_guard};
 
 use super::VaeMetrics;
@@ -21,6 +21,8 @@ const CHUNK: i64 = 64;
 /// Encoder, decoder and their optimizer.
 #[derive(Debug)]
 pub struct TorchVae {
+    /// Length of the code.
+    latent: i64,
     encoder: Encoder,
     decoder: Decoder,
     /// The part that actors need, then the log-variance head, then the decoder.
@@ -40,11 +42,12 @@ impl TorchVae {
     /// An untrained VAE whose parameters depend on the run's seed alone.
     pub fn new(section: &VaeSection, run_seed: u64, device: Device) -> Self {
         let mut layout = Layout::default();
-        let encoder = Encoder::describe(&mut layout);
-        let decoder = Decoder::describe(&mut layout);
+        let encoder = Encoder::describe(&mut layout, section.latent);
+        let decoder = Decoder::describe(&mut layout, section.latent);
         let parameters = Parameters::initialise(layout, derive(run_seed, Purpose::VaeParameters, 0), device);
         let optimizer = Adam::new(parameters.flat(), section.learning_rate);
         Self {
+            latent: section.latent as i64,
             encoder,
             decoder,
             parameters,
@@ -60,7 +63,7 @@ impl TorchVae {
     pub fn update(&mut self, images: &Tensor, noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
         let pixels = pixels(&images.to_device(self.device()));
 
-        let code_noise = noise.normal(&[pixels.size()[0], LATENT as i64], pixels.device());
+        let code_noise = noise.normal(&[pixels.size()[0], self.latent], pixels.device());
         let Objective {
             loss,
             error,
@@ -85,7 +88,7 @@ impl TorchVae {
         })
     }
 
-    /// The loss and its two parts for these pixels, `[n, 1, 72, 128]`, and standard normal noise, `[n, 32]`.
+    /// The loss and its two parts for these pixels, `[n, 1, 72, 128]`, and standard normal noise, `[n, latent]`.
     fn objective(&self, pixels: &Tensor, code_noise: &Tensor) -> Objective {
         // The code is drawn as mean + std · noise, so that gradients reach mean and std (arXiv:1312.6114, section 2.4).
         let (mean, log_variance) = self.encoder.distribution(&self.parameters, pixels);
@@ -101,10 +104,10 @@ impl TorchVae {
         }
     }
 
-    /// The code's mean for each image, `[n, 32]`. `images`: `[n, 72, 128]` u8, any number of them.
+    /// The code's mean for each image, `[n, latent]`. `images`: `[n, 72, 128]` u8, any number of them.
     pub fn encode(&self, images: &Tensor) -> Tensor {
         self.in_chunks(images, |pixels| self.encoder.mean(&self.parameters, pixels))
-            .unwrap_or_else(|| Tensor::zeros([0, LATENT as i64], (Kind::Float, self.device())))
+            .unwrap_or_else(|| Tensor::zeros([0, self.latent], (Kind::Float, self.device())))
     }
 
     /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1]. `images`: `[n, 72, 128]` u8.
@@ -166,11 +169,11 @@ impl TorchVae {
         self.parameters.layout()
     }
 
-    /// Loss, squared error and divergence in the parameters' precision, and the gradient. `images`: `[n, 72, 128]` u8; `noise`: standard normal, `[n, 32]`.
+    /// Loss, squared error and divergence in the parameters' precision, and the gradient. `images`: `[n, 72, 128]` u8; `noise`: standard normal, `[n, latent]`.
     pub(super) fn loss_and_gradient(&self, images: &Tensor, noise: &[f32]) -> ([f64; 3], Vec<f32>) {
         let kind = self.parameters.flat().kind();
         let pixels = pixels(images).to_kind(kind);
-        let noise = Tensor::from_slice(noise).view([-1, LATENT as i64]).to_kind(kind);
+        let noise = Tensor::from_slice(noise).view([-1, self.latent]).to_kind(kind);
         let Objective {
             loss,
             error,

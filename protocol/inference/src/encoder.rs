@@ -1,7 +1,7 @@
 //! The VAE's encoder: depth image to the mean of the latent code (paper, section 3.3).
 //!
 //! Four 4x4 convolutions of stride 2 without padding, a ReLU after each, and one linear layer:
-//! 1x72x128 → 32x35x63 → 64x16x30 → 128x7x14 → 256x2x6 → 32.
+//! 1x72x128 → 32x35x63 → 64x16x30 → 128x7x14 → 256x2x6 → `vae.latent`.
 //!
 //! Images lie channels-last here: a kernel row then covers one contiguous run of memory, and a convolution is one product that reads its windows where they
 //! lie. PyTorch's channels-first weights are rearranged once, when a snapshot arrives.
@@ -11,7 +11,7 @@
 use skein_kernels::{Finish, Isa, Matrix, Pair, Panels, Rows, Start, Team, Windows, product};
 use skein_protocol::config::Precision;
 use skein_protocol::snapshot::{ENCODER_CHANNELS as CHANNELS, ENCODER_FEATURES as FEATURES, ENCODER_KERNEL as KERNEL};
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LATENT};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LONGEST_LATENT, LatentCode};
 
 use crate::linear::Linear;
 
@@ -62,8 +62,9 @@ impl Encoder {
         }
     }
 
-    /// Mean of the latent code of a depth image, `[72, 128]`, top row first, 0 nearest and 255 farthest; the network sees it scaled to [0, 1].
-    pub fn encode(&self, image: &[u8; IMAGE_PIXELS], scratch: &mut EncoderScratch) -> [f32; LATENT] {
+    /// Mean of the latent code of a depth image, `[72, 128]`, top row first, 0 nearest and 255 farthest; the network sees it scaled to [0, 1]. Behind the code's
+    /// numbers there are zeros.
+    pub fn encode(&self, image: &[u8; IMAGE_PIXELS], scratch: &mut EncoderScratch) -> LatentCode {
         let EncoderScratch {
             images: [input, output],
             pairs,
@@ -74,8 +75,9 @@ impl Encoder {
             convolution.apply(input, pairs, output);
             std::mem::swap(input, output);
         }
-        let mut latent = [0.0; LATENT];
-        self.mean.apply(input, Finish::Plain, &mut latent);
+        let mut latent = [0.0; LONGEST_LATENT];
+        self.mean
+            .apply(input, Finish::Plain, &mut latent[..self.mean.outputs()]);
         latent
     }
 
@@ -83,10 +85,10 @@ impl Encoder {
     ///
     /// # Panics
     /// When the last image is not whole.
-    pub fn encode_all(&self, team: &mut Team, images: &[u8]) -> Vec<[f32; LATENT]> {
+    pub fn encode_all(&self, team: &mut Team, images: &[u8]) -> Vec<LatentCode> {
         let (images, rest) = images.as_chunks::<IMAGE_PIXELS>();
         assert!(rest.is_empty(), "{} pixels are left over", rest.len());
-        let mut latents = vec![[0.0; LATENT]; images.len()];
+        let mut latents = vec![[0.0; LONGEST_LATENT]; images.len()];
         team.split_rows(&mut latents, 1, 1, |first, latents| {
             let mut scratch = EncoderScratch::default();
             for (latent, image) in latents.iter_mut().zip(&images[first..]) {
@@ -176,10 +178,11 @@ mod tests {
     use super::*;
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64Mcg;
+    use skein_protocol::config::{Observation, View};
     use skein_protocol::snapshot::SnapshotLayout;
 
-    fn parameters(seed: u64) -> (SnapshotLayout, Vec<f32>) {
-        let layout = SnapshotLayout::new(LATENT, 1);
+    fn parameters(latent: usize, seed: u64) -> (SnapshotLayout, Vec<f32>) {
+        let layout = SnapshotLayout::new(&View::present(Observation::Latent, latent), 1);
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let mut values = vec![0.0; layout.values()];
         for tensor in layout.tensors() {
@@ -239,20 +242,23 @@ mod tests {
 
     #[test]
     fn equals_a_direct_convolution() {
-        for seed in 0..2 {
-            let (layout, values) = parameters(seed);
+        for (seed, latent_len) in [(0, 32), (1, 8), (2, 64)] {
+            let (layout, values) = parameters(latent_len, seed);
             let tensor = |name: &str| &values[layout.tensor(name).unwrap().range.clone()];
             let latent = |precision| {
                 encoder(&layout, &values, Isa::best(), precision).encode(&image(seed), &mut EncoderScratch::default())
             };
             let expected = naive(&|name: &str| tensor(name).to_vec(), &image(seed));
+            assert_eq!(expected.len(), latent_len);
             assert!(
                 expected.iter().any(|value| value.abs() > 0.02),
                 "a comparison of noughts proves nothing"
             );
             // Eight bits of precision are 4e-3 of an operand; over many terms, errors mostly cancel.
             for (precision, tolerance) in [(Precision::F32, 1e-5), (Precision::Bf16, 2e-3)] {
-                for (found, expected) in latent(precision).iter().zip(&expected) {
+                let code = latent(precision);
+                assert!(code[latent_len..].iter().all(|&value| value == 0.0), "behind the code");
+                for (found, expected) in code.iter().zip(&expected) {
                     let error = (f64::from(*found) - expected).abs();
                     assert!(error < tolerance, "{found} {expected}, {precision}");
                 }
@@ -262,7 +268,7 @@ mod tests {
 
     #[test]
     fn the_same_image_gives_the_same_bits_whatever_came_before() {
-        let (layout, values) = parameters(7);
+        let (layout, values) = parameters(32, 7);
         let encoder = encoder(&layout, &values, Isa::best(), Precision::Bf16);
         let mut scratch = EncoderScratch::default();
         let first = encoder.encode(&image(1), &mut scratch);
@@ -273,7 +279,7 @@ mod tests {
 
     #[test]
     fn every_instruction_set_gives_the_same_bits() {
-        let (layout, values) = parameters(3);
+        let (layout, values) = parameters(16, 3);
         for precision in [Precision::F32, Precision::Bf16] {
             let latent =
                 |isa| encoder(&layout, &values, isa, precision).encode(&image(1), &mut EncoderScratch::default());

@@ -13,7 +13,7 @@ use skein_kernels::Isa;
 use skein_protocol::config::Precision;
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
-use skein_protocol::{IMAGE_PIXELS, LATENT};
+use skein_protocol::{IMAGE_PIXELS, LatentCode};
 
 pub use encoder::{Encoder, EncoderScratch};
 pub use policy::{ActionDistribution, Policy, PolicyScratch};
@@ -69,7 +69,7 @@ impl Network {
     }
 
     /// See [`Encoder::encode`].
-    pub fn encode(&self, image: &[u8; IMAGE_PIXELS], scratch: &mut Scratch) -> [f32; LATENT] {
+    pub fn encode(&self, image: &[u8; IMAGE_PIXELS], scratch: &mut Scratch) -> LatentCode {
         self.encoder.encode(image, &mut scratch.encoder)
     }
 

@@ -467,6 +467,18 @@ mod tests {
                 vec!["sac.critic_networks = 3", "neither 1 nor 2"],
             ),
             (
+                "",
+                vec!["vae.latent=48"],
+                vec![
+                    "test.toml",
+                    "--set vae.latent=48",
+                    "vae.latent = 48",
+                    "[8, 16, 32, 64]",
+                    "set it to one of them",
+                ],
+            ),
+            ("[vae]\nlatent = 0", vec![], vec!["test.toml", "vae.latent = 0"]),
+            (
                 "[td3]\ncritic_networks = 0",
                 vec![],
                 vec!["td3.critic_networks = 0", "neither 1 nor 2"],

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require};
 use crate::leg::MOST_FLOWN;
-use crate::{ACTION, LATENT};
+use crate::{ACTION, LatentCode};
 
 /// Earlier moments that can be seen at most.
 const MOST_HISTORY: usize = 16;
@@ -111,14 +111,6 @@ impl LearningSection {
         )
     }
 
-    /// What the policy sees, with what came before.
-    pub fn view(&self) -> View {
-        View {
-            moment: self.observation,
-            history_steps: self.history_steps.clone(),
-        }
-    }
-
     /// Whether flights are flown in legs, so that the weights are refreshed in the middle of them.
     pub fn in_legs(&self) -> bool {
         self.leg_steps > 0
@@ -210,71 +202,75 @@ pub enum Observation {
     LatentVelocityAction,
 }
 
-impl Observation {
-    /// Length of the observation vector.
-    pub fn len(self) -> usize {
-        match self {
-            Self::Latent => LATENT,
-            Self::LatentVelocity => LATENT + 2,
-            Self::LatentVelocityAction => LATENT + 2 + ACTION,
-        }
-    }
-
-    /// Never: every observation holds the latent code.
-    pub fn is_empty(self) -> bool {
-        false
-    }
-
-    /// Writes what is seen of a moment: `latent` `[32]`, `velocity_mps` the vehicle's forward, left and up velocity, `previous_action` zero at take-off.
-    ///
-    /// Actor and learner both build observations with this function and [`View::write`] only.
-    ///
-    /// # Panics
-    /// When `into` is not [`Observation::len`] long.
-    pub fn write(
-        self,
-        latent: &[f32; LATENT],
-        velocity_mps: &[f32; 3],
-        previous_action: &[f32; ACTION],
-        into: &mut [f32],
-    ) {
-        assert_eq!(into.len(), self.len(), "an observation has a fixed length");
-        into[..LATENT].copy_from_slice(latent);
-        if self != Self::Latent {
-            into[LATENT..LATENT + 2].copy_from_slice(&velocity_mps[1..]);
-        }
-        if self == Self::LatentVelocityAction {
-            into[LATENT + 2..].copy_from_slice(previous_action);
-        }
-    }
-}
-
-/// What the policy sees: the present moment, then earlier ones.
+/// What the policy sees: the present moment, then earlier ones. Actor and learner build observations by this alone.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct View {
     /// What is seen of each.
     pub moment: Observation,
+    /// Length of the latent code, [`VaeSection::latent`](super::VaeSection::latent).
+    pub latent: usize,
     /// How many steps back the earlier ones lie.
     pub history_steps: Vec<usize>,
 }
 
 impl View {
-    /// The present moment alone.
-    pub fn present(moment: Observation) -> Self {
+    /// The present moment alone, with a code of `latent` numbers.
+    pub fn present(moment: Observation, latent: usize) -> Self {
         Self {
             moment,
+            latent,
             history_steps: Vec::new(),
         }
     }
 
+    /// Length of what is seen of a moment.
+    pub fn moment_len(&self) -> usize {
+        self.latent
+            + match self.moment {
+                Observation::Latent => 0,
+                Observation::LatentVelocity => 2,
+                Observation::LatentVelocityAction => 2 + ACTION,
+            }
+    }
+
     /// Length of the observation vector.
     pub fn len(&self) -> usize {
-        self.moment.len() * (1 + self.history_steps.len())
+        self.moment_len() * (1 + self.history_steps.len())
     }
 
     /// Never: the present is always seen.
     pub fn is_empty(&self) -> bool {
         false
+    }
+
+    /// Writes what is seen of a moment: the latent code, `velocity_mps` the vehicle's forward, left and up velocity, `previous_action` zero at take-off.
+    ///
+    /// # Panics
+    /// When `into` is not [`View::moment_len`] long.
+    pub fn write_moment(
+        &self,
+        code: &LatentCode,
+        velocity_mps: &[f32; 3],
+        previous_action: &[f32; ACTION],
+        into: &mut [f32],
+    ) {
+        assert_eq!(into.len(), self.moment_len(), "what is seen has a fixed length");
+        self.write_code(code, into);
+        let rest = &mut into[self.latent..];
+        if self.moment != Observation::Latent {
+            rest[..2].copy_from_slice(&velocity_mps[1..]);
+        }
+        if self.moment == Observation::LatentVelocityAction {
+            rest[2..].copy_from_slice(previous_action);
+        }
+    }
+
+    /// Writes the latent code alone, where it lies in what is seen of a moment.
+    ///
+    /// # Panics
+    /// When `into` is shorter than the code.
+    pub fn write_code(&self, code: &LatentCode, into: &mut [f32]) {
+        into[..self.latent].copy_from_slice(&code[..self.latent]);
     }
 
     /// The moments seen at `step` of a flight, by their steps, in the vector's order; before take-off there was the take-off.
@@ -290,7 +286,7 @@ impl View {
     /// When `into` is not [`View::len`] long.
     pub fn write(&self, step: usize, into: &mut [f32], write_moment: impl Fn(usize, &mut [f32])) {
         assert_eq!(into.len(), self.len(), "an observation has a fixed length");
-        for (moment, into) in self.moments(step).zip(into.chunks_exact_mut(self.moment.len())) {
+        for (moment, into) in self.moments(step).zip(into.chunks_exact_mut(self.moment_len())) {
             write_moment(moment, into);
         }
     }

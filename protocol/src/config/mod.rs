@@ -71,6 +71,15 @@ impl Config {
         }
     }
 
+    /// What the policy sees.
+    pub fn view(&self) -> View {
+        View {
+            moment: self.learning.observation,
+            latent: self.vae.latent,
+            history_steps: self.learning.history_steps.clone(),
+        }
+    }
+
     /// Checks every key, and keys against each other.
     ///
     /// # Errors

@@ -5,11 +5,17 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require, require_learning_rate};
+use crate::LONGEST_LATENT;
+
+/// Lengths a latent code may have. Records have room for the longest; mean and log-variance of the shortest fill the 16 lanes that the learner adds up at a time.
+const LATENTS: [usize; 4] = [8, 16, 32, LONGEST_LATENT];
 
 /// `[vae]`: the variational auto-encoder (paper, section 3.3), trained together with the agent and then frozen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VaeSection {
+    /// Length of the latent code: 8, 16, 32 or 64 (paper: 32). Default 32.
+    pub latent: usize,
     /// Environment steps during which the VAE is trained; then it is frozen and stored latents are recomputed (paper: 10000). Default 10000.
     pub train_steps: usize,
     /// Environment steps after which stored latents are recomputed while the VAE is still trained, so that a policy that learns meanwhile learns from codes of one
@@ -31,6 +37,7 @@ pub struct VaeSection {
 impl Default for VaeSection {
     fn default() -> Self {
         Self {
+            latent: 32,
             train_steps: 10_000,
             recode_steps: 0,
             updates_per_step: 0.1,
@@ -44,6 +51,14 @@ impl Default for VaeSection {
 
 impl VaeSection {
     pub(super) fn validate(&self) -> Result<(), Invalid> {
+        require(
+            LATENTS.contains(&self.latent),
+            "vae.latent",
+            self.latent,
+            format!(
+                "is none of {LATENTS:?}: no record and no network is laid out for such a code; set it to one of them, of which the paper has 32"
+            ),
+        )?;
         require(
             self.train_steps >= 1,
             "vae.train_steps",

@@ -14,12 +14,16 @@ use super::*;
 use crate::flight::TRUE_STATE;
 use crate::flight::samples::{code, flight, shade, with_images};
 
+/// Length of the codes.
+const LATENT: usize = 16;
+
 fn config(capacity: usize, observation: Observation) -> Config {
     let mut config = Config::default();
     config.replay.capacity = capacity;
     config.replay.success_share = 0.25;
     config.learning.observation = observation;
     config.vae.train_steps = 500;
+    config.vae.latent = LATENT;
     config
 }
 
@@ -30,7 +34,7 @@ fn frozen(config: &Config) -> Replay {
     replay
 }
 
-fn encode(images: &[u8]) -> Result<Vec<[f32; LATENT]>, Infallible> {
+fn encode(images: &[u8]) -> Result<Vec<LatentCode>, Infallible> {
     Ok(images
         .chunks_exact(IMAGE_PIXELS)
         .map(|image| final_code(image[0]))
@@ -38,7 +42,7 @@ fn encode(images: &[u8]) -> Result<Vec<[f32; LATENT]>, Infallible> {
 }
 
 /// What the final encoder makes of an image, in contrast to [`code`].
-fn final_code(shade: u8) -> [f32; LATENT] {
+fn final_code(shade: u8) -> LatentCode {
     code(shade).map(|value| -value - 1.0)
 }
 
@@ -208,7 +212,7 @@ fn rows_of_a_minibatch_belong_together() {
     }
     let mut batch = Minibatch::default();
     replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 64, &mut batch);
-    let width = Observation::LatentVelocityAction.len();
+    let width = config.view().len();
     for index in 0..64 {
         let observation = &batch.observations[index * width..(index + 1) * width];
         let next = &batch.next_observations[index * width..(index + 1) * width];

@@ -33,7 +33,7 @@ impl Model {
         let parts = [(VecDeque::new(), success), (VecDeque::new(), regular)];
         Self {
             parts,
-            view: config.learning.view(),
+            view: config.view(),
             section: config.replay.clone(),
         }
     }
@@ -41,7 +41,7 @@ impl Model {
     fn insert(&mut self, flight: &CommittedFlight) {
         for step in 0..flight.steps() {
             let moment = |step: usize| {
-                let mut vector = flight.observations[step].latent.to_vec();
+                let mut vector = flight.observations[step].latent[..self.view.latent].to_vec();
                 if self.view.moment != Observation::Latent {
                     vector.extend(&flight.observations[step].velocity_mps[1..]);
                 }
@@ -79,12 +79,12 @@ impl Model {
         }
     }
 
-    fn set_latents(&mut self, latent: impl Fn(&[f32]) -> [f32; LATENT]) {
+    fn set_latents(&mut self, latent: impl Fn(&[f32]) -> LatentCode) {
         for transition in self.parts.iter_mut().flat_map(|(part, _)| part) {
             for vector in [&mut transition.observation, &mut transition.next_observation] {
-                for moment in vector.chunks_exact_mut(self.view.moment.len()) {
+                for moment in vector.chunks_exact_mut(self.view.moment_len()) {
                     let made = latent(moment);
-                    moment[..LATENT].copy_from_slice(&made);
+                    moment[..self.view.latent].copy_from_slice(&made[..self.view.latent]);
                 }
             }
         }
@@ -147,12 +147,14 @@ proptest! {
             Observation::Latent, Observation::LatentVelocity, Observation::LatentVelocityAction,
         ]),
         history in prop::sample::subsequence(vec![1_usize, 2, 5], 0..=3),
+        latent in prop::sample::select(vec![8_usize, 16, 32, 64]),
         rule in prop::sample::select(vec![SuccessRule::LevelUp, SuccessRule::Approach]),
         chunk in 1..9_usize,
         share in prop::sample::select(vec![0.0, 0.25]),
     ) {
         let mut config = config(capacity, observation);
         config.learning.history_steps = history;
+        config.vae.latent = latent;
         config.replay.success_share = share;
         config.replay.success = rule;
         config.replay.approach_steps = 3;

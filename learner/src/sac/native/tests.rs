@@ -1,6 +1,5 @@
 //! Against the reference, number by number; and that neither threads nor instructions change a bit.
 
-use skein_protocol::config::Observation;
 use tch::Device;
 
 use super::super::TorchSac;
@@ -8,11 +7,8 @@ use super::super::samples::Transitions;
 use super::*;
 use crate::state::{NamedTensor, TensorValues};
 
-const OBSERVATIONS: [Observation; 3] = [
-    Observation::Latent,
-    Observation::LatentVelocity,
-    Observation::LatentVelocityAction,
-];
+/// Numbers in an observation.
+const OBSERVATIONS: [usize; 3] = [32, 34, 36];
 
 fn section(hidden_width: usize) -> SacSection {
     SacSection {
@@ -106,8 +102,8 @@ fn gradients_and_one_update_are_the_references() {
     // Whether the critic is told something else, and how much.
     for (number, (observation, told)) in OBSERVATIONS.into_iter().zip([None, Some(5), Some(50)]).enumerate() {
         let inputs = Inputs {
-            critic: told.unwrap_or(observation.len()),
-            ..Inputs::same(observation.len())
+            critic: told.unwrap_or(observation),
+            ..Inputs::same(observation)
         };
         for (width, rows) in [(8, 1), (8, 33), (31, 7), (31, 8), (64, 50), (256, 256), (100, 201)] {
             let seed = (number + rows) as u64;
@@ -122,7 +118,7 @@ fn gradients_and_one_update_are_the_references() {
                 transitions = transitions.telling(told, &mut noise);
             }
             let context = format!(
-                "{observation:?}, width {width}, {rows} rows, {} networks",
+                "{observation} seen, width {width}, {rows} rows, {} networks",
                 section.critic_networks
             );
             assert_one_update_is_equal(&mut native, &mut torch, &transitions, &context);
@@ -132,8 +128,8 @@ fn gradients_and_one_update_are_the_references() {
 
 #[test]
 fn gradients_are_the_references_where_tanh_saturates_and_deviations_are_bounded() {
-    let observation = Observation::Latent;
-    let (mut native, mut torch) = both(&section(16), Inputs::same(observation.len()), 1);
+    let observation = 32;
+    let (mut native, mut torch) = both(&section(16), Inputs::same(observation), 1);
     let mut stored = native.named_tensors();
     let policy = stored
         .iter_mut()
@@ -153,9 +149,9 @@ fn gradients_are_the_references_where_tanh_saturates_and_deviations_are_bounded(
 
 #[test]
 fn a_hundred_updates_stay_close_to_the_references() {
-    let observation = Observation::LatentVelocity;
+    let observation = 34;
     for seed in 1..=3 {
-        let (mut native, mut torch) = both(&section(64), Inputs::same(observation.len()), seed);
+        let (mut native, mut torch) = both(&section(64), Inputs::same(observation), seed);
         let (mut data, mut team) = (Noise::new(seed), Team::new(1));
         let (mut noise, mut same_noise) = (Noise::new(seed + 1), Noise::new(seed + 1));
         let before = numbers(&mut native);
@@ -185,10 +181,10 @@ fn a_hundred_updates_stay_close_to_the_references() {
 
 #[test]
 fn neither_threads_nor_instructions_change_a_bit() {
-    let observation = Observation::LatentVelocityAction;
+    let observation = 36;
     for (width, rows) in [(40, 131), (16, 5)] {
         let run = |isa: Isa, members: usize| {
-            let mut sac = NativeSac::new(&section(width), Inputs::same(observation.len()), 1, isa);
+            let mut sac = NativeSac::new(&section(width), Inputs::same(observation), 1, isa);
             let (mut data, mut noise, mut team) = (Noise::new(1), Noise::new(2), Team::new(members));
             let metrics: Vec<_> = (0..5)
                 .map(|_| {
@@ -210,13 +206,13 @@ fn neither_threads_nor_instructions_change_a_bit() {
 
 #[test]
 fn batches_of_changing_size_are_what_they_are_alone() {
-    let observation = Observation::Latent;
+    let observation = 32;
     let (mut team, section) = (Team::new(1), section(16));
     let large = Transitions::random(observation, 50, &mut Noise::new(1));
     let little = Transitions::random(observation, 3, &mut Noise::new(2));
-    let mut sac = NativeSac::new(&section, Inputs::same(observation.len()), 1, Isa::best());
+    let mut sac = NativeSac::new(&section, Inputs::same(observation), 1, Isa::best());
     sac.update(&mut team, large.columns(), &mut Noise::new(3)).unwrap();
-    let mut fresh = NativeSac::new(&section, Inputs::same(observation.len()), 2, Isa::best());
+    let mut fresh = NativeSac::new(&section, Inputs::same(observation), 2, Isa::best());
     fresh.load_named(&sac.named_tensors()).unwrap();
     let run = |sac: &mut NativeSac, team: &mut Team| sac.update(team, little.columns(), &mut Noise::new(4)).unwrap();
     assert_eq!(run(&mut sac, &mut team), run(&mut fresh, &mut team));
@@ -226,9 +222,9 @@ fn batches_of_changing_size_are_what_they_are_alone() {
 #[test]
 #[should_panic(expected = "one row for each transition")]
 fn columns_that_do_not_belong_together_are_refused() {
-    let observation = Observation::Latent;
+    let observation = 32;
     let mut transitions = Transitions::random(observation, 5, &mut Noise::new(1));
-    transitions.next_observations.truncate(4 * observation.len());
-    let mut sac = NativeSac::new(&section(8), Inputs::same(observation.len()), 1, Isa::best());
+    transitions.next_observations.truncate(4 * observation);
+    let mut sac = NativeSac::new(&section(8), Inputs::same(observation), 1, Isa::best());
     let _ = sac.update(&mut Team::new(1), transitions.columns(), &mut Noise::new(1));
 }

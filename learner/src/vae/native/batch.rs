@@ -1,7 +1,5 @@
 //! What is remembered of a minibatch between its passes.
 
-use skein_protocol::LATENT;
-
 use super::buffer::Buffer;
 use super::network::Network;
 use super::order::Affine;
@@ -12,9 +10,9 @@ use super::unfold;
 pub(super) struct Batch {
     /// Pixels and the encoder's images, after ReLU.
     pub(super) seen: [Buffer; 5],
-    /// Mean and log-variance, `[n, 64]`.
+    /// Mean and log-variance, `[n, 2 latent]`.
     pub(super) heads: Buffer,
-    /// `[n, 32]`.
+    /// `[n, latent]`.
     pub(super) codes: Buffer,
     /// The decoder's first image, `[n, 3, 1024]`, after ReLU.
     pub(super) unfolded: Buffer,
@@ -38,6 +36,7 @@ pub(super) struct Batch {
 impl Batch {
     /// Makes room for so many images.
     pub(super) fn resize(&mut self, network: &Network, images: usize) {
+        let latent = network.latent();
         let (seen, drawn) = (network.seen_lens(), network.drawn_lens());
         let resize = |buffers: &mut [Buffer], lens: &[usize]| {
             for (buffer, len) in buffers.iter_mut().zip(lens) {
@@ -49,10 +48,10 @@ impl Batch {
         resize(&mut self.drawn, &drawn);
         resize(&mut self.drawn_flow, &drawn[..3]);
         for (buffer, len) in [
-            (&mut self.heads, 2 * LATENT),
-            (&mut self.heads_flow, 2 * LATENT),
-            (&mut self.codes, LATENT),
-            (&mut self.codes_flow, LATENT),
+            (&mut self.heads, 2 * latent),
+            (&mut self.heads_flow, 2 * latent),
+            (&mut self.codes, latent),
+            (&mut self.codes_flow, latent),
             (&mut self.unfolded, unfold::INPUT_LEN),
             (&mut self.unfolded_flow, unfold::INPUT_LEN),
             (&mut self.seen_sums, sums_len(network.encoder_places())),

@@ -3,7 +3,7 @@
 use skein_kernels::{Isa, sigmoid};
 
 /// Numbers summed side by side; sums of sums follow in order. So the result does not depend on how wide a register is.
-const LANES: usize = 16;
+pub(super) const LANES: usize = 16;
 
 /// Gives every pixel of `image`, `[pixels, channels]`, the `bias`, `[channels]`.
 pub(super) fn fill(image: &mut [f32], bias: &[f32]) {

@@ -2,9 +2,9 @@
 
 use skein_kernels::{Finish, Isa, Matrix, Panels, Rows, Start, Team, Windows, product};
 use skein_protocol::snapshot::{ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL};
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LATENT};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
 
-use super::elementwise::{fill, rectify, scale};
+use super::elementwise::{LANES, fill, rectify, scale};
 use super::layer::{Layer, Linear, STRIDE};
 use super::order::{Affine, Order};
 use super::stopwatch::{Pass, Stopwatch};
@@ -27,7 +27,7 @@ pub(super) struct Network {
     pub(super) encoder: [Layer; 4],
     /// Mean, then log-variance.
     pub(super) heads: Linear,
-    /// The mean's weights once more, for encoding alone: `[3072, 32]`.
+    /// The mean's weights once more, for encoding alone: `[3072, latent]`.
     mean: Panels,
     pub(super) linear: Linear,
     pub(super) unfold: Unfold,
@@ -36,7 +36,8 @@ pub(super) struct Network {
 }
 
 impl Network {
-    pub(super) fn new(isa: Isa, order: &Order) -> Self {
+    /// With codes of `latent` numbers.
+    pub(super) fn new(isa: Isa, latent: usize, order: &Order) -> Self {
         let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
         let encoder = std::array::from_fn(|index| {
             let windows = Windows::new(size, ENCODER_CHANNELS[index], [ENCODER_KERNEL; 2], STRIDE);
@@ -44,6 +45,10 @@ impl Network {
             let place = order.layer(&format!("encoder.conv{}", index + 1));
             Layer::new(isa, windows, ENCODER_CHANNELS[index + 1], place)
         });
+        assert!(
+            (2 * latent).is_multiple_of(LANES),
+            "what flows back to the heads' biases is added up in whole lanes"
+        );
         let mut heads = order.layer("encoder.mean");
         let log_variance = order.layer("encoder.log_variance");
         heads.weight.end = log_variance.weight.end;
@@ -66,9 +71,9 @@ impl Network {
         Self {
             isa,
             encoder,
-            heads: Linear::new(isa, ENCODER_FEATURES, 2 * LATENT, heads),
+            heads: Linear::new(isa, ENCODER_FEATURES, 2 * latent, heads),
             mean: Panels::new(isa),
-            linear: Linear::new(isa, LATENT, unfold::INPUT_LEN, order.layer("decoder.linear")),
+            linear: Linear::new(isa, latent, unfold::INPUT_LEN, order.layer("decoder.linear")),
             unfold: Unfold::new(isa, order.layer("decoder.conv1")),
             decoder,
         }
@@ -76,7 +81,7 @@ impl Network {
 
     /// Takes over all weights but those of the decoder's first convolution.
     pub(super) fn pack(&mut self, team: &mut Team, parameters: &[f32]) {
-        let mean = &parameters[self.heads.place.weight.clone()][..LATENT * ENCODER_FEATURES];
+        let mean = &parameters[self.heads.place.weight.clone()][..self.latent() * ENCODER_FEATURES];
         self.mean.pack(Matrix::of_rows(mean, ENCODER_FEATURES).transposed());
         self.heads.pack(parameters);
         self.linear.pack(parameters);
@@ -100,18 +105,16 @@ impl Network {
         }
     }
 
-    /// The code's mean from the features.
-    pub(super) fn mean(&self, parameters: &[f32], features: &[f32]) -> [f32; LATENT] {
-        let bias = &parameters[self.heads.place.bias.clone()][..LATENT];
-        let mut code = [0.0; LATENT];
-        product(
-            Rows::Matrix(features),
-            &self.mean,
-            Start::Bias(bias),
-            Finish::Plain,
-            &mut code,
-        );
-        code
+    /// The code's mean from the features, into `code`, `[latent]`.
+    pub(super) fn mean(&self, parameters: &[f32], features: &[f32], code: &mut [f32]) {
+        let bias = &parameters[self.heads.place.bias.clone()][..self.latent()];
+        let (rows, start) = (Rows::Matrix(features), Start::Bias(bias));
+        product(rows, &self.mean, start, Finish::Plain, code);
+    }
+
+    /// Numbers of a code.
+    pub(super) fn latent(&self) -> usize {
+        self.linear.inputs
     }
 
     /// Image number `index` of a batch whose codes have gone through [`Unfold::multiply`]: the decoder's four images, the last one before its sigmoid.

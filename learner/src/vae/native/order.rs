@@ -162,15 +162,18 @@ mod tests {
     use super::*;
     use crate::networks::{Decoder, Encoder};
 
-    fn order() -> (Order, usize) {
+    fn order(latent: usize) -> (Order, usize) {
         let mut layout = Layout::default();
-        let _ = (Encoder::describe(&mut layout), Decoder::describe(&mut layout));
+        let _ = (
+            Encoder::describe(&mut layout, latent),
+            Decoder::describe(&mut layout, latent),
+        );
         (Order::of(&layout), layout.len())
     }
 
     #[test]
     fn every_number_has_one_place_and_comes_back_to_its_own() {
-        let (order, len) = order();
+        let (order, len) = order(8);
         // Exact in f32 up to 2^24.
         let numbers: Vec<f32> = (0..len).map(|number| number as f32).collect();
         let arranged = order.arrange_from_pytorch(&numbers);
@@ -182,7 +185,7 @@ mod tests {
 
     #[test]
     fn a_weight_lies_where_its_formula_says() {
-        let (order, len) = order();
+        let (order, len) = order(32);
         let numbers: Vec<f32> = (0..len).map(|number| number as f32).collect();
         let arranged = order.arrange_from_pytorch(&numbers);
         let first_of = |name: &str| {

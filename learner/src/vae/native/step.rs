@@ -5,7 +5,7 @@
 //! or columns. No sum is ever split between members.
 
 use skein_kernels::{Finish, Isa, Start, Team};
-use skein_protocol::{IMAGE_PIXELS, LATENT};
+use skein_protocol::IMAGE_PIXELS;
 
 use super::batch::Batch;
 use super::buffer::Buffer;
@@ -38,7 +38,7 @@ pub(super) struct Step<'a> {
 
 impl Step<'_> {
     /// The loss of depth images, `[n, 72, 128]`, and its gradient but for the weights of the decoder's first convolution, for which what flows back is left in
-    /// [`super::unfold::Unfold`]. `noise`: standard normal, `[n, 32]`.
+    /// [`super::unfold::Unfold`]. `noise`: standard normal, `[n, latent]`.
     pub(super) fn objective(&mut self, depth: &[u8], noise: &[f32], gradient: &mut [f32]) -> Objective {
         let count = depth.len() / IMAGE_PIXELS;
         self.batch.resize(self.network, count);
@@ -79,7 +79,7 @@ impl Step<'_> {
             .heads
             .forward(self.team, parameters, &batch.seen[4], Finish::Plain, &mut batch.heads);
         watch.layer(HEADS, Pass::Forward);
-        let divergence = code::draw(self.isa, &batch.heads, noise, &mut batch.codes);
+        let divergence = code::draw(self.isa, network.latent(), &batch.heads, noise, &mut batch.codes);
         watch.rest();
         network.linear.forward(
             self.team,
@@ -160,6 +160,7 @@ impl Step<'_> {
         let weight = divergence_weight as f32;
         code::flow_back(
             self.isa,
+            network.latent(),
             &batch.heads,
             noise,
             &batch.codes_flow,
@@ -267,5 +268,3 @@ fn total(isa: Isa, places: [&Affine; 4], sums: &[f32], gradient: &mut [f32]) {
         rest = others;
     }
 }
-
-const _: () = assert!(LATENT.is_multiple_of(16));

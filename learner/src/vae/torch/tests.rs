@@ -1,5 +1,6 @@
 //! The whole step: exactness, determinism, and that it learns.
 
+use skein_protocol::config::{Observation, View};
 use skein_protocol::snapshot::SnapshotLayout;
 
 use super::*;
@@ -39,7 +40,7 @@ fn divergence_matches_hand_calculation() {
 #[test]
 fn the_published_part_is_the_snapshots_encoder() {
     let vae = vae(1);
-    let layout = SnapshotLayout::new(LATENT, 8);
+    let layout = SnapshotLayout::new(&View::present(Observation::Latent, 32), 8);
     assert_eq!(layout.encoder(), 0..vae.published_len());
     let mut start = 0;
     for (ours, snapshots) in vae.parameters.layout().tensors().iter().zip(layout.tensors()) {

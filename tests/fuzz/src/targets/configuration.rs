@@ -123,7 +123,7 @@ fn override_samples() -> Vec<Vec<u8>> {
     [
         "run.seed=7\nrun.device=cuda:1\nsimulator.vehicle.preset=point",
         "courses.training=a/b.toml\ncourses.evaluation=[\"c.toml\", \"/d.toml\"]\nsac.target_entropy=auto",
-        "learning.observation=latent+velocity\nlearning.warmup_steps=100000\nreplay.capacity=1000",
+        "learning.observation=latent+velocity\nvae.latent=16\nlearning.warmup_steps=100000\nreplay.capacity=1000",
         "simulator.generator.shapes=[\"cross\", \"l\"]\ncheckpoints.keep = 3\ntransport.actor_silence_secs=0.5",
     ]
     .map(|text| text.as_bytes().to_vec())

@@ -1,6 +1,7 @@
 //! Transition and status records in any sequence, through the learner's desk: whatever comes, a flight is committed whole, once and finite, or not at all.
 
 use std::collections::BTreeSet;
+use std::mem::offset_of;
 use std::time::{Duration, Instant};
 
 use bytemuck::{Zeroable, bytes_of_mut};
@@ -32,8 +33,10 @@ const RUN: RunId = RunId(1);
 const FLIGHTS: u64 = 6;
 /// Records of the longest flight.
 const LONGEST_FLIGHT: usize = 8;
+/// Length of the latent codes.
+const LATENT: usize = 16;
 /// Bytes of a record before its image.
-const HEADER: usize = std::mem::offset_of!(TransitionRecord, depth);
+const HEADER: usize = offset_of!(TransitionRecord, depth);
 
 pub(super) fn sample_ticket(flight: u64) -> Ticket {
     Ticket {
@@ -57,7 +60,10 @@ fn samples() -> Vec<Vec<u8>> {
     const STEP: [u8; 3] = [3, 0, 0];
     // The last step, and the closing record after it.
     const CLOSE: [u8; 6] = [3, 0, 2, 3, 0, 1];
-    let changed = |place: u8, value: u8| [4, 0, 0, 1, place, value];
+    let changed = |place: usize, value: u8| {
+        let [low, high] = (place as u16).to_le_bytes();
+        [4, 0, 0, 1, low, high, value]
+    };
     vec![
         [&ATTACH[..], &ISSUE, &STEP, &STEP, &CLOSE, &ISSUE, &STEP, &CLOSE].concat(),
         [
@@ -86,9 +92,17 @@ fn samples() -> Vec<Vec<u8>> {
         [
             &ATTACH[..],
             &ISSUE,
-            &changed(244, 0x7f),
+            &changed(offset_of!(TransitionRecord, level_up), 0x7f),
             &changed(44, 3),
             &changed(44, 3),
+        ]
+        .concat(),
+        // A number behind the latent code.
+        [
+            &ATTACH[..],
+            &ISSUE,
+            &changed(offset_of!(TransitionRecord, latent) + 4 * LATENT + 3, 0x3f),
+            &CLOSE,
         ]
         .concat(),
     ]
@@ -116,7 +130,7 @@ impl Learner {
             max_records_per_flight: LONGEST_FLIGHT,
             ..TransportSection::default()
         };
-        let mut desk = Desk::new(RUN, &limits);
+        let mut desk = Desk::new(RUN, &limits, LATENT);
         for flight in 0..FLIGHTS {
             desk.order(Order {
                 ticket: sample_ticket(flight),
@@ -239,7 +253,7 @@ fn keep(flight: u64) -> Keep {
 /// Up to three bytes of the record's header are something else.
 fn change(record: &mut TransitionRecord, script: &mut Script<'_>) {
     for _ in 0..script.u8() % 4 {
-        let place = usize::from(script.u8()) % HEADER;
+        let place = usize::from(script.u16()) % HEADER;
         bytes_of_mut(record)[place] = script.u8();
     }
 }
@@ -254,6 +268,8 @@ fn assert_sound(flight: &CommittedFlight) {
     assert_eq!(flight.depth.is_some(), keep(flight.flight.0) == Keep::Depth);
     assert!(flight.observations.len() <= LONGEST_FLIGHT);
     assert!(flight.walls_passed <= flight.course_walls);
+    let codes = flight.observations.iter();
+    assert!(codes.flat_map(|seen| &seen.latent[LATENT..]).all(|&value| value == 0.0));
     let actions = flight.actions.iter().flatten();
     assert!(actions.clone().all(|action| action.abs() <= 1.0));
     let seen = flight.observations.iter().flat_map(|seen| {

@@ -9,7 +9,7 @@ use skein_learner::replay::{Minibatch, Replay, ReplayState, RingState};
 use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LONGEST_LATENT};
 
 use super::{Target, USUAL, Verdict};
 use crate::script::Script;
@@ -23,6 +23,8 @@ pub(super) const REPLAY: Target = Target {
     run: restore,
 };
 
+/// Length of the latent codes, the default.
+const LATENT: usize = 32;
 /// Values in a row of the smallest buffer: two observations, an action, a reward, an end.
 const ROW: usize = 2 * LATENT + ACTION + 2;
 
@@ -55,7 +57,7 @@ fn restore(bytes: &[u8]) -> Verdict {
     }
     // A flight more: taken in, or refused for want of room for its images.
     let _ = replay.insert(flight());
-    let encode = |images: &[u8]| Ok::<_, ()>(vec![[0.5; LATENT]; images.len() / IMAGE_PIXELS]);
+    let encode = |images: &[u8]| Ok::<_, ()>(vec![[0.5; LONGEST_LATENT]; images.len() / IMAGE_PIXELS]);
     replay.renew_latents(8, encode).unwrap();
     replay.freeze();
     assert_eq!(replay.image_count(), None);
@@ -93,7 +95,7 @@ fn ring(script: &mut Script<'_>, capacity: usize) -> RingState {
 
 pub(super) fn flight() -> CommittedFlight {
     let seen = StepObservation {
-        latent: [0.0; LATENT],
+        latent: [0.0; LONGEST_LATENT],
         velocity_mps: [0.0; 3],
         position_m: [0.0; 3],
         orientation: [0.0, 0.0, 0.0, 1.0],
