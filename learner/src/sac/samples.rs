@@ -70,6 +70,7 @@ impl Transitions {
             rewards: &self.rewards,
             next_observations: &self.next_observations,
             terminated: &self.terminated,
+            images: self.images.as_ref().map(|images| images.each_ref().map(Vec::as_slice)),
         }
     }
 }

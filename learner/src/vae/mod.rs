@@ -40,7 +40,7 @@ pub struct VaeMetrics {
 impl Vae {
     /// An untrained VAE whose parameters depend on the run's seed alone. `device` is libtorch's; the native engine has the processor.
     pub fn new(section: &VaeSection, run: &RunSection, device: Device) -> Self {
-        match run.engine() {
+        match section.engine(run) {
             Engine::Native => Self::Native(NativeVae::new(section, run.seed, run.learner_threads)),
             Engine::Libtorch => Self::Libtorch(TorchVae::new(section, run.seed, device)),
         }

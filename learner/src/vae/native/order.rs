@@ -159,12 +159,14 @@ impl Entry {
 
 #[cfg(test)]
 mod tests {
+    use skein_protocol::config::DecoderName;
+
     use super::*;
     use crate::networks::{Decoder, Encoder};
 
     fn order() -> (Order, usize) {
         let mut layout = Layout::default();
-        let _ = (Encoder::describe(&mut layout), Decoder::describe(&mut layout));
+        let _ = (Encoder::describe(&mut layout), Decoder::describe(&mut layout, DecoderName::Plain));
         (Order::of(&layout), layout.len())
     }
 
