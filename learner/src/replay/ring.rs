@@ -181,6 +181,13 @@ impl Ring {
         &self.images
     }
 
+    /// Gives every image its new number, `[images ever numbered]`.
+    pub(super) fn renumber_images(&mut self, numbers: &[u32]) {
+        for image in &mut self.images {
+            *image = numbers[*image as usize];
+        }
+    }
+
     /// Rewrites the latent parts of both observations of every row from `latents`, one per image, and forgets the images. `first_of_flight` says which image
     /// of an image's flight was the first.
     pub(super) fn replace_latents(
@@ -211,6 +218,6 @@ pub struct RingState {
     pub inserted: u64,
     /// Rows in slot order, `[filled, width]`: `[observation | next observation | true state | next true state | action | reward | terminated]`.
     pub rows: Vec<f32>,
-    /// Number of the depth image of each row's observation, `[filled]`; empty once the VAE is frozen.
+    /// Number of the depth image of each row's observation, `[filled]`; empty once no images are kept.
     pub images: Vec<u32>,
 }

@@ -1,5 +1,6 @@
 //! Transitions for tests.
 
+use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::Observation;
 
 use crate::algorithm::Columns;
@@ -15,6 +16,8 @@ pub(crate) struct Transitions {
     /// What the critic is told instead of the observations, and after the actions.
     pub(crate) told: Option<[Vec<f32>; 2]>,
     pub(crate) terminated: Vec<f32>,
+    /// Of the observations and the next ones.
+    pub(crate) images: Option<[Vec<u8>; 2]>,
 }
 
 impl Transitions {
@@ -28,6 +31,7 @@ impl Transitions {
             next_observations: draw(rows * observation.len()),
             told: None,
             terminated: (0..rows).map(|row| f32::from(row % 3 == 1)).collect(),
+            images: None,
         }
     }
 
@@ -52,9 +56,26 @@ impl Transitions {
             next_observations: observations.clone(),
             told: None,
             terminated: vec![1.0; rows],
+            images: None,
             observations,
             actions,
         }
+    }
+
+    /// The same, where the observation's first two numbers can be seen in its image and nowhere else: how bright its upper and its lower half are.
+    pub(crate) fn looking(observation: Observation, rows: usize, noise: &mut Noise) -> Self {
+        let mut asked = Self::guessing(observation, rows, noise);
+        let images: Vec<u8> = asked
+            .observations
+            .chunks_exact(observation.len())
+            .flat_map(|row| [shade(row[0]), shade(row[1])])
+            .flat_map(|shade| [shade; IMAGE_PIXELS / 2])
+            .collect();
+        asked.images = Some([images.clone(), images]);
+        for observations in [&mut asked.observations, &mut asked.next_observations] {
+            observations.fill(0.0);
+        }
+        asked
     }
 
     pub(crate) fn columns(&self) -> Columns<'_> {
@@ -73,4 +94,9 @@ impl Transitions {
             images: self.images.as_ref().map(|images| images.each_ref().map(Vec::as_slice)),
         }
     }
+}
+
+/// How bright a number in [-1, 1] is drawn.
+pub(crate) fn shade(number: f32) -> u8 {
+    (127.5 + 127.5 * number).round() as u8
 }

@@ -155,7 +155,7 @@ fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
             .map(code)
             .collect();
         let mut drawn = Minibatch::default();
-        let mut rng = trainer.rng(Purpose::PolicyBatches, PolicyVersion(9));
+        let mut rng = rng(&config, Purpose::PolicyBatches, PolicyVersion(9));
         trainer.replay().sample(&mut rng, 200, &mut drawn);
         let rows = drawn.observations.chunks(drawn.observations.len() / 200);
         for observation in rows {
