@@ -323,8 +323,7 @@ fn capacities(section: &ReplaySection) -> (usize, usize) {
 }
 
 /// Images that can be needed. The VAE's training can leave behind: before the epoch in which it is frozen, fewer than `vae.train_steps` steps were flown, with at
-/// most as many closing images; then come the flights of one epoch. A policy needs those of the transitions held, two each at most, and has not looked which these are
-/// before an epoch came in.
+/// most as many closing images; then come the flights of one epoch. A policy needs those of the transitions held, two each at most, and of the flight that comes in.
 fn image_limit(config: &Config) -> usize {
     let steps = match config.learning.encoder {
         EncoderTraining::Vae => config.vae.train_steps,

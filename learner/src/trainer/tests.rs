@@ -1,7 +1,7 @@
 //! A trainer restored from a checkpoint goes on bit for bit.
 
 use skein_inference::{Network, Scratch};
-use skein_protocol::config::Precision;
+use skein_protocol::config::{AlgorithmName, DecoderName, EncoderTraining, Precision};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{IMAGE_PIXELS, LATENT};
 
@@ -57,6 +57,17 @@ fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
     assert_eq!((booked(Stage::VaeStep), booked(Stage::PolicyUpdate)), done);
 }
 
+/// Without a VAE, and with so little room for images that those of overwritten transitions are given up.
+fn end_to_end(algorithm: AlgorithmName) -> Config {
+    let mut config = config();
+    config.learning.encoder = EncoderTraining::EndToEnd;
+    config.learning.algorithm = algorithm;
+    config.td3.hidden_width = 16;
+    config.td3.batch_size = 8;
+    config.transport.max_records_per_flight = 12;
+    config
+}
+
 fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
     CheckpointState {
         progress: Progress {
@@ -77,10 +88,11 @@ fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
 /// Stored to disk, and taken over by a trainer that knows nothing.
 fn resumed(trainer: &mut Trainer, epochs: u64) -> Trainer {
     let directory = tempfile::tempdir().unwrap();
-    let store = CheckpointStore::new(directory.path(), &config());
+    let config = trainer.config.clone();
+    let store = CheckpointStore::new(directory.path(), &config);
     store.save(&state(trainer, epochs), &[]).unwrap();
     let stored = store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap();
-    let mut resumed = Trainer::new(&config()).unwrap();
+    let mut resumed = Trainer::new(&config).unwrap();
     resumed
         .restore(&stored.progress, &stored.tensors, stored.replay)
         .unwrap();
@@ -89,8 +101,8 @@ fn resumed(trainer: &mut Trainer, epochs: u64) -> Trainer {
 }
 
 /// Six epochs, resumed after each of `resumed_after`.
-fn train(lag: u64, resumed_after: &[u64]) -> CheckpointState {
-    let mut trainer = Trainer::new(&config()).unwrap();
+fn train(config: &Config, lag: u64, resumed_after: &[u64]) -> CheckpointState {
+    let mut trainer = Trainer::new(config).unwrap();
     // What was needed of the flights of the first epochs, when they were ordered.
     let mut keep = vec![trainer.keep(); lag as usize];
     for epoch in 0..6 {
@@ -106,15 +118,68 @@ fn train(lag: u64, resumed_after: &[u64]) -> CheckpointState {
 #[test]
 fn a_resumed_trainer_goes_on_bit_for_bit_whenever_it_is_resumed() {
     for lag in [0, 1] {
-        let undisturbed = train(lag, &[]);
+        let undisturbed = train(&config(), lag, &[]);
         assert!(undisturbed.progress.vae_steps > 3 && undisturbed.progress.policy_updates > 10);
         assert!(undisturbed.replay.images.is_none(), "the VAE was never frozen");
         // While the VAE is trained, as it is frozen after the third epoch, and later.
         for after in [&[2][..], &[1, 2, 3, 4, 5]] {
-            let resumed = train(lag, after);
+            let resumed = train(&config(), lag, after);
             assert!(resumed == undisturbed, "lag {lag}, resumed after {after:?}");
         }
     }
+}
+
+#[test]
+fn what_learns_end_to_end_goes_on_bit_for_bit_too_and_keeps_its_images_to_the_end() {
+    for algorithm in [AlgorithmName::Sac, AlgorithmName::Td3] {
+        let config = end_to_end(algorithm);
+        let undisturbed = train(&config, 1, &[]);
+        let Progress {
+            vae_steps,
+            policy_updates,
+            environment_steps,
+            ..
+        } = undisturbed.progress;
+        assert_eq!(vae_steps, 0);
+        assert!(policy_updates > 10);
+        let images: usize = undisturbed.replay.images.iter().flatten().map(|block| block.len()).sum();
+        let flown = (environment_steps + 6 * FLIGHTS) as usize * IMAGE_PIXELS;
+        assert!(0 < images && images < flown, "{images} bytes of {flown} flown are held");
+        for after in [&[2][..], &[1, 2, 3, 4, 5]] {
+            let resumed = train(&config, 1, after);
+            assert!(resumed == undisturbed, "{algorithm}, resumed after {after:?}");
+        }
+    }
+}
+
+#[test]
+fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
+    let mut trainer = Trainer::new(&end_to_end(AlgorithmName::Sac)).unwrap();
+    let encoder = |trainer: &Trainer| trainer.snapshot(PolicyVersion(0)).values[trainer.layout.encoder()].to_vec();
+    let before = encoder(&trainer);
+    assert!(before.iter().filter(|value| **value == 0.0).count() < 10, "it is initialised");
+    (0..3).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+    let moved = encoder(&trainer).iter().zip(&before).filter(|(after, before)| after != before).count();
+    assert!(moved > before.len() / 2, "{moved} of {} numbers moved", before.len());
+    assert_eq!((trainer.keep(), trainer.reconstruct(&[0; IMAGE_PIXELS])), (Keep::Depth, None));
+    assert!(trainer.tensors().iter().all(|tensor| !tensor.name.starts_with("vae")));
+}
+
+#[test]
+fn a_u_net_is_on_libtorch_and_the_policy_where_it_was() {
+    let mut config = config();
+    config.vae.decoder = DecoderName::UNet;
+    let mut trainer = Trainer::new(&config).unwrap();
+    assert!(matches!(trainer.vae, Some(Vae::Libtorch(_))));
+    let policy = |trainer: &mut Trainer| {
+        let mut parts = trainer.algorithm.named_tensors();
+        parts.sort_by(|left, right| left.name.cmp(&right.name));
+        parts
+    };
+    let mut plain = Trainer::new(&self::config()).unwrap();
+    assert!(policy(&mut trainer) == policy(&mut plain), "both begin alike");
+    (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+    assert_eq!(trainer.keep(), Keep::Latents, "the VAE was never frozen");
 }
 
 #[test]
