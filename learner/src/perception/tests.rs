@@ -17,6 +17,8 @@ use crate::state::TensorValues;
 
 const ALGORITHMS: [AlgorithmName; 2] = [AlgorithmName::Sac, AlgorithmName::Td3];
 const OBSERVATION: Observation = Observation::LatentVelocity;
+/// In a bright image both commands should be this, in a dark one the opposite.
+const WANTED: f32 = 0.6;
 
 fn config(algorithm: AlgorithmName) -> Config {
     let mut config = Config::default();
@@ -255,66 +257,52 @@ fn error_of_actors(algorithm: &dyn Algorithm, config: &Config) -> f32 {
         Network::new(&snapshot, &layout, config.vae.encoder_precision),
         Scratch::default(),
     );
-    let mut noise = Noise::new(99);
-    let squares = (0..50).map(|_| {
-        let wanted = [noise.uniform(0.8), noise.uniform(0.8)];
-        let mut image = [shade(wanted[0]); IMAGE_PIXELS];
-        image[IMAGE_PIXELS / 2..].fill(shade(wanted[1]));
-        let mut observation = network.encode(&image, &mut scratch).to_vec();
+    let squares = [-WANTED, WANTED].map(|wanted| {
+        let mut observation = network.encode(&[shade(wanted); IMAGE_PIXELS], &mut scratch).to_vec();
         observation.resize(OBSERVATION.len(), 0.0);
         let action = network.distribution(&observation, &mut scratch).mode();
-        (action[0] - wanted[0]).powi(2) + (action[1] - wanted[1]).powi(2)
+        action.map(|action| (action - wanted).powi(2)).iter().sum::<f32>()
     });
-    squares.sum::<f32>() / 100.0
+    squares.iter().sum::<f32>() / 4.0
 }
 
 #[test]
 fn what_can_only_be_seen_in_the_image_is_learned_and_actors_fly_it() {
     for name in ALGORITHMS {
         let mut config = config(name);
-        for rate in [
-            &mut config.sac.policy_learning_rate,
-            &mut config.sac.critic_learning_rate,
-            &mut config.td3.policy_learning_rate,
-            &mut config.td3.critic_learning_rate,
-        ] {
-            *rate = 1e-3;
-        }
+        (config.sac.critic_learning_rate, config.td3.critic_learning_rate) = (1e-3, 1e-3);
+        (config.sac.policy_learning_rate, config.td3.policy_learning_rate) = (3e-3, 3e-3);
         config.sac.temperature_learning_rate = 1e-2;
         let mut algorithm = new(&config);
         let (mut data, mut noise) = (Noise::new(1), Noise::new(2));
-        for number in 0..400 {
-            let seen = Transitions::looking(OBSERVATION, 16, &mut data);
-            update(&mut *algorithm, &seen, &mut noise).unwrap();
-            if number % 50 == 49 {
-                println!("{name}, {number}: {}", error_of_actors(&*algorithm, &config));
+        // Always answering zero has a mean squared error of 0.6² = 0.36.
+        let mut errors = vec![error_of_actors(&*algorithm, &config)];
+        while errors.len() < 30 && errors[errors.len() - 1] > 0.06 {
+            for _ in 0..20 {
+                let seen = Transitions::looking(OBSERVATION, 16, WANTED, &mut data);
+                update(&mut *algorithm, &seen, &mut noise).unwrap();
             }
+            errors.push(error_of_actors(&*algorithm, &config));
         }
-        // Always answering zero has a mean squared error of 0.8² / 3 = 0.21.
-        let error = error_of_actors(&*algorithm, &config);
-        assert!(error < 0.05, "{name}: {error}");
+        println!("{name}: {errors:?}");
+        assert!(errors[0] > 0.25 && errors.last() < Some(&0.06), "{name}: {errors:?}");
     }
 }
 
-/// Prints what an update takes: `cargo test --release -p skein-learner -- --ignored --nocapture update_from_64_images`.
+/// Prints what an update takes of a processor: `cargo test --release -p skein-learner -- --ignored --nocapture update_from_64_images`.
 #[test]
 #[ignore = "a measurement, not a claim"]
 fn time_of_an_update_from_64_images() {
+    const UPDATES: usize = 20;
     for name in ALGORITHMS {
         let mut config = config(name);
         (config.sac.hidden_width, config.td3.hidden_width, config.td3.policy_period) = (256, 256, 2);
         let (mut algorithm, seen, mut noise) = (new(&config), random(64, 1), Noise::new(2));
-        let mut millis: Vec<_> = (0..20)
-            .map(|_| {
-                let start = std::time::Instant::now();
-                update(&mut *algorithm, &seen, &mut noise).unwrap();
-                start.elapsed().as_secs_f64() * 1e3
-            })
-            .collect();
-        millis.sort_by(f64::total_cmp);
-        println!(
-            "{name}: fastest {:.0} ms, median {:.0} ms, one thread",
-            millis[0], millis[10]
-        );
+        let spent = || crate::threads::cpu_secs().values().sum::<f64>();
+        let before = spent();
+        for _ in 0..UPDATES {
+            update(&mut *algorithm, &seen, &mut noise).unwrap();
+        }
+        println!("{name}: {:.0} ms", (spent() - before) / UPDATES as f64 * 1e3);
     }
 }

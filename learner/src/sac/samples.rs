@@ -62,19 +62,20 @@ impl Transitions {
         }
     }
 
-    /// The same, where the observation's first two numbers can be seen in its image and nowhere else: how bright its upper and its lower half are.
-    pub(crate) fn looking(observation: Observation, rows: usize, noise: &mut Noise) -> Self {
+    /// A one-step task that only the image tells: both numbers of the action should be `wanted` if it is bright, and the opposite if it is dark.
+    pub(crate) fn looking(observation: Observation, rows: usize, wanted: f32, noise: &mut Noise) -> Self {
         let mut asked = Self::guessing(observation, rows, noise);
-        let images: Vec<u8> = asked
-            .observations
-            .chunks_exact(observation.len())
-            .flat_map(|row| [shade(row[0]), shade(row[1])])
-            .flat_map(|shade| [shade; IMAGE_PIXELS / 2])
+        let wanted: Vec<f32> = (0..rows)
+            .map(|_| if noise.uniform(1.0) < 0.0 { -wanted } else { wanted })
             .collect();
-        asked.images = Some([images.clone(), images]);
+        let images: Vec<u8> = wanted.iter().flat_map(|&wanted| [shade(wanted); IMAGE_PIXELS]).collect();
+        for ((reward, action), wanted) in asked.rewards.iter_mut().zip(asked.actions.chunks_exact(2)).zip(wanted) {
+            *reward = -((wanted - action[0]).powi(2) + (wanted - action[1]).powi(2));
+        }
         for observations in [&mut asked.observations, &mut asked.next_observations] {
             observations.fill(0.0);
         }
+        asked.images = Some([images.clone(), images]);
         asked
     }
 
