@@ -150,7 +150,10 @@ impl Columns<'_> {
         }
         let images = self.images.map(|images| images.map(<[u8]>::len));
         let expected = (inputs.encoder == EncoderTraining::EndToEnd).then_some([rows * IMAGE_PIXELS; 2]);
-        assert_eq!(images, expected, "two images for each transition, where they are learned from");
+        assert_eq!(
+            images, expected,
+            "two images for each transition, where they are learned from"
+        );
         rows
     }
 }

@@ -160,11 +160,7 @@ impl Trainer {
 
     /// What is needed of the next flights to be ordered.
     pub fn keep(&self) -> Keep {
-        if self.has_images() {
-            Keep::Depth
-        } else {
-            Keep::Latents
-        }
+        if self.has_images() { Keep::Depth } else { Keep::Latents }
     }
 
     /// Whether images are learned from: until the VAE is frozen, or to the end if there is none.

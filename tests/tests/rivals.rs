@@ -27,11 +27,18 @@ fn learners_log(run: &Ended) -> String {
 #[test]
 fn without_a_vae_a_run_killed_and_gone_on_with_by_more_actors_learns_the_same_bit_for_bit() {
     let calm = end_to_end("sac").actors(1).finish();
-    assert!(learners_log(&calm).contains("engine=libtorch"), "{}", learners_log(&calm));
+    assert!(
+        learners_log(&calm).contains("engine=libtorch"),
+        "{}",
+        learners_log(&calm)
+    );
     let Summary {
         updates, vae_updates, ..
     } = calm.summary();
-    assert!(updates > 10 && vae_updates == 0, "{updates} updates, {vae_updates} of the VAE");
+    assert!(
+        updates > 10 && vae_updates == 0,
+        "{updates} updates, {vae_updates} of the VAE"
+    );
 
     let mut run = end_to_end("sac").actors(2).start();
     // After the first checkpoint, amid updates.
@@ -61,7 +68,10 @@ fn snapshots_of_such_a_run_are_laid_out_as_ever_and_the_critic_has_trained_their
 fn a_u_net_trains_on_libtorch_while_the_policy_stays_on_the_kernels() {
     let u_net = Recipe::small().set("vae.decoder=u-net").finish();
     let log = learners_log(&u_net);
-    assert!(log.contains("engine=native") && log.contains("vae_engine=libtorch"), "{log}");
+    assert!(
+        log.contains("engine=native") && log.contains("vae_engine=libtorch"),
+        "{log}"
+    );
     assert!(u_net.summary().vae_updates > 5);
     assert!(u_net.directory.plots().join("reconstructions.png").exists());
     let plain = Recipe::small().finish();

@@ -85,11 +85,7 @@ fn the_critics_loss_moves_every_tensor_of_the_encoder_and_its_target_follows() {
         update(&mut *algorithm, &random(6, 1), &mut Noise::new(2)).unwrap();
         let after = encoder_of(&*algorithm, &config);
         let target_after = &part(&mut *algorithm, target)[encoder.clone()];
-        for tensor in layout
-            .tensors()
-            .iter()
-            .filter(|tensor| tensor.range.end <= encoder.end)
-        {
+        for tensor in layout.tensors().iter().filter(|tensor| tensor.range.end <= encoder.end) {
             let moved = |before: &[f32], after: &[f32]| {
                 let pairs = before[tensor.range.clone()].iter().zip(&after[tensor.range.clone()]);
                 pairs.map(|(before, after)| (after - before).abs()).fold(0.0, f32::max)
@@ -229,8 +225,7 @@ fn an_update_that_is_not_finite_changes_nothing() {
         let mut seen = random(4, 1);
         seen.rewards[2] = f32::NAN;
         let before = algorithm.named_tensors();
-        let UpdateError::NonFinite { tensor, update } =
-            update(&mut *algorithm, &seen, &mut Noise::new(1)).unwrap_err();
+        let UpdateError::NonFinite { tensor, update } = update(&mut *algorithm, &seen, &mut Noise::new(1)).unwrap_err();
         assert_eq!((tensor, update), ("critic loss", 1), "{name}");
         assert!(algorithm.named_tensors() == before, "{name}");
     }
@@ -296,7 +291,11 @@ fn time_of_an_update_from_64_images() {
     const UPDATES: usize = 20;
     for name in ALGORITHMS {
         let mut config = config(name);
-        (config.sac.hidden_width, config.td3.hidden_width, config.td3.policy_period) = (256, 256, 2);
+        (
+            config.sac.hidden_width,
+            config.td3.hidden_width,
+            config.td3.policy_period,
+        ) = (256, 256, 2);
         let (mut algorithm, seen, mut noise) = (new(&config), random(64, 1), Noise::new(2));
         let spent = || crate::threads::cpu_secs().values().sum::<f64>();
         let before = spent();

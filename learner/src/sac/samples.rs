@@ -68,7 +68,10 @@ impl Transitions {
         let wanted: Vec<f32> = (0..rows)
             .map(|_| if noise.uniform(1.0) < 0.0 { -wanted } else { wanted })
             .collect();
-        let images: Vec<u8> = wanted.iter().flat_map(|&wanted| [shade(wanted); IMAGE_PIXELS]).collect();
+        let images: Vec<u8> = wanted
+            .iter()
+            .flat_map(|&wanted| [shade(wanted); IMAGE_PIXELS])
+            .collect();
         for ((reward, action), wanted) in asked.rewards.iter_mut().zip(asked.actions.chunks_exact(2)).zip(wanted) {
             *reward = -((wanted - action[0]).powi(2) + (wanted - action[1]).powi(2));
         }

@@ -142,7 +142,13 @@ fn what_learns_end_to_end_goes_on_bit_for_bit_too_and_keeps_its_images_to_the_en
         } = undisturbed.progress;
         assert_eq!(vae_steps, 0);
         assert!(policy_updates > 10);
-        let images: usize = undisturbed.replay.images.iter().flatten().map(|block| block.len()).sum();
+        let images: usize = undisturbed
+            .replay
+            .images
+            .iter()
+            .flatten()
+            .map(|block| block.len())
+            .sum();
         let flown = (environment_steps + 6 * FLIGHTS) as usize * IMAGE_PIXELS;
         assert!(0 < images && images < flown, "{images} bytes of {flown} flown are held");
         for after in [&[2][..], &[1, 2, 3, 4, 5]] {
@@ -157,11 +163,21 @@ fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
     let mut trainer = Trainer::new(&end_to_end(AlgorithmName::Sac)).unwrap();
     let encoder = |trainer: &Trainer| trainer.snapshot(PolicyVersion(0)).values[trainer.layout.encoder()].to_vec();
     let before = encoder(&trainer);
-    assert!(before.iter().filter(|value| **value == 0.0).count() < 10, "it is initialised");
+    assert!(
+        before.iter().filter(|value| **value == 0.0).count() < 10,
+        "it is initialised"
+    );
     (0..3).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
-    let moved = encoder(&trainer).iter().zip(&before).filter(|(after, before)| after != before).count();
+    let moved = encoder(&trainer)
+        .iter()
+        .zip(&before)
+        .filter(|(after, before)| after != before)
+        .count();
     assert!(moved > before.len() / 2, "{moved} of {} numbers moved", before.len());
-    assert_eq!((trainer.keep(), trainer.reconstruct(&[0; IMAGE_PIXELS])), (Keep::Depth, None));
+    assert_eq!(
+        (trainer.keep(), trainer.reconstruct(&[0; IMAGE_PIXELS])),
+        (Keep::Depth, None)
+    );
     assert!(trainer.tensors().iter().all(|tensor| !tensor.name.starts_with("vae")));
 }
 

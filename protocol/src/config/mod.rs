@@ -137,7 +137,9 @@ impl Config {
             !end_to_end || self.replay.capacity <= MOST_WITH_IMAGES,
             "replay.capacity",
             self.replay.capacity,
-            format!("is above {MOST_WITH_IMAGES}, and learning.encoder = \"end-to-end\": every transition keeps a depth image, 9 KiB"),
+            format!(
+                "is above {MOST_WITH_IMAGES}, and learning.encoder = \"end-to-end\": every transition keeps a depth image, 9 KiB"
+            ),
         )?;
         let is_native = self.run.engine == Some(Engine::Native);
         for (asked, key) in [
@@ -148,7 +150,9 @@ impl Config {
                 !(is_native && asked),
                 "run.engine",
                 Engine::Native,
-                format!("does not compute {key}, which is written for libtorch: leave run.engine out, or set it to \"libtorch\""),
+                format!(
+                    "does not compute {key}, which is written for libtorch: leave run.engine out, or set it to \"libtorch\""
+                ),
             )?;
         }
         Ok(())

@@ -38,8 +38,14 @@ fn assert_images_belong(batch: &Minibatch) {
         let at = (reward * 100.0).round() as u64;
         let (flight, step) = (at / 1000, (at % 1000) as usize);
         let shades = [shade(flight, step), shade(flight, step + 1)];
-        assert!(image.iter().all(|&pixel| pixel == shades[0]), "flight {flight}, step {step}");
-        assert!(next.iter().all(|&pixel| pixel == shades[1]), "after flight {flight}, step {step}");
+        assert!(
+            image.iter().all(|&pixel| pixel == shades[0]),
+            "flight {flight}, step {step}"
+        );
+        assert!(
+            next.iter().all(|&pixel| pixel == shades[1]),
+            "after flight {flight}, step {step}"
+        );
     }
 }
 

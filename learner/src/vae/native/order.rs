@@ -166,7 +166,10 @@ mod tests {
 
     fn order() -> (Order, usize) {
         let mut layout = Layout::default();
-        let _ = (Encoder::describe(&mut layout), Decoder::describe(&mut layout, DecoderName::Plain));
+        let _ = (
+            Encoder::describe(&mut layout),
+            Decoder::describe(&mut layout, DecoderName::Plain),
+        );
         (Order::of(&layout), layout.len())
     }
 

@@ -74,10 +74,7 @@ fn restore_end_to_end(state: ReplayState) {
     for _ in 0..3 {
         replay.insert(flight()).unwrap();
         replay.sample(&mut rng, 4, &mut drawn);
-        assert_eq!(
-            [drawn.images.len(), drawn.next_images.len()],
-            [4 * IMAGE_PIXELS; 2]
-        );
+        assert_eq!([drawn.images.len(), drawn.next_images.len()], [4 * IMAGE_PIXELS; 2]);
     }
 }
 
