@@ -1,7 +1,8 @@
 //! The variational auto-encoder: gives the policy its eyes.
 //!
 //! It learns to reproduce depth images through a code of 32 numbers, during the first steps of a run, and is then frozen (paper, section 3.3). The
-//! policy sees the code's mean. Two engines compute it, which begin with the same parameters and are held to each other by tests.
+//! policy sees the code's mean. Two engines compute it, which begin with the same parameters and are held to each other by tests; with a U-Net for a decoder
+//! (`Decoder` in `networks/decoder.rs` says what is to be expected of one) it is on libtorch in any case.
 
 mod native;
 mod torch;
