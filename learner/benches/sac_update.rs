@@ -30,6 +30,7 @@ fn main() {
         states: &observations,
         next_states: &next_observations,
         terminated: &vec![0.0; rows],
+        images: None,
     };
     for width in [64, 128, WIDTH, 512, 1024] {
         update(&mut criterion, Engine::Native, width, columns);

@@ -6,8 +6,8 @@
 use std::fmt;
 
 use skein_kernels::{Isa, Team};
-use skein_protocol::ACTION;
-use skein_protocol::config::{AlgorithmName, Config, CriticInput};
+use skein_protocol::config::{AlgorithmName, Config, CriticInput, Engine};
+use skein_protocol::{ACTION, IMAGE_PIXELS};
 use tch::Device;
 
 use crate::error::UpdateError;
@@ -17,7 +17,7 @@ use crate::networks::Layout;
 use crate::noise::Noise;
 use crate::sac::Sac;
 use crate::state::Stateful;
-use crate::td3::Td3;
+use crate::td3::{Td3, TorchTd3};
 
 /// A way to learn a policy from transitions.
 ///
@@ -49,44 +49,57 @@ pub trait Algorithm: Stateful + fmt::Debug {
     /// # Panics
     /// When `into` is not as long as the layout.
     fn publish(&self, into: &mut [f32]);
+
+    /// Copies the encoder's part of a snapshot, in the snapshot layout's order, if this trains an encoder. What learns from the VAE's codes leaves `into` alone.
+    ///
+    /// # Panics
+    /// When `into` is not as long as the encoder.
+    fn publish_encoder(&self, _into: &mut [f32]) {}
 }
 
 /// The algorithm that a configuration names, untrained. `device`: libtorch's; the native engine is on the processor.
 pub fn new(config: &Config, device: Device) -> Box<dyn Algorithm> {
-    let (inputs, seed) = (Inputs::of(config), config.run.seed);
-    match config.learning.algorithm {
-        AlgorithmName::Sac => Box::new(Sac::new(&config.sac, inputs, seed, config.run.engine(), device)),
-        AlgorithmName::Td3 => Box::new(Td3::new(&config.td3, inputs, seed, Isa::best())),
+    let (inputs, seed, engine) = (Inputs::of(config), config.run.seed, config.policy_engine());
+    match (config.learning.algorithm, engine) {
+        (AlgorithmName::Sac, engine) => Box::new(Sac::new(&config.sac, inputs, seed, engine, device)),
+        (AlgorithmName::Td3, Engine::Native) => Box::new(Td3::new(&config.td3, inputs, seed, Isa::best())),
+        (AlgorithmName::Td3, Engine::Libtorch) => Box::new(TorchTd3::new(&config.td3, inputs, seed, device)),
     }
 }
 
-/// How many numbers the networks see of a state.
+/// How many numbers the networks see of a state, and where they come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Inputs {
     /// The policy: an observation.
     pub policy: usize,
     /// The critic, beside the action.
     pub critic: usize,
+    /// How many of them, the first ones, are made of the images in each update, by an encoder that is trained end to end; `None` where the code is the VAE's.
+    pub from_image: Option<usize>,
 }
 
 impl Inputs {
     /// Those of the run configured by `config`.
     pub fn of(config: &Config) -> Self {
-        let policy = config.view().len();
+        let same = Self {
+            from_image: config.learning.end_to_end().then_some(config.vae.latent),
+            ..Self::same(config.view().len())
+        };
         match config.learning.critic_input {
-            CriticInput::Observation => Self::same(policy),
+            CriticInput::Observation => same,
             CriticInput::GroundTruth => Self {
-                policy,
                 critic: TRUE_STATE,
+                ..same
             },
         }
     }
 
-    /// Both see an observation of so many numbers.
+    /// Both see an observation of so many numbers, the VAE's code among them.
     pub fn same(observation: usize) -> Self {
         Self {
             policy: observation,
             critic: observation,
+            from_image: None,
         }
     }
 }
@@ -108,6 +121,8 @@ pub struct Columns<'a> {
     pub next_states: &'a [f32],
     /// `[n]`: 1 where the state after the action ends the task (a crash, the end wall), 0 elsewhere. A flight cut off by its step limit is not terminated.
     pub terminated: &'a [f32],
+    /// Depth images of the observations and of the next ones, `[n, 72, 128]` each; where the encoder is trained end to end, whose codes no row of the replay can hold.
+    pub images: Option<[&'a [u8]; 2]>,
 }
 
 impl Columns<'_> {
@@ -133,6 +148,12 @@ impl Columns<'_> {
                 "every column of a minibatch has one row for each transition"
             );
         }
+        let images = self.images.map(|images| images.map(<[u8]>::len));
+        let expected = inputs.from_image.map(|_| [rows * IMAGE_PIXELS; 2]);
+        assert_eq!(
+            images, expected,
+            "two images for each transition, where they are learned from"
+        );
         rows
     }
 }

@@ -128,7 +128,7 @@ fn write_path(
     Ok(())
 }
 
-/// Writes depth images of a flight beside their reconstructions, `reconstructions.safetensors`.
+/// Writes depth images of a flight beside their reconstructions, `reconstructions.safetensors`; nothing where there is no VAE.
 ///
 /// # Errors
 /// [`EvaluationError`] names the file.
@@ -151,7 +151,9 @@ pub fn write_reconstructions(
         .flatten()
         .copied()
         .collect();
-    let reconstruction = trainer.reconstruct(&chosen);
+    let Some(reconstruction) = trainer.reconstruct(&chosen) else {
+        return Ok(());
+    };
     let shape = vec![chosen.len() / IMAGE_PIXELS, IMAGE_HEIGHT, IMAGE_WIDTH];
     let view = |bytes| TensorView::new(Dtype::U8, shape.clone(), bytes);
     let file = view(&chosen)

@@ -4,6 +4,7 @@
 //! depends on who flew a flight, or when.
 
 pub mod algorithm;
+mod batch;
 pub mod best;
 pub mod checkpoint;
 pub mod curriculum;
@@ -19,6 +20,7 @@ mod mirror;
 pub mod networks;
 pub mod noise;
 pub mod optimizer;
+mod perception;
 pub mod replay;
 pub mod report;
 pub mod sac;

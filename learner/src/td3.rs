@@ -1,7 +1,9 @@
 //! Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477): what the paper compares SAC with (its Fig. 11).
 //!
-//! On the kernels alone, forward and backward written out. The critic is that of [`crate::sac`], one network with two estimates, so that the algorithms differ in nothing else; its
+//! On the kernels, forward and backward written out; [`TorchTd3`] is the same on libtorch. The critic is that of [`crate::sac`], one network with two estimates, so that the algorithms differ in nothing else; its
 //! second estimate only ever steadies the targets. tanh is the C library's, as in actors: bits are equal on any processor with the same one.
+
+mod torch;
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::ACTION;
@@ -18,6 +20,8 @@ use crate::networks::native::{
 use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
 use crate::state::{Part, Stateful};
+
+pub use torch::TorchTd3;
 
 /// Policy and critic, the targets that follow them slowly, and their optimizers.
 #[derive(Debug)]

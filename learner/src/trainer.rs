@@ -57,7 +57,8 @@ pub struct Trainer {
     layout: SnapshotLayout,
     /// Threads of the native engine.
     team: Team,
-    vae: Vae,
+    /// Where it trains the encoder; else the algorithm does.
+    vae: Option<Vae>,
     algorithm: Box<dyn Algorithm>,
     replay: Replay,
     steps: u64,
@@ -73,16 +74,24 @@ impl Trainer {
     pub fn new(config: &Config) -> Result<Self, DeviceError> {
         device::use_threads(config.run.learner_threads);
         let device = device::open(config.run.device)?;
-        let engine = config.run.engine();
+        let engine = config.policy_engine();
+        let vae = (!config.learning.end_to_end()).then(|| config.vae.engine(&config.run));
         let (isa, threads) = (Isa::best(), config.run.learner_threads);
-        tracing::info!(%engine, device = %config.run.device, %isa, threads, "networks are computed");
+        tracing::info!(
+            %engine,
+            vae_engine = vae.map(tracing::field::display),
+            device = %config.run.device,
+            %isa,
+            threads,
+            "networks are computed"
+        );
         Ok(Self {
             layout: SnapshotLayout::of(config),
             team: Team::new(match engine {
                 Engine::Native => threads,
                 Engine::Libtorch => 1,
             }),
-            vae: Vae::new(&config.vae, &config.run, device),
+            vae: vae.map(|_| Vae::new(&config.vae, &config.run, device)),
             algorithm: algorithm::new(config, device),
             replay: Replay::new(config),
             steps: 0,
@@ -101,14 +110,16 @@ impl Trainer {
         tensors: &[NamedTensor],
         replay: ReplayState,
     ) -> Result<(), TrainerRestoreError> {
-        self.vae.load_named(tensors)?;
+        if let Some(vae) = &mut self.vae {
+            vae.load_named(tensors)?;
+        }
         self.algorithm.load_named(tensors)?;
         self.replay = Replay::restore(&self.config, replay)?;
         self.steps = progress.environment_steps;
         self.renewals = self.renewals_due();
         for (what, found, expected) in [
-            ("VAE steps", self.vae.updates(), progress.vae_steps),
-            ("policy updates", self.algorithm.updates(), progress.policy_updates),
+            ("VAE steps", self.vae_updates(), progress.vae_steps),
+            ("policy updates", self.updates(), progress.policy_updates),
         ] {
             if found != expected {
                 return Err(TrainerRestoreError::Count { what, found, expected });
@@ -134,7 +145,7 @@ impl Trainer {
 
     /// VAE steps done.
     pub fn vae_updates(&self) -> u64 {
-        self.vae.updates()
+        self.vae.as_ref().map_or(0, Vae::updates)
     }
 
     /// The replay buffer.
@@ -153,15 +164,15 @@ impl Trainer {
 
     /// What is needed of the next flights to be ordered.
     pub fn keep(&self) -> Keep {
-        if self.vae_is_frozen() && !self.config.learning.mirror {
-            Keep::Latents
-        } else {
-            Keep::Depth
+        match self.has_images() || self.config.learning.mirror {
+            true => Keep::Depth,
+            false => Keep::Latents,
         }
     }
 
-    fn vae_is_frozen(&self) -> bool {
-        self.replay.image_count().is_none()
+    /// Whether images are learned from: until the VAE is frozen, or to the end if there is none.
+    fn has_images(&self) -> bool {
+        self.replay.image_count().is_some()
     }
 
     /// Stores a flight's transitions, and if asked for those of its mirror image.
@@ -172,7 +183,7 @@ impl Trainer {
         let learning = &self.config.learning;
         let mirrored = learning.mirror.then(|| flight.mirrored());
         // With policy lag, flights still come in that were flown with an encoder older than the frozen one: their codes are made anew. Without, images come for the mirror alone.
-        if self.vae_is_frozen() && (learning.policy_lag > 0 || !learning.mirror) {
+        if !self.has_images() && (learning.policy_lag > 0 || !learning.mirror) {
             self.encode(&mut flight);
         }
         self.steps += flight.steps() as u64;
@@ -185,7 +196,7 @@ impl Trainer {
     }
 
     fn insert(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
-        if self.vae_is_frozen() {
+        if !self.has_images() {
             flight.depth = None;
         }
         self.replay.insert(flight)
@@ -212,20 +223,20 @@ impl Trainer {
         timer: &mut LapTimer,
         mut after_each: impl FnMut(&VaeMetrics) -> Result<(), E>,
     ) -> Result<Option<VaeMetrics>, E> {
-        if self.vae_is_frozen() {
+        let Some(vae) = self.vae.as_mut().filter(|_| self.replay.image_count().is_some()) else {
             return Ok(None);
-        }
+        };
         let section = &self.config.vae;
         let counted = self.steps.min(section.train_steps as u64);
         let due = (counted as f64 * section.updates_per_step) as u64;
-        let mut rng = self.rng(Purpose::VaeBatches, version);
+        let mut rng = rng(&self.config, Purpose::VaeBatches, version);
         let mut noise = Noise::new(derive(self.config.run.seed, Purpose::VaeNoise, version.0));
         let (mut images, mut last) = (Vec::new(), None);
-        while self.vae.updates() < due {
+        while vae.updates() < due {
             self.replay
                 .sample_images(&mut rng, self.config.vae.batch_size, &mut images);
             timer.lap(Stage::SampleImages, 1);
-            let metrics = self.vae.update(&images, &mut noise)?;
+            let metrics = vae.update(&images, &mut noise)?;
             timer.lap(Stage::VaeStep, 1);
             after_each(&metrics)?;
             last = Some(metrics);
@@ -238,7 +249,7 @@ impl Trainer {
         }
         self.renewals = due;
         if is_over {
-            tracing::info!(steps = self.steps, vae_updates = self.vae.updates(), "VAE frozen");
+            tracing::info!(steps = self.steps, vae_updates = self.vae_updates(), "VAE frozen");
             self.replay.freeze();
         }
         Ok(last)
@@ -278,7 +289,7 @@ impl Trainer {
         let learning = &self.config.learning;
         let counted = self.steps.saturating_sub(learning.warmup_steps as u64);
         let due = (counted as f64 * learning.updates_per_step) as u64;
-        let mut rng = self.rng(Purpose::PolicyBatches, version);
+        let mut rng = rng(&self.config, Purpose::PolicyBatches, version);
         let mut noise = Noise::new(derive(self.config.run.seed, Purpose::PolicyNoise, version.0));
         let mut minibatch = Minibatch::default();
         while self.algorithm.updates() < due {
@@ -292,30 +303,34 @@ impl Trainer {
         Ok(())
     }
 
-    fn rng(&self, purpose: Purpose, version: PolicyVersion) -> Pcg64Mcg {
-        Pcg64Mcg::seed_from_u64(derive(self.config.run.seed, purpose, version.0))
-    }
-
     /// The parameters that actors fly with, as they are now.
     pub fn snapshot(&self, version: PolicyVersion) -> Snapshot {
         let mut values = vec![0.0; self.layout.values()];
-        self.vae.publish(&mut values[self.layout.encoder()]);
+        let encoder = &mut values[self.layout.encoder()];
+        match &self.vae {
+            Some(vae) => vae.publish(encoder),
+            None => self.algorithm.publish_encoder(encoder),
+        }
         self.algorithm.publish(&mut values[self.layout.policy()]);
         Snapshot { version, values }
     }
 
-    /// `images` as the VAE sees them: `[n, 72, 128]` u8, both ways.
-    pub fn reconstruct(&mut self, images: &[u8]) -> Vec<u8> {
-        let depth = self.vae.reconstruct(images).into_iter();
-        depth.map(|depth| (depth * 255.0).round_ties_even() as u8).collect()
+    /// `images` as the VAE sees them, if there is one: `[n, 72, 128]` u8, both ways.
+    pub fn reconstruct(&mut self, images: &[u8]) -> Option<Vec<u8>> {
+        let depth = self.vae.as_mut()?.reconstruct(images).into_iter();
+        Some(depth.map(|depth| (depth * 255.0).round_ties_even() as u8).collect())
     }
 
     /// Copies of all tensors that updates change.
     pub fn tensors(&mut self) -> Vec<NamedTensor> {
-        let mut all = self.vae.named_tensors();
+        let mut all = self.vae.as_mut().map(Vae::named_tensors).unwrap_or_default();
         all.extend(self.algorithm.named_tensors());
         all
     }
+}
+
+fn rng(config: &Config, purpose: Purpose, version: PolicyVersion) -> Pcg64Mcg {
+    Pcg64Mcg::seed_from_u64(derive(config.run.seed, purpose, version.0))
 }
 
 fn columns(minibatch: &Minibatch) -> Columns<'_> {
@@ -331,6 +346,7 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
         rewards: &minibatch.rewards,
         next_observations: &minibatch.next_observations,
         terminated: &minibatch.terminated,
+        images: (!minibatch.images.is_empty()).then_some([&minibatch.images, &minibatch.next_images]),
     }
 }
 

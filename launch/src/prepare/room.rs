@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use rustix::fs::statvfs;
-use skein_protocol::config::Config;
+use skein_protocol::config::{Config, EncoderTraining};
 use skein_protocol::services::shared_memory_needed;
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::{ACTION, IMAGE_PIXELS};
@@ -115,12 +115,16 @@ pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
     })
 }
 
-/// Bytes of a checkpoint when the replay buffer is as full as it can become, with the depth images that are needed while the VAE is trained.
+/// Bytes of a checkpoint when the replay buffer is as full as it can become, with the depth images that are learned from.
 fn checkpoint_bytes(config: &Config) -> u64 {
     let records = config.transport.max_records_per_flight as u64;
     let rows = (config.replay.capacity as u64).min(config.run.flights.saturating_mul(records));
     let row = 4 * (2 * config.view().len() + ACTION + 2) as u64;
-    let images = 2 * config.vae.train_steps as u64 + config.learning.flights_per_epoch * records;
+    let steps = match config.learning.encoder {
+        EncoderTraining::Vae => config.vae.train_steps,
+        EncoderTraining::EndToEnd => config.replay.capacity,
+    };
+    let images = 2 * steps as u64 + config.learning.flights_per_epoch * records;
     let images = images.min(config.run.flights.saturating_mul(records));
     let snapshot = 4 * SnapshotLayout::of(config).values() as u64;
     rows * row + images * IMAGE_PIXELS as u64 + CHECKPOINT_SNAPSHOTS * snapshot

@@ -69,6 +69,13 @@ impl Layout {
         values
     }
 
+    /// Draws the weights described so far, biases apart, from a range that is wider by `factor`.
+    pub(crate) fn widen_weights(&mut self, factor: f32) {
+        for tensor in self.tensors.iter_mut().filter(|tensor| tensor.shape.len() > 1) {
+            tensor.initial_bound *= factor;
+        }
+    }
+
     /// Whether nothing was described yet.
     pub fn is_empty(&self) -> bool {
         self.tensors.is_empty()

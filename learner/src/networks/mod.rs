@@ -14,7 +14,7 @@ mod policy;
 
 pub use critic::Critic;
 pub use decoder::Decoder;
-pub use encoder::{Encoder, LOG_VARIANCE_BOUND, pixels};
+pub use encoder::{Encoded, Encoder, ImageEncoder, LOG_VARIANCE_BOUND, pixels};
 pub use flat::{Layout, ParameterSpec, Parameters};
 pub use layers::{Convolution, Linear, TransposedConvolution};
 pub use policy::{Policy, PolicySample};

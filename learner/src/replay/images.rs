@@ -1,9 +1,10 @@
-//! Depth images of stored transitions, kept only while the VAE is trained.
+//! Depth images of stored transitions, kept while the VAE is trained, or for ever where the policy learns from them.
 //!
 //! A flight's images are taken over in the block the flight brought them in, not copied. Images are numbered in order of arrival, so the image of a step's
-//! next observation is the following number, the closing image included. Nothing is dropped before the end: a transition that the ring overwrites
-//! leaves its images behind as training material for the VAE, and no row can ever point at an image of another flight. What bounds the store is
-//! that the VAE is frozen after a configured number of steps.
+//! next observation is the following number, the closing image included. For the VAE nothing is dropped before the end: a transition that the ring overwrites
+//! leaves its images behind as training material, and no row can ever point at an image of another flight; what bounds the store is that the VAE is frozen
+//! after a configured number of steps. For a policy, images that no row needs are [swept out](ImageStore::keep_only) now and then, and the others numbered anew, in the
+//! same order.
 
 use std::sync::Arc;
 
@@ -70,6 +71,32 @@ impl ImageStore {
         before
     }
 
+    /// Gives up all images but those `needed`, `[len]`; returns the new number of each image, one that means nothing of those that are gone.
+    ///
+    /// Of a flight that is needed in part, the needed images are copied into a block of their own. Two neighbours that are kept remain neighbours.
+    pub(super) fn keep_only(&mut self, needed: &[bool]) -> Vec<u32> {
+        let mut numbers = Vec::with_capacity(needed.len());
+        let (flights, first) = (std::mem::take(&mut self.flights), std::mem::take(&mut self.first));
+        self.len = 0;
+        for (block, first) in flights.into_iter().zip(first) {
+            let needed = &needed[first as usize..][..block.len() / IMAGE_PIXELS];
+            let before = self.len as u32;
+            numbers.extend(needed.iter().scan(before, |next, &needed| {
+                let number = *next;
+                *next += u32::from(needed);
+                Some(number)
+            }));
+            if needed.iter().all(|&needed| needed) {
+                self.push(block);
+            } else if needed.contains(&true) {
+                let images = block.chunks_exact(IMAGE_PIXELS).zip(needed);
+                let kept: Vec<_> = images.filter(|(_, needed)| **needed).map(|(image, _)| image).collect();
+                self.push(Arc::new(kept.concat()));
+            }
+        }
+        numbers
+    }
+
     /// The blocks, in order.
     pub(super) fn flights(&self) -> &[Arc<Vec<u8>>] {
         &self.flights
@@ -123,7 +150,8 @@ impl ImageStore {
         self.first.partition_point(|&first| first <= number) - 1
     }
 
-    fn image(&self, number: u32) -> &[u8] {
+    /// The image of this number, `[72, 128]`.
+    pub(super) fn image(&self, number: u32) -> &[u8] {
         let flight = self.flight_of(number);
         let start = (number - self.first[flight]) as usize * IMAGE_PIXELS;
         &self.flights[flight][start..start + IMAGE_PIXELS]

@@ -5,7 +5,8 @@
 //! caller's seeded generator draws: the content is a function of the flights, and a minibatch one of content and seed.
 //!
 //! While the VAE is trained, the depth [`images`] of stored transitions are kept: the VAE learns from them, and when it is frozen the latent codes of all
-//! rows, each made by the encoder of its day, are made anew with the final one. Then the images go.
+//! rows, each made by the encoder of its day, are made anew with the final one. Then the images go. Where the encoder is trained end to end they stay: a minibatch
+//! then holds the images of its transitions, as long as the transitions are stored.
 
 mod images;
 mod ring;
@@ -17,7 +18,7 @@ mod tests;
 use std::sync::Arc;
 
 use rand::{Rng, RngExt};
-use skein_protocol::config::{Config, ReplaySection, View};
+use skein_protocol::config::{Config, EncoderTraining, ReplaySection, View};
 use skein_protocol::ids::FlightId;
 use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode};
 
@@ -36,8 +37,12 @@ pub struct Replay {
     view: View,
     success: Ring,
     regular: Ring,
-    /// Until the VAE is frozen.
+    /// Until the VAE is frozen; for ever where the policy learns from them.
     images: Option<ImageStore>,
+    /// What learns from the images.
+    encoder: EncoderTraining,
+    /// Images from which on those that no transition needs are looked for, where a policy learns from them.
+    sweep_above: usize,
     /// The flight that was stored last, and how many steps of it: what a later leg must follow. In no checkpoint, as those lie between flights.
     last: Option<(FlightId, usize)>,
 }
@@ -59,6 +64,10 @@ pub struct Minibatch {
     pub next_true_states: Vec<f32>,
     /// `[batch]`: 1 where the flight ended in a state without a future, else 0. A flight's last step before the time limit is 0: it bootstraps.
     pub terminated: Vec<f32>,
+    /// Depth images of the observations, `[batch, 72, 128]`, where the encoder is trained end to end; else empty.
+    pub images: Vec<u8>,
+    /// Those of the next observations.
+    pub next_images: Vec<u8>,
     /// Slots drawn, before any row is touched: the loads of many rows are then under way at one time.
     slots: Vec<usize>,
 }
@@ -77,18 +86,14 @@ pub enum InsertError {
         /// Steps flown before.
         first_step: usize,
     },
-    /// It came without depth images while the VAE is trained.
-    #[error(
-        "flight {flight} has no depth images, but the VAE is not frozen yet and its latent codes will have to be made anew"
-    )]
+    /// It came without depth images while they are learned from.
+    #[error("flight {flight} has no depth images, but images are still learned from")]
     NoImages {
         /// The flight.
         flight: FlightId,
     },
     /// The images have no room.
-    #[error(
-        "{found} depth images of flight {flight} exceed the {limit} that the VAE's training can need, {held} of them held: the VAE should have been frozen"
-    )]
+    #[error("{found} depth images of flight {flight} exceed the {limit} that can be needed, {held} of them held")]
     TooManyImages {
         /// The flight.
         flight: FlightId,
@@ -113,6 +118,8 @@ impl Replay {
             success: Ring::new(success, layout),
             regular: Ring::new(regular, layout),
             images: Some(ImageStore::new(image_limit(config))),
+            encoder: config.learning.encoder,
+            sweep_above: config.replay.capacity + config.replay.capacity / 4 + epoch_images(config),
             last: None,
         }
     }
@@ -137,7 +144,7 @@ impl Replay {
         self.images.as_ref().map(ImageStore::len)
     }
 
-    /// Stores all transitions of `flight`, in order, each in the part the success rule says. Its depth images are taken over while the VAE is trained, and
+    /// Stores all transitions of `flight`, in order, each in the part the success rule says. Its depth images are taken over while they are learned from, and
     /// dropped after. Of a later leg the first image is the last one of the leg before, and is not stored twice.
     ///
     /// # Errors
@@ -183,9 +190,13 @@ impl Replay {
             (_, 0) => count,
             _ => (count as f64 * self.section.success_share).round() as usize,
         };
+        let images = match self.encoder {
+            EncoderTraining::Vae => None,
+            EncoderTraining::EndToEnd => self.images.as_ref(),
+        };
         into.clear();
-        into.gather(&self.success, rng, from_success);
-        into.gather(&self.regular, rng, count - from_success);
+        into.gather(&self.success, images, rng, from_success);
+        into.gather(&self.regular, images, rng, count - from_success);
     }
 
     /// Draws `count` depth images uniformly with replacement, `[count, 72, 128]`, for a step of the VAE.
@@ -227,11 +238,17 @@ impl Replay {
 
     /// Hands the flight's images to the store; the number of the first, if images are stored.
     fn take_images(&mut self, flight: &mut CommittedFlight) -> Result<Option<u32>, InsertError> {
+        if self.images.is_none() {
+            return Ok(None);
+        }
+        let id = flight.flight;
+        let images = flight.depth.take().ok_or(InsertError::NoImages { flight: id })?;
+        let is_later_leg = flight.first_step > 0;
+        let found = flight.steps() + usize::from(!is_later_leg);
+        self.sweep_images(found);
         let Some(store) = &mut self.images else {
             return Ok(None);
         };
-        let is_later_leg = flight.first_step > 0;
-        let (id, found) = (flight.flight, flight.steps() + usize::from(!is_later_leg));
         if !store.has_room(found) {
             let (held, limit) = (store.len(), store.limit());
             return Err(InsertError::TooManyImages {
@@ -241,11 +258,26 @@ impl Replay {
                 limit,
             });
         }
-        let images = flight.depth.take().ok_or(InsertError::NoImages { flight: id })?;
         Ok(Some(match is_later_leg {
             true => store.extend(&images[IMAGE_PIXELS..]),
             false => store.push(Arc::new(images)),
         }))
+    }
+
+    /// Gives up the images of transitions that are overwritten, if a policy learns from images and there would be too many with so many more. When that is follows from
+    /// how many are held, so that a buffer restored from a checkpoint does the same. The newest transition's images stay: a leg may follow it.
+    fn sweep_images(&mut self, more: usize) {
+        let Some(store) = &mut self.images else { return };
+        if self.encoder == EncoderTraining::Vae || store.len() + more <= self.sweep_above {
+            return;
+        }
+        let mut needed = vec![false; store.len()];
+        for &image in self.success.images().iter().chain(self.regular.images()) {
+            needed[image as usize..image as usize + 2].fill(true);
+        }
+        let numbers = store.keep_only(&needed);
+        self.success.renumber_images(&numbers);
+        self.regular.renumber_images(&numbers);
     }
 }
 
@@ -258,10 +290,12 @@ impl Minibatch {
         self.true_states.clear();
         self.next_true_states.clear();
         self.terminated.clear();
+        self.images.clear();
+        self.next_images.clear();
     }
 
-    /// Appends `count` rows drawn from `ring`.
-    fn gather(&mut self, ring: &Ring, rng: &mut impl Rng, count: usize) {
+    /// Appends `count` rows drawn from `ring`, with their `images` if there are any to be learned from.
+    fn gather(&mut self, ring: &Ring, images: Option<&ImageStore>, rng: &mut impl Rng, count: usize) {
         self.slots.clear();
         self.slots.extend((0..count).map(|_| rng.random_range(0..ring.len())));
         self.actions.reserve(count * ACTION);
@@ -274,6 +308,11 @@ impl Minibatch {
             self.actions.extend_from_slice(row.action);
             self.rewards.push(row.reward);
             self.terminated.push(row.terminated);
+            if let Some(images) = images {
+                let number = ring.images()[slot];
+                self.images.extend_from_slice(images.image(number));
+                self.next_images.extend_from_slice(images.image(number + 1));
+            }
         }
     }
 }
@@ -288,9 +327,22 @@ fn capacities(section: &ReplaySection) -> (usize, usize) {
     (success, section.capacity - success)
 }
 
-/// Images that the VAE's training can leave behind: before the epoch in which it is frozen, fewer than `vae.train_steps` steps were flown, with at
-/// most as many closing images; then come the flights of one epoch. Their mirror images come on top.
+/// Images that can be needed. The VAE's training can leave behind: before the epoch in which it is frozen, fewer than `vae.train_steps` steps were flown, with at
+/// most as many closing images; then come the flights of one epoch. Their mirror images come on top. A policy needs those of the transitions held, two each at most, and of the flight that comes in.
 fn image_limit(config: &Config) -> usize {
-    let epoch = config.learning.flights_per_epoch as usize * config.transport.max_records_per_flight;
-    (2 * config.vae.train_steps + epoch) * (1 + usize::from(config.learning.mirror))
+    let steps = match config.learning.encoder {
+        EncoderTraining::Vae => config.vae.train_steps,
+        EncoderTraining::EndToEnd => config.replay.capacity,
+    };
+    2 * steps * sides(config) + epoch_images(config)
+}
+
+/// Images of an epoch's flights at most.
+fn epoch_images(config: &Config) -> usize {
+    config.learning.flights_per_epoch as usize * config.transport.max_records_per_flight * sides(config)
+}
+
+/// How often a flight is stored.
+fn sides(config: &Config) -> usize {
+    1 + usize::from(config.learning.mirror)
 }

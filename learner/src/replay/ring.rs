@@ -181,6 +181,13 @@ impl Ring {
         &self.images
     }
 
+    /// Gives every image its new number, `[images ever numbered]`.
+    pub(super) fn renumber_images(&mut self, numbers: &[u32]) {
+        for image in &mut self.images {
+            *image = numbers[*image as usize];
+        }
+    }
+
     /// Forgets which images the rows are of.
     pub(super) fn forget_images(&mut self) {
         self.images = Vec::new();
@@ -215,6 +222,6 @@ pub struct RingState {
     pub inserted: u64,
     /// Rows in slot order, `[filled, width]`: `[observation | next observation | true state | next true state | action | reward | terminated]`.
     pub rows: Vec<f32>,
-    /// Number of the depth image of each row's observation, `[filled]`; empty once the VAE is frozen.
+    /// Number of the depth image of each row's observation, `[filled]`; empty once no images are kept.
     pub images: Vec<u32>,
 }

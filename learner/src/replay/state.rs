@@ -16,7 +16,7 @@ pub struct ReplayState {
     pub success: RingState,
     /// The regular part.
     pub regular: RingState,
-    /// Depth images, one block a flight, `[steps + 1, 72, 128]`; `None` once the VAE is frozen. Shared with the buffer, not copied.
+    /// Depth images, one block a flight, `[images, 72, 128]`; `None` once the VAE is frozen. Shared with the buffer, not copied.
     pub images: Option<Vec<Arc<Vec<u8>>>>,
 }
 
@@ -53,6 +53,7 @@ impl Replay {
         replay.regular = Ring::restore(regular, layout, state.regular).map_err(fail("regular part"))?;
         match state.images {
             Some(blocks) => replay.images.iter_mut().try_for_each(|store| fill(store, &blocks)),
+            None if config.learning.end_to_end() => Err("there are none, and the policy learns from them".to_owned()),
             None => {
                 replay.images = None;
                 Ok(())

@@ -3,7 +3,6 @@
 //! Two engines do the same update: one on kernels of our own, one on libtorch. Parameters, noise, metrics and what a checkpoint holds are the same of both; sums round
 //! differently.
 
-mod batch;
 pub mod losses;
 mod native;
 mod torch;
@@ -145,6 +144,13 @@ impl Algorithm for Sac {
 
     fn publish(&self, into: &mut [f32]) {
         Sac::publish(self, into);
+    }
+
+    fn publish_encoder(&self, into: &mut [f32]) {
+        match self {
+            Self::Native(_) => {}
+            Self::Torch(sac) => sac.publish_encoder(into),
+        }
     }
 }
 

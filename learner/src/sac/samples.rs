@@ -1,5 +1,7 @@
 //! Transitions for tests.
 
+use skein_protocol::IMAGE_PIXELS;
+
 use crate::algorithm::Columns;
 use crate::noise::Noise;
 
@@ -13,6 +15,8 @@ pub(crate) struct Transitions {
     /// What the critic is told instead of the observations, and after the actions.
     pub(crate) told: Option<[Vec<f32>; 2]>,
     pub(crate) terminated: Vec<f32>,
+    /// Of the observations and the next ones.
+    pub(crate) images: Option<[Vec<u8>; 2]>,
 }
 
 impl Transitions {
@@ -26,6 +30,7 @@ impl Transitions {
             next_observations: draw(rows * width),
             told: None,
             terminated: (0..rows).map(|row| f32::from(row % 3 == 1)).collect(),
+            images: None,
         }
     }
 
@@ -49,9 +54,27 @@ impl Transitions {
             next_observations: observations.clone(),
             told: None,
             terminated: vec![1.0; rows],
+            images: None,
             observations,
             actions,
         }
+    }
+
+    /// A one-step task that only the image tells: in a bright one, the larger both numbers of the action the better; in a dark one, the smaller.
+    pub(crate) fn looking(width: usize, rows: usize, noise: &mut Noise) -> Self {
+        let mut asked = Self::guessing(width, rows, noise);
+        let ways: Vec<f32> = (0..rows)
+            .map(|_| if noise.uniform(1.0) < 0.0 { -1.0 } else { 1.0 })
+            .collect();
+        let images: Vec<u8> = ways.iter().flat_map(|&way| [shade(0.6 * way); IMAGE_PIXELS]).collect();
+        for ((reward, action), way) in asked.rewards.iter_mut().zip(asked.actions.chunks_exact(2)).zip(ways) {
+            *reward = way * (action[0] + action[1]);
+        }
+        for observations in [&mut asked.observations, &mut asked.next_observations] {
+            observations.fill(0.0);
+        }
+        asked.images = Some([images.clone(), images]);
+        asked
     }
 
     pub(crate) fn columns(&self) -> Columns<'_> {
@@ -67,6 +90,12 @@ impl Transitions {
             rewards: &self.rewards,
             next_observations: &self.next_observations,
             terminated: &self.terminated,
+            images: self.images.as_ref().map(|images| images.each_ref().map(Vec::as_slice)),
         }
     }
+}
+
+/// How bright a number in [-1, 1] is drawn.
+pub(crate) fn shade(number: f32) -> u8 {
+    (127.5 + 127.5 * number).round() as u8
 }

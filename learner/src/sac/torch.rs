@@ -6,13 +6,14 @@ use skein_protocol::seeds::{Purpose, derive};
 use tch::{Device, Tensor, no_grad_guard};
 
 use super::SacMetrics;
-use super::batch::Batch;
 use super::losses::{critic_loss, policy_loss, soft_targets, temperature_loss};
 use crate::algorithm::{Columns, Inputs};
+use crate::batch::Batch;
 use crate::error::{UpdateError, finite};
 use crate::networks::{Critic, Layout, Parameters, Policy};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
+use crate::perception::{LooksAhead, Perception};
 use crate::state::{Part, Stateful};
 
 /// Policy, critic, target critic and temperature, each with its optimizer.
@@ -22,6 +23,8 @@ pub struct TorchSac {
     policy: Policy,
     policy_parameters: Parameters,
     policy_optimizer: Adam,
+    /// Where the encoder is trained end to end: its parameters lie before the critic's.
+    perception: Option<Perception>,
     critic: Critic,
     critic_parameters: Parameters,
     critic_optimizer: Adam,
@@ -43,6 +46,9 @@ impl TorchSac {
         let policy = Policy::describe(&mut layout, inputs.policy as i64, width);
         let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 0), device);
         let mut layout = Layout::default();
+        let perception = inputs
+            .from_image
+            .map(|latent| Perception::describe(&mut layout, latent));
         let critic = Critic::describe(&mut layout, inputs.critic as i64, width, section.critic_networks);
         let critic_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 1), device);
         let log_temperature = Tensor::from_slice(&[section.initial_temperature.ln() as f32])
@@ -53,6 +59,7 @@ impl TorchSac {
             policy,
             policy_optimizer: Adam::new(policy_parameters.flat(), section.policy_learning_rate),
             policy_parameters,
+            perception,
             critic,
             critic_optimizer: Adam::new(critic_parameters.flat(), section.critic_learning_rate),
             target_parameters: critic_parameters.duplicate(),
@@ -77,7 +84,11 @@ impl TorchSac {
     ///
     /// Source: arXiv:1812.05905, algorithm 1.
     pub fn update(&mut self, columns: Columns<'_>, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {
-        let batch = Batch::new(columns, self.inputs, self.log_temperature.device());
+        let mut batch = Batch::new(columns, self.inputs, self.log_temperature.device());
+        if let Some(perception) = &self.perception {
+            let (critic, target) = (&self.critic_parameters, &self.target_parameters);
+            perception.look(&mut batch, critic, target, LooksAhead::Learned);
+        }
         let action_shape = [batch.rows(), ACTION as i64];
         let mut normal = || noise.normal(&action_shape, self.log_temperature.device());
         let temperature = self.log_temperature.detach().exp();
@@ -117,7 +128,7 @@ impl TorchSac {
             .sample(&self.policy_parameters, &batch.observations, &normal());
         let drawn_values = self
             .critic
-            .smaller(&self.critic_parameters, &batch.states, &drawn.actions);
+            .smaller(&self.critic_parameters, &batch.states.detach(), &drawn.actions);
         let policy_loss = policy_loss(&drawn.log_prob, &drawn_values, &temperature);
         let policy_gradient = self.policy_parameters.gradient(&policy_loss);
 
@@ -180,6 +191,16 @@ impl TorchSac {
     /// When `into` is not as long as the layout.
     pub fn publish(&self, into: &mut [f32]) {
         self.policy_parameters.copy_range(0..self.policy_layout().len(), into);
+    }
+
+    /// Copies the encoder's part of a snapshot, if the critic trains one.
+    ///
+    /// # Panics
+    /// When `into` is not as long as the encoder.
+    pub fn publish_encoder(&self, into: &mut [f32]) {
+        if let Some(perception) = &self.perception {
+            perception.publish(&self.critic_parameters, into);
+        }
     }
 
     /// Updates done so far.

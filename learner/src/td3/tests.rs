@@ -1,10 +1,9 @@
 //! The update against automatic gradients, and that it learns.
 
-use tch::{Device, Tensor, no_grad_guard};
+use tch::Device;
 
 use super::*;
 use crate::networks::Parameters;
-use crate::optimizer::Adam;
 use crate::sac::samples::Transitions;
 
 /// Numbers in an observation.
@@ -13,6 +12,7 @@ const OBSERVATION: usize = 34;
 const TOLD: Inputs = Inputs {
     policy: OBSERVATION,
     critic: 19,
+    from_image: None,
 };
 
 fn section() -> Td3Section {
@@ -24,87 +24,6 @@ fn section() -> Td3Section {
 
 fn td3(section: &Td3Section, seed: u64) -> Td3 {
     Td3::new(section, Inputs::same(OBSERVATION), seed, Isa::best())
-}
-
-/// The same algorithm on libtorch, in reading order, with [`TOLD`].
-struct Reference {
-    section: Td3Section,
-    policy: Policy,
-    critic: Critic,
-    learned: [Parameters; 2],
-    targets: [Parameters; 2],
-    optimizers: [Adam; 2],
-    updates: u64,
-}
-
-impl Reference {
-    fn new(section: &Td3Section, seed: u64) -> Self {
-        let width = section.hidden_width as i64;
-        let [inputs, state] = [TOLD.policy, TOLD.critic].map(|inputs| inputs as i64);
-        let (mut policy_layout, mut critic_layout) = (Layout::default(), Layout::default());
-        let policy = Policy::with_outputs(&mut policy_layout, inputs, width, ACTION as i64);
-        let critic = Critic::describe(&mut critic_layout, state, width, section.critic_networks);
-        let parameters = |layout: Layout, index| {
-            Parameters::initialise(layout, derive(seed, Purpose::PolicyParameters, index), Device::Cpu)
-        };
-        let learned = [parameters(policy_layout, 0), parameters(critic_layout, 1)];
-        Self {
-            policy,
-            critic,
-            targets: learned.each_ref().map(Parameters::duplicate),
-            optimizers: [
-                Adam::new(learned[0].flat(), section.policy_learning_rate),
-                Adam::new(learned[1].flat(), section.critic_learning_rate),
-            ],
-            learned,
-            section: section.clone(),
-            updates: 0,
-        }
-    }
-
-    fn update(&mut self, transitions: &Transitions, noise: &mut Noise) -> f64 {
-        let rows = transitions.rewards.len() as i64;
-        let column = |values: &[f32], width: i64| Tensor::from_slice(values).view([rows, width]);
-        let columns = transitions.columns();
-        let [inputs, state] = [TOLD.policy, TOLD.critic].map(|inputs| inputs as i64);
-        let (observations, actions) = (column(columns.observations, inputs), column(columns.actions, 2));
-        let next = column(columns.next_observations, inputs);
-        let (states, next_states) = (column(columns.states, state), column(columns.next_states, state));
-        let (rewards, terminated) = (column(&transitions.rewards, 1), column(&transitions.terminated, 1));
-        let [policy, critic] = &self.learned;
-        let [target_policy, target_critic] = &self.targets;
-        let targets: Tensor = {
-            let _guard = no_grad_guard();
-            let bound = self.section.target_noise_bound;
-            let noise = noise.normal(&[rows, 2], Device::Cpu) * self.section.target_noise;
-            let next_actions =
-                (self.policy.output(target_policy, &next).tanh() + noise.clamp(-bound, bound)).clamp(-1.0, 1.0);
-            let values = self
-                .critic
-                .smaller(target_critic, &next_states, &next_actions)
-                .unsqueeze(1);
-            rewards + (1.0 - terminated) * values * self.section.discount
-        };
-        let values = self.critic.forward(critic, &states, &actions);
-        let loss = (values - targets).square().sum_dim_intlist(1, false, None).mean(None) * 0.5;
-        let critic_loss = loss.double_value(&[]);
-        let critic_gradient = critic.gradient(&loss);
-        self.updates += 1;
-        let improves = self.updates.is_multiple_of(self.section.policy_period);
-        let policy_gradient = improves.then(|| {
-            let actions = self.policy.output(policy, &observations).tanh();
-            let first = self.critic.forward(critic, &states, &actions).narrow(1, 0, 1);
-            policy.gradient(&-first.mean(None))
-        });
-        self.optimizers[1].step(self.learned[1].flat_mut(), &critic_gradient);
-        if let Some(gradient) = policy_gradient {
-            self.optimizers[0].step(self.learned[0].flat_mut(), &gradient);
-            for (target, learned) in self.targets.iter_mut().zip(&self.learned) {
-                target.follow(learned, self.section.target_rate);
-            }
-        }
-        critic_loss
-    }
 }
 
 fn numbers(parameters: &Parameters) -> Vec<f32> {
@@ -128,7 +47,7 @@ fn forty_updates_stay_close_to_automatic_gradients() {
     };
     for (seed, section) in [(1, section()), (2, section()), (3, apart), (4, cut_off)] {
         let mut native = Td3::new(&section, TOLD, seed, Isa::best());
-        let mut reference = Reference::new(&section, seed);
+        let mut torch = TorchTd3::new(&section, TOLD, seed, Device::Cpu);
         let (mut data, mut noise, mut same_noise) = (Noise::new(seed), Noise::new(9), Noise::new(9));
         let before = native.policy_parameters.values.clone();
         for number in 1..=40 {
@@ -136,18 +55,23 @@ fn forty_updates_stay_close_to_automatic_gradients() {
             let found = native
                 .update(&mut Team::new(1), transitions.columns(), &mut noise)
                 .unwrap();
-            let expected = reference.update(&transitions, &mut same_noise);
-            let apart = (f64::from(found[0].1) - expected).abs();
-            assert!(
-                apart < 1e-4 * (1.0 + expected),
-                "update {number}: {found:?}, not {expected}"
-            );
+            let expected = torch
+                .update(&mut Team::new(1), transitions.columns(), &mut same_noise)
+                .unwrap();
+            for ((scalar, found), (same, expected)) in found.iter().zip(&expected) {
+                assert_eq!(scalar, same);
+                let apart = (found - expected).abs();
+                assert!(
+                    apart < 1e-4 * (1.0 + expected.abs()),
+                    "update {number}, {scalar:?}: {found}, not {expected}"
+                );
+            }
         }
         let pairs = [
-            (&native.policy_parameters.values, &reference.learned[0], 6e-3),
-            (&native.critic_parameters.values, &reference.learned[1], 1.2e-2),
-            (&native.target_policy, &reference.targets[0], 1e-3),
-            (&native.target_critic, &reference.targets[1], 1e-3),
+            (&native.policy_parameters.values, &torch.policy_parameters, 6e-3),
+            (&native.critic_parameters.values, &torch.critic_parameters, 1.2e-2),
+            (&native.target_policy, &torch.target_policy, 1e-3),
+            (&native.target_critic, &torch.target_critic, 1e-3),
         ];
         for (found, expected, moved) in pairs {
             let expected = numbers(expected);
@@ -160,6 +84,17 @@ fn forty_updates_stay_close_to_automatic_gradients() {
             assert!(far <= 2 + found.len() / 200, "{far} of {} are far off", found.len());
         }
         assert_ne!(before, native.policy_parameters.values, "the policy was never updated");
+        let layout = |algorithm: &mut dyn Algorithm| {
+            let parts = algorithm.named_tensors().into_iter();
+            let mut parts: Vec<_> = parts.map(|part| (part.name, part.shape)).collect();
+            parts.sort();
+            parts
+        };
+        assert_eq!(
+            layout(&mut native),
+            layout(&mut torch),
+            "a checkpoint says nothing of the engine"
+        );
     }
 }
 

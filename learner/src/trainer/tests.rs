@@ -2,7 +2,7 @@
 
 use skein_inference::{Network, Scratch};
 use skein_protocol::IMAGE_PIXELS;
-use skein_protocol::config::{Observation, Precision};
+use skein_protocol::config::{AlgorithmName, DecoderName, EncoderTraining, Observation, Precision};
 use skein_protocol::transition::Outcome;
 
 use super::*;
@@ -58,6 +58,17 @@ fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
     assert_eq!((booked(Stage::VaeStep), booked(Stage::PolicyUpdate)), done);
 }
 
+/// Without a VAE, and with so little room for images that those of overwritten transitions are given up.
+fn end_to_end(algorithm: AlgorithmName) -> Config {
+    let mut config = config();
+    config.learning.encoder = EncoderTraining::EndToEnd;
+    config.learning.algorithm = algorithm;
+    config.td3.hidden_width = 16;
+    config.td3.batch_size = 8;
+    config.transport.max_records_per_flight = 12;
+    config
+}
+
 fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
     CheckpointState {
         progress: Progress {
@@ -78,10 +89,11 @@ fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
 /// Stored to disk, and taken over by a trainer that knows nothing.
 fn resumed(trainer: &mut Trainer, epochs: u64) -> Trainer {
     let directory = tempfile::tempdir().unwrap();
-    let store = CheckpointStore::new(directory.path(), &config());
+    let config = trainer.config.clone();
+    let store = CheckpointStore::new(directory.path(), &config);
     store.save(&state(trainer, epochs), &[]).unwrap();
     let stored = store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap();
-    let mut resumed = Trainer::new(&config()).unwrap();
+    let mut resumed = Trainer::new(&config).unwrap();
     resumed
         .restore(&stored.progress, &stored.tensors, stored.replay)
         .unwrap();
@@ -90,8 +102,8 @@ fn resumed(trainer: &mut Trainer, epochs: u64) -> Trainer {
 }
 
 /// Six epochs, resumed after each of `resumed_after`.
-fn train(lag: u64, resumed_after: &[u64]) -> CheckpointState {
-    let mut trainer = Trainer::new(&config()).unwrap();
+fn train(config: &Config, lag: u64, resumed_after: &[u64]) -> CheckpointState {
+    let mut trainer = Trainer::new(config).unwrap();
     // What was needed of the flights of the first epochs, when they were ordered.
     let mut keep = vec![trainer.keep(); lag as usize];
     for epoch in 0..6 {
@@ -107,15 +119,84 @@ fn train(lag: u64, resumed_after: &[u64]) -> CheckpointState {
 #[test]
 fn a_resumed_trainer_goes_on_bit_for_bit_whenever_it_is_resumed() {
     for lag in [0, 1] {
-        let undisturbed = train(lag, &[]);
+        let undisturbed = train(&config(), lag, &[]);
         assert!(undisturbed.progress.vae_steps > 3 && undisturbed.progress.policy_updates > 10);
         assert!(undisturbed.replay.images.is_none(), "the VAE was never frozen");
         // While the VAE is trained, as it is frozen after the third epoch, and later.
         for after in [&[2][..], &[1, 2, 3, 4, 5]] {
-            let resumed = train(lag, after);
+            let resumed = train(&config(), lag, after);
             assert!(resumed == undisturbed, "lag {lag}, resumed after {after:?}");
         }
     }
+}
+
+#[test]
+fn what_learns_end_to_end_goes_on_bit_for_bit_too_and_keeps_its_images_to_the_end() {
+    for algorithm in [AlgorithmName::Sac, AlgorithmName::Td3] {
+        let config = end_to_end(algorithm);
+        let undisturbed = train(&config, 1, &[]);
+        let Progress {
+            vae_steps,
+            policy_updates,
+            environment_steps,
+            ..
+        } = undisturbed.progress;
+        assert_eq!(vae_steps, 0);
+        assert!(policy_updates > 10);
+        let images: usize = undisturbed
+            .replay
+            .images
+            .iter()
+            .flatten()
+            .map(|block| block.len())
+            .sum();
+        let flown = (environment_steps + 6 * FLIGHTS) as usize * IMAGE_PIXELS;
+        assert!(0 < images && images < flown, "{images} bytes of {flown} flown are held");
+        for after in [&[2][..], &[1, 2, 3, 4, 5]] {
+            let resumed = train(&config, 1, after);
+            assert!(resumed == undisturbed, "{algorithm}, resumed after {after:?}");
+        }
+    }
+}
+
+#[test]
+fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
+    let mut trainer = Trainer::new(&end_to_end(AlgorithmName::Sac)).unwrap();
+    let encoder = |trainer: &Trainer| trainer.snapshot(PolicyVersion(0)).values[trainer.layout.encoder()].to_vec();
+    let before = encoder(&trainer);
+    assert!(
+        before.iter().filter(|value| **value == 0.0).count() < 10,
+        "it is initialised"
+    );
+    (0..3).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+    let moved = encoder(&trainer)
+        .iter()
+        .zip(&before)
+        .filter(|(after, before)| after != before)
+        .count();
+    assert!(moved > before.len() / 2, "{moved} of {} numbers moved", before.len());
+    assert_eq!(
+        (trainer.keep(), trainer.reconstruct(&[0; IMAGE_PIXELS])),
+        (Keep::Depth, None)
+    );
+    assert!(trainer.tensors().iter().all(|tensor| !tensor.name.starts_with("vae")));
+}
+
+#[test]
+fn a_u_net_is_on_libtorch_and_the_policy_where_it_was() {
+    let mut config = config();
+    config.vae.decoder = DecoderName::UNet;
+    let mut trainer = Trainer::new(&config).unwrap();
+    assert!(matches!(trainer.vae, Some(Vae::Libtorch(_))));
+    let policy = |trainer: &mut Trainer| {
+        let mut parts = trainer.algorithm.named_tensors();
+        parts.sort_by(|left, right| left.name.cmp(&right.name));
+        parts
+    };
+    let mut plain = Trainer::new(&self::config()).unwrap();
+    assert!(policy(&mut trainer) == policy(&mut plain), "both begin alike");
+    (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+    assert_eq!(trainer.keep(), Keep::Latents, "the VAE was never frozen");
 }
 
 #[test]
@@ -182,7 +263,7 @@ fn flights_are_stored_a_second_time_as_seen_in_a_mirror() {
         "images are of one shade, and look the same in a mirror"
     );
     let mut drawn = Minibatch::default();
-    let mut rng = trainer.rng(Purpose::PolicyBatches, PolicyVersion(9));
+    let mut rng = rng(&trainer.config, Purpose::PolicyBatches, PolicyVersion(9));
     trainer.replay().sample(&mut rng, 400, &mut drawn);
     let observations = drawn.observations.chunks(drawn.observations.len() / 400);
     let to_the_left = observations.zip(drawn.actions.chunks(2)).filter(|(seen, action)| {
@@ -221,7 +302,7 @@ fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
         .map(code)
         .collect();
     let mut drawn = Minibatch::default();
-    let mut rng = trainer.rng(Purpose::PolicyBatches, PolicyVersion(9));
+    let mut rng = rng(&trainer.config, Purpose::PolicyBatches, PolicyVersion(9));
     trainer.replay().sample(&mut rng, 200, &mut drawn);
     let mut rows = drawn.observations.chunks(drawn.observations.len() / 200);
     let latent = trainer.config.vae.latent;

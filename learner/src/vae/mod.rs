@@ -1,7 +1,8 @@
 //! The variational auto-encoder: gives the policy its eyes.
 //!
 //! It learns to reproduce depth images through a short code, during the first steps of a run, and is then frozen (paper, section 3.3). The
-//! policy sees the code's mean. Two engines compute it, which begin with the same parameters and are held to each other by tests.
+//! policy sees the code's mean. Two engines compute it, which begin with the same parameters and are held to each other by tests; with a U-Net for a decoder
+//! (`Decoder` in `networks/decoder.rs` says what is to be expected of one) it is on libtorch in any case.
 
 mod native;
 mod torch;
@@ -40,7 +41,7 @@ pub struct VaeMetrics {
 impl Vae {
     /// An untrained VAE whose parameters depend on the run's seed alone. `device` is libtorch's; the native engine has the processor.
     pub fn new(section: &VaeSection, run: &RunSection, device: Device) -> Self {
-        match run.engine() {
+        match section.engine(run) {
             Engine::Native => Self::Native(NativeVae::new(section, run.seed, run.learner_threads)),
             Engine::Libtorch => Self::Libtorch(TorchVae::new(section, run.seed, device)),
         }

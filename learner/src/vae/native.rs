@@ -18,7 +18,7 @@ mod unfold;
 
 use skein_kernels::{AdamStep, Isa, Team};
 use skein_protocol::IMAGE_PIXELS;
-use skein_protocol::config::VaeSection;
+use skein_protocol::config::{DecoderName, VaeSection};
 use skein_protocol::seeds::{Purpose, derive};
 
 use self::batch::Batch;
@@ -72,7 +72,7 @@ impl NativeVae {
     pub(crate) fn with_isa(section: &VaeSection, run_seed: u64, threads: usize, isa: Isa) -> Self {
         let mut layout = Layout::default();
         let published_len = Encoder::describe(&mut layout, section.latent).published_len();
-        let _ = Decoder::describe(&mut layout, section.latent);
+        let _ = Decoder::describe(&mut layout, section.latent, DecoderName::Plain);
         let order = Order::of(&layout);
         let initial = layout.initial_values(derive(run_seed, Purpose::VaeParameters, 0));
         let len = initial.len();

@@ -2,6 +2,7 @@
 
 use skein_kernels::Isa;
 use skein_protocol::IMAGE_PIXELS;
+use skein_protocol::config::DecoderName;
 
 use super::*;
 
@@ -278,6 +279,11 @@ fn a_configuration_gets_its_engine() {
     let mut run = RunSection::default();
     let section = VaeSection::default();
     assert!(matches!(Vae::new(&section, &run, Device::Cpu), Vae::Native(_)));
+    let u_net = VaeSection {
+        decoder: DecoderName::UNet,
+        ..section.clone()
+    };
+    assert!(matches!(Vae::new(&u_net, &run, Device::Cpu), Vae::Libtorch(_)));
     run.engine = Some(Engine::Libtorch);
     assert!(matches!(Vae::new(&section, &run, Device::Cpu), Vae::Libtorch(_)));
 }

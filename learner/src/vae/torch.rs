@@ -10,7 +10,7 @@ use tch::{Device, Kind, Tensor, no_grad_guard};
 
 use super::VaeMetrics;
 use crate::error::{UpdateError, finite};
-use crate::networks::{Decoder, Encoder, Layout, Parameters, pixels};
+use crate::networks::{Decoder, Encoded, Encoder, Layout, Parameters, pixels};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
 use crate::state::{Part, Stateful};
@@ -43,7 +43,7 @@ impl TorchVae {
     pub fn new(section: &VaeSection, run_seed: u64, device: Device) -> Self {
         let mut layout = Layout::default();
         let encoder = Encoder::describe(&mut layout, section.latent);
-        let decoder = Decoder::describe(&mut layout, section.latent);
+        let decoder = Decoder::describe(&mut layout, section.latent, section.decoder);
         let parameters = Parameters::initialise(layout, derive(run_seed, Purpose::VaeParameters, 0), device);
         let optimizer = Adam::new(parameters.flat(), section.learning_rate);
         Self {
@@ -91,9 +91,13 @@ impl TorchVae {
     /// The loss and its two parts for these pixels, `[n, 1, 72, 128]`, and standard normal noise, `[n, latent]`.
     fn objective(&self, pixels: &Tensor, code_noise: &Tensor) -> Objective {
         // The code is drawn as mean + std · noise, so that gradients reach mean and std (arXiv:1312.6114, section 2.4).
-        let (mean, log_variance) = self.encoder.distribution(&self.parameters, pixels);
+        let Encoded {
+            mean,
+            log_variance,
+            maps,
+        } = self.encoder.encode(&self.parameters, pixels);
         let codes = &mean + (&log_variance * 0.5).exp() * code_noise;
-        let reconstructed = self.decoder.forward(&self.parameters, &codes);
+        let reconstructed = self.decoder.forward(&self.parameters, &codes, &maps);
 
         let error = squared_error(&reconstructed, pixels);
         let divergence = divergence(&mean, &log_variance);
@@ -114,8 +118,8 @@ impl TorchVae {
     pub fn reconstruct(&self, images: &Tensor) -> Tensor {
         let shape = [-1, IMAGE_HEIGHT as i64, IMAGE_WIDTH as i64];
         self.in_chunks(images, |pixels| {
-            let codes = self.encoder.mean(&self.parameters, pixels);
-            self.decoder.forward(&self.parameters, &codes).view(shape)
+            let Encoded { mean, maps, .. } = self.encoder.encode(&self.parameters, pixels);
+            self.decoder.forward(&self.parameters, &mean, &maps).view(shape)
         })
         .unwrap_or_else(|| Tensor::zeros([0, shape[1], shape[2]], (Kind::Float, self.device())))
     }

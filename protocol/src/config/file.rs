@@ -292,6 +292,22 @@ mod tests {
     }
 
     #[test]
+    fn what_is_written_for_libtorch_alone_is_computed_by_it_and_nothing_else_is() {
+        let engines = |overrides: &[&str]| {
+            let config = load("", overrides).unwrap();
+            (config.policy_engine(), config.vae.engine(&config.run))
+        };
+        let (native, libtorch) = (Engine::Native, Engine::Libtorch);
+        assert_eq!(engines(&[]), (native, native));
+        assert_eq!(engines(&["vae.decoder=u-net"]), (native, libtorch));
+        for algorithm in ["sac", "td3"] {
+            let algorithm = format!("learning.algorithm={algorithm}");
+            assert_eq!(engines(&["learning.encoder=end-to-end", &algorithm]).0, libtorch);
+            assert_eq!(engines(&["run.engine=libtorch", &algorithm]).0, libtorch);
+        }
+    }
+
+    #[test]
     fn course_paths_are_relative_to_the_file() {
         let config = load("[courses]\ntraining = \"a/b.toml\"", &[]).unwrap();
         assert!(config.courses.training.is_absolute() && config.courses.training.ends_with("a/b.toml"));
@@ -482,6 +498,41 @@ mod tests {
                 "[td3]\ncritic_networks = 0",
                 vec![],
                 vec!["td3.critic_networks = 0", "neither 1 nor 2"],
+            ),
+            (
+                "[learning]\nencoder = \"end-to-end\"\nhistory_steps = [2]",
+                vec![],
+                vec!["learning.history_steps = [2]", "end-to-end", "name none"],
+            ),
+            (
+                "[learning]\nencoder = \"end-to-end\"",
+                vec!["learning.critic_input=ground-truth"],
+                vec!["learning.critic_input = ground-truth", "end-to-end", "sees no image"],
+            ),
+            (
+                "[learning]\nencoder = \"end-to-end\"",
+                vec!["vae.decoder=u-net"],
+                vec!["vae.decoder = u-net", "end-to-end", "there is no VAE"],
+            ),
+            (
+                "[learning]\nencoder = \"end-to-end\"",
+                vec!["replay.capacity=200001"],
+                vec!["replay.capacity = 200001", "end-to-end", "9 KiB"],
+            ),
+            (
+                "[learning]\nencoder = \"end-to-end\"",
+                vec!["run.engine=native"],
+                vec!["run.engine = native", "end-to-end", "leave run.engine out"],
+            ),
+            (
+                "[vae]\ndecoder = \"u-net\"",
+                vec!["run.engine=native"],
+                vec!["run.engine = native", "u-net", "leave run.engine out"],
+            ),
+            (
+                "[vae]\ndecoder = \"unet\"",
+                vec![],
+                vec!["[vae]", "unet", "u-net", "plain"],
             ),
             (
                 "[learning]\nleg_steps = 257",

@@ -17,6 +17,9 @@ const MOST_HISTORY: usize = 16;
 pub struct LearningSection {
     /// What learns the policy: `sac` or `td3`, each with a section of its own. Default `sac`, as in the paper.
     pub algorithm: AlgorithmName,
+    /// What trains the encoder that turns a depth image into the numbers the policy sees: `vae`, or `end-to-end`, where the critic's loss does and `[vae]` has no say but in
+    /// the encoder's precision. Every transition keeps its images then, 9 KiB each. Default `vae`, as in the paper.
+    pub encoder: EncoderTraining,
     /// Flights flown with one frozen snapshot before the networks are updated. 1 is the paper's delayed learning. Default 10.
     pub flights_per_epoch: u64,
     /// Steps after which the networks are updated and the weights refreshed in the middle of a flight, which goes on with them. 0 waits for the flight's end, as
@@ -48,6 +51,7 @@ impl Default for LearningSection {
     fn default() -> Self {
         Self {
             algorithm: AlgorithmName::Sac,
+            encoder: EncoderTraining::Vae,
             flights_per_epoch: 10,
             leg_steps: 0,
             policy_lag: 0,
@@ -78,6 +82,7 @@ impl LearningSection {
             "is above 1: flying two epochs behind gains nothing over one, whose updates already overlap the flying",
         )?;
         self.validate_legs()?;
+        self.validate_encoder()?;
         require(
             (0.0..=100.0).contains(&self.updates_per_step),
             "learning.updates_per_step",
@@ -114,6 +119,27 @@ impl LearningSection {
     /// Whether flights are flown in legs, so that the weights are refreshed in the middle of them.
     pub fn in_legs(&self) -> bool {
         self.leg_steps > 0
+    }
+
+    /// Whether policy and critic learn from depth images themselves.
+    pub fn end_to_end(&self) -> bool {
+        self.encoder == EncoderTraining::EndToEnd
+    }
+
+    /// What an encoder that the critic's loss trains does not go with.
+    fn validate_encoder(&self) -> Result<(), Invalid> {
+        require(
+            !self.end_to_end() || self.history_steps.is_empty(),
+            "learning.history_steps",
+            format!("{:?}", self.history_steps),
+            "does not go with learning.encoder = \"end-to-end\", which draws the images of two moments with each transition and no earlier ones: name none, or set learning.encoder to \"vae\"",
+        )?;
+        require(
+            !self.end_to_end() || self.critic_input == CriticInput::Observation,
+            "learning.critic_input",
+            "ground-truth",
+            "does not go with learning.encoder = \"end-to-end\": the critic's loss trains the encoder, and this critic sees no image; set it to \"observation\", or learning.encoder to \"vae\"",
+        )
     }
 
     /// One flight is under way in legs at a time: only then does each leg follow from all that was flown before.
@@ -176,6 +202,16 @@ impl fmt::Display for AlgorithmName {
             Self::Td3 => "td3",
         })
     }
+}
+
+/// What trains the encoder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum EncoderTraining {
+    /// A variational auto-encoder, which is then frozen (the paper).
+    Vae,
+    /// The critic's loss: policy and critic see through one convolutional encoder (arXiv:1910.01741, arXiv:2004.13649).
+    EndToEnd,
 }
 
 /// What the critic judges an action by.

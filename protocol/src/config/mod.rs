@@ -22,13 +22,13 @@ use crate::leg::MOST_FLOWN;
 pub use courses::CoursesSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
 pub use file::{ConfigError, culprit};
-pub use learning::{AlgorithmName, CriticInput, LearningSection, Observation, View};
+pub use learning::{AlgorithmName, CriticInput, EncoderTraining, LearningSection, Observation, View};
 pub use replay::{ReplaySection, SuccessRule};
 pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};
 pub use td3::Td3Section;
 pub use transport::TransportSection;
-pub use vae::{Precision, VaeSection};
+pub use vae::{DecoderName, Precision, VaeSection};
 
 /// Everything that determines a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -80,6 +80,14 @@ impl Config {
         }
     }
 
+    /// What computes policy and critic: the run's engine, but what learns from images is written for libtorch alone.
+    pub fn policy_engine(&self) -> Engine {
+        match self.learning.encoder {
+            EncoderTraining::Vae => self.run.engine(),
+            EncoderTraining::EndToEnd => Engine::Libtorch,
+        }
+    }
+
     /// Checks every key, and keys against each other.
     ///
     /// # Errors
@@ -112,15 +120,7 @@ impl Config {
             ),
         )?;
         self.validate_legs()?;
-        require(
-            self.learning.algorithm == AlgorithmName::Sac || self.run.engine() == Engine::Native,
-            "run.engine",
-            self.run.engine(),
-            format!(
-                "does not compute learning.algorithm = \"{}\", which is written for the native engine alone: set run.engine to \"native\" and run.device to \"cpu\"",
-                self.learning.algorithm
-            ),
-        )?;
+        self.validate_encoder()?;
         let (key, batch_size) = self.batch_size_by_key();
         require(
             batch_size <= self.learning.warmup_steps.max(1),
@@ -131,6 +131,40 @@ impl Config {
                 self.learning.warmup_steps
             ),
         )
+    }
+
+    /// What ways of training the encoder ask of other sections.
+    fn validate_encoder(&self) -> Result<(), Invalid> {
+        let (end_to_end, decoder) = (self.learning.end_to_end(), self.vae.decoder);
+        require(
+            !end_to_end || decoder == DecoderName::Plain,
+            "vae.decoder",
+            "u-net",
+            "does not go with learning.encoder = \"end-to-end\", where there is no VAE: set it to \"plain\", or learning.encoder to \"vae\"",
+        )?;
+        require(
+            !end_to_end || self.replay.capacity <= MOST_WITH_IMAGES,
+            "replay.capacity",
+            self.replay.capacity,
+            format!(
+                "is above {MOST_WITH_IMAGES}, and learning.encoder = \"end-to-end\": every transition keeps a depth image, 9 KiB"
+            ),
+        )?;
+        let is_native = self.run.engine == Some(Engine::Native);
+        for (asked, key) in [
+            (end_to_end, "learning.encoder = \"end-to-end\""),
+            (decoder == DecoderName::UNet, "vae.decoder = \"u-net\""),
+        ] {
+            require(
+                !(is_native && asked),
+                "run.engine",
+                Engine::Native,
+                format!(
+                    "does not compute {key}, which is written for libtorch: leave run.engine out, or set it to \"libtorch\""
+                ),
+            )?;
+        }
+        Ok(())
     }
 
     /// What flights in legs ask of other sections.
@@ -154,6 +188,9 @@ impl Config {
         )
     }
 }
+
+/// Transitions held at most where each keeps its image: 1.8 GB of images.
+const MOST_WITH_IMAGES: usize = 200_000;
 
 /// How deep sections, tables and lists may lie within each other: the parser of TOML itself ends at 80, and recursion at the end of the stack.
 pub(crate) const DEEPEST: usize = 16;

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require, require_learning_rate};
+use super::{Engine, Invalid, RunSection, require, require_learning_rate};
 use crate::LONGEST_LATENT;
 
 /// Lengths a latent code may have. Records have room for the longest; mean and log-variance of the shortest fill the 16 lanes that the learner adds up at a time.
@@ -29,6 +29,9 @@ pub struct VaeSection {
     pub learning_rate: f64,
     /// Weight of the Kullback-Leibler term against the squared error summed over the image's pixels. Default 1, the plain VAE.
     pub kl_weight: f64,
+    /// What reproduces the image, in training alone: `plain`, or `u-net`, which sees the encoder's feature maps beside the code (arXiv:1505.04597). The encoder that flies is the
+    /// same. A U-Net is trained on libtorch, whatever trains the policy. Default `plain`, as in the paper.
+    pub decoder: DecoderName,
     /// In what precision depth images are encoded: `f32` or `bf16`. Part of the result. AVX-512's instruction for bfloat16 is used where it is, AMX never: AMD's Zen 4
     /// encodes nearly twice as fast with it, Intel's Sapphire and Emerald Rapids more slowly than in `f32`; all processors get the same numbers (those below 1.2e-38 apart). The VAE is trained in `f32` either way. Default `f32`.
     pub encoder_precision: Precision,
@@ -44,12 +47,21 @@ impl Default for VaeSection {
             batch_size: 32,
             learning_rate: 1e-3,
             kl_weight: 1.0,
+            decoder: DecoderName::Plain,
             encoder_precision: Precision::F32,
         }
     }
 }
 
 impl VaeSection {
+    /// What computes it in a run with these settings: the run's engine, but a U-Net is written for libtorch alone.
+    pub fn engine(&self, run: &RunSection) -> Engine {
+        match self.decoder {
+            DecoderName::Plain => run.engine(),
+            DecoderName::UNet => Engine::Libtorch,
+        }
+    }
+
     pub(super) fn validate(&self) -> Result<(), Invalid> {
         require(
             LATENTS.contains(&self.latent),
@@ -91,6 +103,16 @@ impl VaeSection {
             "is negative or not finite: the latent code would be pushed apart without bound",
         )
     }
+}
+
+/// What the decoder sees.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DecoderName {
+    /// The code alone.
+    Plain,
+    /// The code, and the encoder's feature maps.
+    UNet,
 }
 
 /// Precision of what is multiplied; sums are f32.

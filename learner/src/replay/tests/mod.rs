@@ -1,5 +1,6 @@
 //! The buffer's claims one by one, and the buffer against a [`model`] of it.
 
+mod end_to_end;
 mod model;
 
 use std::convert::Infallible;

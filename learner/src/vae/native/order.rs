@@ -159,6 +159,8 @@ impl Entry {
 
 #[cfg(test)]
 mod tests {
+    use skein_protocol::config::DecoderName;
+
     use super::*;
     use crate::networks::{Decoder, Encoder};
 
@@ -166,7 +168,7 @@ mod tests {
         let mut layout = Layout::default();
         let _ = (
             Encoder::describe(&mut layout, latent),
-            Decoder::describe(&mut layout, latent),
+            Decoder::describe(&mut layout, latent, DecoderName::Plain),
         );
         (Order::of(&layout), layout.len())
     }

@@ -1,6 +1,6 @@
 //! The whole step: exactness, determinism, and that it learns.
 
-use skein_protocol::config::{Observation, View};
+use skein_protocol::config::{DecoderName, Observation, View};
 use skein_protocol::snapshot::SnapshotLayout;
 
 use super::*;
@@ -162,4 +162,56 @@ fn a_non_finite_loss_changes_nothing() {
         }
     );
     assert_eq!((vae.parameters.flat(), vae.updates()), (&before, 0));
+}
+
+#[test]
+fn a_u_net_reproduces_what_a_plain_decoder_cannot_and_ends_with_the_same_encoder_for_actors() {
+    let section = VaeSection {
+        decoder: DecoderName::UNet,
+        ..VaeSection::default()
+    };
+    crate::device::use_threads(1);
+    let mut u_net = TorchVae::new(&section, 3, Device::Cpu);
+    let mut plain = vae(3);
+    assert_eq!(u_net.published_len(), plain.published_len());
+    let published = |vae: &TorchVae| {
+        let mut values = vec![0.0; vae.published_len()];
+        vae.publish(&mut values);
+        values
+    };
+    assert_eq!(published(&u_net), published(&plain), "both begin alike");
+    let images = synthetic_images(8, 1);
+    assert_eq!(u_net.reconstruct(&images).size(), [8, 72, 128]);
+    let mut noise = [Noise::new(4), Noise::new(4)];
+    let mut errors = [0.0; 2];
+    for _ in 0..24 {
+        for ((vae, noise), error) in [&mut u_net, &mut plain].into_iter().zip(&mut noise).zip(&mut errors) {
+            *error = vae.update(&images, noise).unwrap().pixel_error;
+        }
+    }
+    println!("pixel errors {errors:?}");
+    assert!(errors[0] < errors[1], "{errors:?}");
+    assert_ne!(published(&u_net), published(&plain));
+}
+
+#[test]
+fn a_u_nets_decoder_sees_the_middle_of_every_map() {
+    crate::device::use_threads(1);
+    let section = VaeSection {
+        decoder: DecoderName::UNet,
+        ..VaeSection::default()
+    };
+    let sees = |section: &VaeSection| {
+        let vae = TorchVae::new(section, 1, Device::Cpu);
+        let _guard = no_grad_guard();
+        let encoded = vae.encoder.encode(&vae.parameters, &pixels(&synthetic_images(1, 1)));
+        let reconstruct = |maps: &[Tensor; 3]| vae.decoder.forward(&vae.parameters, &encoded.mean, maps);
+        let whole = reconstruct(&encoded.maps);
+        std::array::from_fn::<_, 3, _>(|changed| {
+            let maps = std::array::from_fn(|map| &encoded.maps[map] + f64::from(u8::from(map == changed)));
+            reconstruct(&maps) != whole
+        })
+    };
+    assert_eq!(sees(&section), [true; 3]);
+    assert_eq!(sees(&VaeSection::default()), [false; 3]);
 }

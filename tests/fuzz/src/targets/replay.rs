@@ -6,7 +6,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_learner::flight::{CommittedFlight, StepObservation};
 use skein_learner::replay::{Minibatch, Replay, ReplayState, RingState};
-use skein_protocol::config::Config;
+use skein_protocol::config::{Config, EncoderTraining};
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LONGEST_LATENT};
@@ -44,6 +44,7 @@ fn restore(bytes: &[u8]) -> Verdict {
         success: ring(&mut script, 32),
         regular: ring(&mut script, 224),
     };
+    restore_end_to_end(state.clone());
     let Ok(mut replay) = Replay::restore(&config, state.clone()) else {
         return Verdict::Refused;
     };
@@ -62,6 +63,22 @@ fn restore(bytes: &[u8]) -> Verdict {
     replay.freeze();
     assert_eq!(replay.image_count(), None);
     Verdict::Accepted
+}
+
+/// The same content where a policy learns from the images: what is taken is drawn from, with its images, and gone on with until images are given up.
+fn restore_end_to_end(state: ReplayState) {
+    let mut config = config();
+    config.learning.encoder = EncoderTraining::EndToEnd;
+    let Ok(mut replay) = Replay::restore(&config, state.clone()) else {
+        return;
+    };
+    assert_eq!(replay.state(), state);
+    let (mut rng, mut drawn) = (Pcg64Mcg::seed_from_u64(1), Minibatch::default());
+    for _ in 0..3 {
+        replay.insert(flight()).unwrap();
+        replay.sample(&mut rng, 4, &mut drawn);
+        assert_eq!([drawn.images.len(), drawn.next_images.len()], [4 * IMAGE_PIXELS; 2]);
+    }
 }
 
 fn images(script: &mut Script<'_>) -> Option<Vec<Arc<Vec<u8>>>> {

@@ -1,20 +1,24 @@
-//! A minibatch, from the replay's slices to tensors.
+//! A minibatch, from the replay's slices to tensors: what algorithms on libtorch learn from.
 
 use skein_protocol::ACTION;
 use tch::{Device, Tensor};
 
 use crate::algorithm::{Columns, Inputs};
+use crate::networks::pixels;
+use crate::vae::images_from_bytes;
 
 /// A minibatch on the learner's device; see [`Columns`] for the columns.
 #[derive(Debug)]
-pub(super) struct Batch {
-    pub(super) observations: Tensor,
-    pub(super) actions: Tensor,
-    pub(super) rewards: Tensor,
-    pub(super) next_observations: Tensor,
-    pub(super) states: Tensor,
-    pub(super) next_states: Tensor,
-    pub(super) terminated: Tensor,
+pub(crate) struct Batch {
+    pub(crate) observations: Tensor,
+    pub(crate) actions: Tensor,
+    pub(crate) rewards: Tensor,
+    pub(crate) next_observations: Tensor,
+    pub(crate) states: Tensor,
+    pub(crate) next_states: Tensor,
+    pub(crate) terminated: Tensor,
+    /// Depth images of the observations and of the next ones, `[n, 1, 72, 128]` each, in [0, 1]; where the encoder is trained end to end.
+    pub(crate) images: Option<[Tensor; 2]>,
 }
 
 impl Batch {
@@ -22,10 +26,11 @@ impl Batch {
     ///
     /// # Panics
     /// When the columns have different numbers of rows, or none.
-    pub(super) fn new(columns: Columns<'_>, inputs: Inputs, device: Device) -> Self {
+    pub(crate) fn new(columns: Columns<'_>, inputs: Inputs, device: Device) -> Self {
         let rows = columns.check(inputs) as i64;
         let column = |values: &[f32], shape: &[i64]| Tensor::from_slice(values).view(shape).to_device(device);
         let [observation, state] = [inputs.policy, inputs.critic].map(|width| width as i64);
+        let seen = |bytes| pixels(&images_from_bytes(bytes).to_device(device));
         Self {
             observations: column(columns.observations, &[rows, observation]),
             actions: column(columns.actions, &[rows, ACTION as i64]),
@@ -34,11 +39,12 @@ impl Batch {
             states: column(columns.states, &[rows, state]),
             next_states: column(columns.next_states, &[rows, state]),
             terminated: column(columns.terminated, &[rows]),
+            images: columns.images.map(|images| images.map(seen)),
         }
     }
 
     /// Transitions in the batch.
-    pub(super) fn rows(&self) -> i64 {
+    pub(crate) fn rows(&self) -> i64 {
         self.rewards.size()[0]
     }
 }

@@ -1,0 +1,139 @@
+//! Images that a policy learns from: those of the transitions, however often the rings have gone round, and not many more.
+
+use skein_protocol::config::EncoderTraining;
+
+use super::*;
+
+/// For flights of at most 11 steps, one an epoch.
+fn end_to_end(capacity: usize) -> Config {
+    let mut config = config(capacity, Observation::LatentVelocity);
+    config.learning.encoder = EncoderTraining::EndToEnd;
+    config.learning.flights_per_epoch = 1;
+    config.transport.max_records_per_flight = 12;
+    config
+}
+
+/// Of 1 to 11 steps; in some, a wall is passed.
+fn flown(number: u64) -> CommittedFlight {
+    let mut flight = flight(number, 1 + (number as usize * 7) % 11, Outcome::Collided);
+    if number.is_multiple_of(3) {
+        let middle = flight.steps() / 2;
+        flight.level_up[middle] = true;
+    }
+    with_images(flight)
+}
+
+fn draw(replay: &Replay, seed: u64) -> Minibatch {
+    let mut batch = Minibatch::default();
+    replay.sample(&mut Pcg64Mcg::seed_from_u64(seed), 32, &mut batch);
+    batch
+}
+
+/// Every image drawn is that of its transition, which its reward tells.
+fn assert_images_belong(batch: &Minibatch) {
+    let images = batch.images.chunks_exact(IMAGE_PIXELS);
+    let next_images = batch.next_images.chunks_exact(IMAGE_PIXELS);
+    assert_eq!((images.len(), next_images.len()), (32, 32));
+    for ((reward, image), next) in batch.rewards.iter().zip(images).zip(next_images) {
+        let at = (reward * 100.0).round() as u64;
+        let (flight, step) = (at / 1000, (at % 1000) as usize);
+        let shades = [shade(flight, step), shade(flight, step + 1)];
+        assert!(
+            image.iter().all(|&pixel| pixel == shades[0]),
+            "flight {flight}, step {step}"
+        );
+        assert!(
+            next.iter().all(|&pixel| pixel == shades[1]),
+            "after flight {flight}, step {step}"
+        );
+    }
+}
+
+#[test]
+fn a_minibatch_has_the_images_of_its_transitions_however_often_the_ring_goes_round() {
+    for leg_steps in [usize::MAX, 2] {
+        let config = end_to_end(60);
+        let (most, mut replay) = (2 * 60 + 12, Replay::new(&config));
+        let (mut stored, mut swept) = (0, 0);
+        for number in 0..60 {
+            let flight = flown(number);
+            stored += flight.steps() + 1;
+            let held = replay.image_count().unwrap();
+            for leg in in_legs(&flight, leg_steps.min(flight.steps())) {
+                replay.insert(leg).unwrap();
+            }
+            let now = replay.image_count().unwrap();
+            swept += usize::from(now < held + flight.steps() + 1);
+            assert!(now <= most, "{now} images are held");
+            let batch = draw(&replay, number);
+            assert_images_belong(&batch);
+            // As a checkpoint has it.
+            let restored = Replay::restore(&config, replay.state()).unwrap();
+            assert!(restored.state() == replay.state() && draw(&restored, number) == batch);
+            replay = restored;
+        }
+        assert!(stored > 3 * most && swept > 3, "{stored} images, swept {swept} times");
+        assert!(replay.success_len() > 0 && replay.len() > replay.success_len());
+    }
+}
+
+#[test]
+fn a_buffer_restored_at_any_time_comes_to_hold_the_same() {
+    let config = end_to_end(60);
+    let (mut undisturbed, mut restored) = (Replay::new(&config), Replay::new(&config));
+    for number in 0..50 {
+        undisturbed.insert(flown(number)).unwrap();
+        restored.insert(flown(number)).unwrap();
+        restored = Replay::restore(&config, restored.state()).unwrap();
+        assert!(restored.state() == undisturbed.state(), "after flight {number}");
+    }
+}
+
+#[test]
+fn transitions_are_drawn_as_without_images() {
+    let config = end_to_end(60);
+    let mut with = Replay::new(&config);
+    let mut without = frozen(&self::config(60, Observation::LatentVelocity));
+    for number in 0..40 {
+        with.insert(flown(number)).unwrap();
+        without.insert(flown(number)).unwrap();
+        let drawn = draw(&with, number);
+        assert!(!drawn.images.is_empty());
+        let rows_alone = Minibatch {
+            images: Vec::new(),
+            next_images: Vec::new(),
+            ..drawn
+        };
+        assert!(rows_alone == draw(&without, number));
+    }
+}
+
+#[test]
+fn a_flight_that_is_needed_whole_is_never_copied() {
+    let mut replay = Replay::new(&end_to_end(60));
+    for number in 0..30 {
+        replay.insert(flown(number)).unwrap();
+        let before = replay.state().images.unwrap();
+        replay.insert(flown(number + 100)).unwrap();
+        let after = replay.state().images.unwrap();
+        // The newest but one lies where it lay, also if the others were swept.
+        let newest = after.len() - 2;
+        assert!(Arc::ptr_eq(&after[newest], before.last().unwrap()), "flight {number}");
+    }
+}
+
+#[test]
+fn while_a_policy_learns_from_images_a_flight_or_a_checkpoint_without_them_is_refused() {
+    let config = end_to_end(60);
+    let mut replay = Replay::new(&config);
+    let error = replay.insert(flown(4).without_images()).unwrap_err();
+    assert_eq!(error, InsertError::NoImages { flight: FlightId(4) });
+    replay.insert(flown(4)).unwrap();
+    let mut state = replay.state();
+    state.images = None;
+    state.success.images.clear();
+    state.regular.images.clear();
+    let error = Replay::restore(&config, state).unwrap_err();
+    assert_eq!(error.part, "depth images");
+    assert!(error.problem.contains("the policy learns from them"), "{error}");
+}
