@@ -17,8 +17,6 @@ use crate::state::TensorValues;
 
 const ALGORITHMS: [AlgorithmName; 2] = [AlgorithmName::Sac, AlgorithmName::Td3];
 const OBSERVATION: Observation = Observation::LatentVelocity;
-/// In a bright image both commands should be this, in a dark one the opposite.
-const WANTED: f32 = 0.6;
 
 fn config(algorithm: AlgorithmName) -> Config {
     let mut config = Config::default();
@@ -238,8 +236,8 @@ fn a_minibatch_without_images_is_a_mistake() {
     let _ = update(&mut *new(&config(AlgorithmName::Sac)), &seen, &mut Noise::new(1));
 }
 
-/// Mean squared error of the actions that an actor would choose with the snapshot, where the image alone tells which would be right.
-fn error_of_actors(algorithm: &dyn Algorithm, config: &Config) -> f32 {
+/// How far an actor would go the right way with the snapshot, in a bright and in a dark image, on average: 1 is as far as it can.
+fn right_way(algorithm: &dyn Algorithm, config: &Config) -> f32 {
     let layout = SnapshotLayout::of(config);
     let mut values = vec![f32::NAN; layout.values()];
     algorithm.publish_encoder(&mut values[layout.encoder()]);
@@ -252,35 +250,49 @@ fn error_of_actors(algorithm: &dyn Algorithm, config: &Config) -> f32 {
         Network::new(&snapshot, &layout, config.vae.encoder_precision),
         Scratch::default(),
     );
-    let squares = [-WANTED, WANTED].map(|wanted| {
-        let mut observation = network.encode(&[shade(wanted); IMAGE_PIXELS], &mut scratch).to_vec();
+    let ways = [-1.0, 1.0].map(|way| {
+        let mut observation = network.encode(&[shade(0.6 * way); IMAGE_PIXELS], &mut scratch).to_vec();
         observation.resize(OBSERVATION.len(), 0.0);
         let action = network.distribution(&observation, &mut scratch).mode();
-        action.map(|action| (action - wanted).powi(2)).iter().sum::<f32>()
+        way * (action[0] + action[1])
     });
-    squares.iter().sum::<f32>() / 4.0
+    ways.iter().sum::<f32>() / 4.0
+}
+
+/// [`right_way`], each twenty updates until it is 0.5, but at most so often.
+fn learn_to_look(name: AlgorithmName, critic_rate: f64, most: usize) -> Vec<f32> {
+    let mut config = config(name);
+    (config.sac.critic_learning_rate, config.td3.critic_learning_rate) = (critic_rate, critic_rate);
+    (config.sac.policy_learning_rate, config.td3.policy_learning_rate) = (1e-3, 1e-3);
+    let mut algorithm = new(&config);
+    let (mut data, mut noise) = (Noise::new(1), Noise::new(2));
+    let mut ways = vec![right_way(&*algorithm, &config)];
+    while ways.len() <= most && ways[ways.len() - 1] < 0.5 {
+        for _ in 0..20 {
+            let seen = Transitions::looking(OBSERVATION, 12, &mut data);
+            update(&mut *algorithm, &seen, &mut noise).unwrap();
+        }
+        ways.push(right_way(&*algorithm, &config));
+    }
+    ways
 }
 
 #[test]
 fn what_can_only_be_seen_in_the_image_is_learned_and_actors_fly_it() {
     for name in ALGORITHMS {
-        let mut config = config(name);
-        (config.sac.critic_learning_rate, config.td3.critic_learning_rate) = (1e-3, 1e-3);
-        (config.sac.policy_learning_rate, config.td3.policy_learning_rate) = (3e-3, 3e-3);
-        config.sac.temperature_learning_rate = 1e-2;
-        let mut algorithm = new(&config);
-        let (mut data, mut noise) = (Noise::new(1), Noise::new(2));
-        // Always answering zero has a mean squared error of 0.6² = 0.36.
-        let mut errors = vec![error_of_actors(&*algorithm, &config)];
-        while errors.len() < 30 && errors[errors.len() - 1] > 0.06 {
-            for _ in 0..20 {
-                let seen = Transitions::looking(OBSERVATION, 16, WANTED, &mut data);
-                update(&mut *algorithm, &seen, &mut noise).unwrap();
-            }
-            errors.push(error_of_actors(&*algorithm, &config));
+        let ways = learn_to_look(name, 3e-4, 25);
+        assert!(ways[0] < 0.2 && ways.last() >= Some(&0.5), "{name}: {ways:?}");
+    }
+}
+
+/// Prints how soon: `cargo test --release -p skein-learner -- --ignored --nocapture rates_of_learning`.
+#[test]
+#[ignore = "a measurement, not a claim"]
+fn rates_of_learning_to_look() {
+    for critic_rate in [3e-4, 1e-4, 1e-3] {
+        for name in ALGORITHMS {
+            println!("{name}, {critic_rate}: {:?}", learn_to_look(name, critic_rate, 15));
         }
-        println!("{name}: {errors:?}");
-        assert!(errors[0] > 0.25 && errors.last() < Some(&0.06), "{name}: {errors:?}");
     }
 }
 

@@ -62,18 +62,15 @@ impl Transitions {
         }
     }
 
-    /// A one-step task that only the image tells: both numbers of the action should be `wanted` if it is bright, and the opposite if it is dark.
-    pub(crate) fn looking(observation: Observation, rows: usize, wanted: f32, noise: &mut Noise) -> Self {
+    /// A one-step task that only the image tells: in a bright one, the larger both numbers of the action the better; in a dark one, the smaller.
+    pub(crate) fn looking(observation: Observation, rows: usize, noise: &mut Noise) -> Self {
         let mut asked = Self::guessing(observation, rows, noise);
-        let wanted: Vec<f32> = (0..rows)
-            .map(|_| if noise.uniform(1.0) < 0.0 { -wanted } else { wanted })
+        let ways: Vec<f32> = (0..rows)
+            .map(|_| if noise.uniform(1.0) < 0.0 { -1.0 } else { 1.0 })
             .collect();
-        let images: Vec<u8> = wanted
-            .iter()
-            .flat_map(|&wanted| [shade(wanted); IMAGE_PIXELS])
-            .collect();
-        for ((reward, action), wanted) in asked.rewards.iter_mut().zip(asked.actions.chunks_exact(2)).zip(wanted) {
-            *reward = -((wanted - action[0]).powi(2) + (wanted - action[1]).powi(2));
+        let images: Vec<u8> = ways.iter().flat_map(|&way| [shade(0.6 * way); IMAGE_PIXELS]).collect();
+        for ((reward, action), way) in asked.rewards.iter_mut().zip(asked.actions.chunks_exact(2)).zip(ways) {
+            *reward = way * (action[0] + action[1]);
         }
         for observations in [&mut asked.observations, &mut asked.next_observations] {
             observations.fill(0.0);
