@@ -7,11 +7,10 @@ use std::fmt;
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::config::{AlgorithmName, Config, CriticInput, Engine};
-use skein_protocol::{ACTION, IMAGE_PIXELS};
+use skein_protocol::{ACTION, IMAGE_PIXELS, TRUE_STATE};
 use tch::Device;
 
 use crate::error::UpdateError;
-use crate::flight::TRUE_STATE;
 use crate::metrics::Scalar;
 use crate::networks::Layout;
 use crate::noise::Noise;

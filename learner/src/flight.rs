@@ -24,9 +24,6 @@ pub struct StepObservation {
     pub ground_truth: [f32; GROUND_TRUTH],
 }
 
-/// Length of what a critic that is told the ground truth gets of a moment.
-pub const TRUE_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
-
 /// What brings the numbers of the ground truth, in their order, to a common size: 10 m between walls, some metres to an opening, tenths of a newton.
 #[rustfmt::skip]
 const TRUTH_SCALE: [f32; GROUND_TRUTH] = [
@@ -273,6 +270,7 @@ pub(crate) mod samples {
 
 #[cfg(test)]
 mod tests {
+    use skein_protocol::TRUE_STATE;
     use skein_protocol::config::Observation;
 
     use super::*;

@@ -45,6 +45,8 @@ pub type LatentCode = [f32; LONGEST_LATENT];
 pub const ACTION: usize = 2;
 /// Numbers of what the simulator knows of a moment, [`transition::TransitionRecord::ground_truth`].
 pub const GROUND_TRUTH: usize = 16;
+/// Length of what a critic gets of a moment that is told the ground truth: that, velocity `[3]`, tilt `[2]` and the action before.
+pub const TRUE_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
 /// Bounds of the logarithm of a policy's standard deviation, for actor and learner alike: beyond them tanh saturates or the noise vanishes (as in the
 /// authors' implementation of arXiv:1812.05905).
 pub const LOG_STD: (f32, f32) = (-20.0, 2.0);

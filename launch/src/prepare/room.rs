@@ -4,10 +4,10 @@
 use std::path::{Path, PathBuf};
 
 use rustix::fs::statvfs;
-use skein_protocol::config::{Config, EncoderTraining};
+use skein_protocol::config::{Config, CriticInput, EncoderTraining};
 use skein_protocol::services::shared_memory_needed;
 use skein_protocol::snapshot::SnapshotLayout;
-use skein_protocol::{ACTION, IMAGE_PIXELS};
+use skein_protocol::{ACTION, IMAGE_PIXELS, TRUE_STATE};
 
 /// Where iceoryx2's segments lie.
 const SHARED_MEMORY: &str = "/dev/shm";
@@ -117,14 +117,19 @@ pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
 
 /// Bytes of a checkpoint when the replay buffer is as full as it can become, with the depth images that are learned from.
 fn checkpoint_bytes(config: &Config) -> u64 {
-    let records = config.transport.max_records_per_flight as u64;
+    let learning = &config.learning;
+    let records = (config.transport.max_records_per_flight * learning.times_stored()) as u64;
     let rows = (config.replay.capacity as u64).min(config.run.flights.saturating_mul(records));
-    let row = 4 * (2 * config.view().len() + ACTION + 2) as u64;
-    let steps = match config.learning.encoder {
-        EncoderTraining::Vae => config.vae.train_steps,
+    let told = match learning.critic_input {
+        CriticInput::Observation => 0,
+        CriticInput::GroundTruth => TRUE_STATE,
+    };
+    let row = 4 * (2 * (config.view().len() + told) + ACTION + 2) as u64;
+    let steps = match learning.encoder {
+        EncoderTraining::Vae => config.vae.train_steps * learning.times_stored(),
         EncoderTraining::EndToEnd => config.replay.capacity,
     };
-    let images = 2 * steps as u64 + config.learning.flights_per_epoch * records;
+    let images = 2 * steps as u64 + learning.flights_per_epoch * records;
     let images = images.min(config.run.flights.saturating_mul(records));
     let snapshot = 4 * SnapshotLayout::of(config).values() as u64;
     rows * row + images * IMAGE_PIXELS as u64 + CHECKPOINT_SNAPSHOTS * snapshot

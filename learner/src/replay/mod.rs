@@ -334,15 +334,12 @@ fn image_limit(config: &Config) -> usize {
         EncoderTraining::Vae => config.vae.train_steps,
         EncoderTraining::EndToEnd => config.replay.capacity,
     };
-    2 * steps * sides(config) + epoch_images(config)
+    2 * steps * config.learning.times_stored() + epoch_images(config)
 }
 
 /// Images of an epoch's flights at most.
 fn epoch_images(config: &Config) -> usize {
-    config.learning.flights_per_epoch as usize * config.transport.max_records_per_flight * sides(config)
-}
-
-/// How often a flight is stored.
-fn sides(config: &Config) -> usize {
-    1 + usize::from(config.learning.mirror)
+    config.learning.flights_per_epoch as usize
+        * config.transport.max_records_per_flight
+        * config.learning.times_stored()
 }

@@ -4,9 +4,7 @@
 //! is bound by cache misses, and a row costs one run of neighbouring cache lines where a table per quantity would cost one miss each.
 
 use skein_protocol::config::{Config, CriticInput, View};
-use skein_protocol::{ACTION, LatentCode};
-
-use crate::flight::TRUE_STATE;
+use skein_protocol::{ACTION, LatentCode, TRUE_STATE};
 
 /// Where the parts of a row lie: `[observation | next observation | true state | next true state | action | reward | terminated]`, all `f32`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

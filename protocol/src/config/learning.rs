@@ -116,6 +116,11 @@ impl LearningSection {
         )
     }
 
+    /// How often a flight's transitions are stored: twice if it is seen in a mirror as well.
+    pub fn times_stored(&self) -> usize {
+        1 + usize::from(self.mirror)
+    }
+
     /// Whether flights are flown in legs, so that the weights are refreshed in the middle of them.
     pub fn in_legs(&self) -> bool {
         self.leg_steps > 0

@@ -7,13 +7,13 @@ use std::convert::Infallible;
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{CriticInput, Observation};
 use skein_protocol::transition::Outcome;
+use skein_protocol::{IMAGE_PIXELS, TRUE_STATE};
 
 use super::*;
-use crate::flight::TRUE_STATE;
 use crate::flight::samples::{code, flight, shade, with_images};
+use skein_protocol::TRUE_STATE;
 
 /// Length of the codes.
 const LATENT: usize = 16;
