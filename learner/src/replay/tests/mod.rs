@@ -13,7 +13,6 @@ use skein_protocol::{IMAGE_PIXELS, TRUE_STATE};
 
 use super::*;
 use crate::flight::samples::{code, flight, shade, with_images};
-use skein_protocol::TRUE_STATE;
 
 /// Length of the codes.
 const LATENT: usize = 16;
