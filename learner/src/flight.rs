@@ -153,7 +153,7 @@ impl CommittedFlight {
         view.write(step, into, |step, into| self.write_moment(step, view, into));
     }
 
-    /// Writes what a critic that is told the [ground truth](CriticInput::GroundTruth) gets at the beginning of `step`, `[TRUE_STATE]`: that, the velocity, the tilt
+    /// Writes what a critic that is told the [ground truth](skein_protocol::config::CriticInput::GroundTruth) gets at the beginning of `step`, `[TRUE_STATE]`: that, the velocity, the tilt
     /// and the action before, which with latency has yet to take effect; each number roughly within [-2, 2].
     pub fn write_true_state(&self, step: usize, into: &mut [f32]) {
         let seen = &self.observations[step];

@@ -8,7 +8,7 @@ use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_WIDTH};
 use crate::flight::{CommittedFlight, StepObservation};
 
 /// Places in the ground truth of what points to the left: both openings' offsets, the distance from the middle, the gust.
-const TO_THE_LEFT: [usize; 4] = [1, 5, 8, 13];
+const TO_THE_LEFT: [usize; 4] = [1, 5, 8, 14];
 
 impl CommittedFlight {
     /// The flight in the mirror. Latent codes are the unmirrored flight's: whoever needs them encodes the mirrored images.

@@ -8,7 +8,7 @@ use skein_learner::flight::{CommittedFlight, StepObservation};
 use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
 use skein_protocol::{ACTION, IMAGE_PIXELS, LONGEST_LATENT};
 use skein_simulator::course::{Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout};
-use skein_simulator::simulator::{Simulator, SimulatorSettings};
+use skein_simulator::simulator::{Ahead, GroundTruth, Simulator, SimulatorSettings};
 
 const STEPS: usize = 15;
 
@@ -117,4 +117,27 @@ fn the_mirror_image_of_a_flight_is_the_flight_through_the_mirrored_course() {
     // Silhouettes may come to lie on the other side of a pixel's centre.
     let pixels = (STEPS + 1) * IMAGE_PIXELS;
     assert!(off < pixels / 200, "{off} of {pixels} pixels differ");
+}
+
+#[test]
+fn all_that_points_to_the_left_points_to_the_right_in_the_mirror_and_nothing_else_is_turned() {
+    // `side` is 1 for the flight, -1 for its mirror image.
+    let truth = |side: f32| {
+        let ahead = |distance_m: f32| Ahead {
+            distance_m,
+            offset_m: [side * 1.5, 2.5],
+            clearance_m: 0.9,
+        };
+        GroundTruth {
+            ahead: [ahead(4.0), ahead(14.0)],
+            from_middle_m: [side * 0.3, 0.4],
+            to_end_m: 50.0,
+            mass_factor: 1.1,
+            latency_periods: 1.0,
+            gust_n: [0.1, side * 0.2, 0.3],
+        }
+    };
+    let mut flown = fly(1.0);
+    flown.observations[0].ground_truth = truth(1.0).numbers();
+    assert_eq!(flown.mirrored().observations[0].ground_truth, truth(-1.0).numbers());
 }
