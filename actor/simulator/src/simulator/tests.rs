@@ -244,3 +244,31 @@ fn level_beyond_the_course_is_refused() {
     let error = simulator(Preset::Point).reset(6, &mut rng(1), &mut rng(2)).unwrap_err();
     assert_eq!((error.level, error.levels), (6, 5));
 }
+
+#[test]
+fn the_ground_truth_tells_what_disturbs_a_flight_and_nothing_of_the_kind_in_a_calm_one() {
+    let mut settings = SimulatorSettings::default();
+    let mut told = |share: f32| {
+        settings.disturbances.share = share;
+        settings.disturbances.mass_spread = 0.2;
+        settings.disturbances.latency_periods = 2;
+        settings.disturbances.gust.force_rms_n = 0.15;
+        let mut simulator = Simulator::new(Arc::new(test_course()), &settings).unwrap();
+        simulator.reset(1, &mut rng(1), &mut rng(2)).unwrap();
+        simulator.step([0.0, 0.0]).unwrap();
+        simulator.ground_truth()
+    };
+    let (calm, disturbed) = (told(0.0), told(1.0));
+    assert_eq!(
+        (calm.mass_factor, calm.latency_periods, calm.gust_n),
+        (1.0, 0.0, [0.0; 3])
+    );
+    assert_eq!(disturbed.latency_periods, 2.0);
+    let deviation = (disturbed.mass_factor - 1.0).abs();
+    assert!(deviation > 0.001 && deviation <= 0.2, "{}", disturbed.mass_factor);
+    assert!(
+        disturbed.gust_n.iter().all(|force_n| *force_n != 0.0),
+        "{:?}",
+        disturbed.gust_n
+    );
+}
