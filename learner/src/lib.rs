@@ -4,6 +4,7 @@
 //! depends on who flew a flight, or when.
 
 pub mod algorithm;
+pub mod average;
 mod batch;
 pub mod best;
 pub mod checkpoint;

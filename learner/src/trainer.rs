@@ -15,6 +15,7 @@ use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::Exploration;
 
 use crate::algorithm::{self, Algorithm, Columns};
+use crate::average::Average;
 use crate::checkpoint::Progress;
 use crate::device::{self, DeviceError};
 use crate::error::UpdateError;
@@ -59,7 +60,11 @@ pub struct Trainer {
     team: Team,
     /// Where it trains the encoder; else the algorithm does.
     vae: Option<Vae>,
+    /// What actors see through, as it was made after so many of the VAE's updates.
+    encoder: Option<(u64, Encoder)>,
     algorithm: Box<dyn Algorithm>,
+    /// What flies in the policy's place, if it is averaged.
+    average: Option<Average>,
     replay: Replay,
     steps: u64,
     /// Times that stored codes should have been made anew since the run began.
@@ -85,14 +90,18 @@ impl Trainer {
             threads,
             "networks are computed"
         );
+        let algorithm = algorithm::new(config, device);
+        let averaged = config.learning.average_updates;
         Ok(Self {
             layout: SnapshotLayout::of(config),
+            average: (averaged > 0).then(|| Average::new(averaged, algorithm.as_ref())),
             team: Team::new(match engine {
                 Engine::Native => threads,
                 Engine::Libtorch => 1,
             }),
             vae: vae.map(|_| Vae::new(&config.vae, &config.run, device)),
-            algorithm: algorithm::new(config, device),
+            encoder: None,
+            algorithm,
             replay: Replay::new(config),
             steps: 0,
             renewals: 0,
@@ -113,7 +122,11 @@ impl Trainer {
         if let Some(vae) = &mut self.vae {
             vae.load_named(tensors)?;
         }
+        self.encoder = None;
         self.algorithm.load_named(tensors)?;
+        if let Some(average) = &mut self.average {
+            average.load_named(tensors)?;
+        }
         self.replay = Replay::restore(&self.config, replay)?;
         self.steps = progress.environment_steps;
         self.renewals = self.renewals_due();
@@ -202,11 +215,13 @@ impl Trainer {
         self.replay.insert(flight)
     }
 
-    /// Makes a flight's codes anew with the encoder as it is, if there are images to make them from.
+    /// Makes a flight's codes anew with the encoder as it is, if there are images to make them from, and if it is learned from codes at all.
     fn encode(&mut self, flight: &mut CommittedFlight) {
-        let Some(depth) = &flight.depth else { return };
-        let encoder = self.encoder();
-        let codes = encoder.encode_all(&mut self.team, depth);
+        let (Some(depth), Some(_)) = (&flight.depth, &self.vae) else {
+            return;
+        };
+        let (encoder, team, _) = self.encoder();
+        let codes = encoder.encode_all(team, depth);
         for (observation, latent) in flight.observations.iter_mut().zip(codes) {
             observation.latent = latent;
         }
@@ -261,17 +276,26 @@ impl Trainer {
 
     /// Makes stored codes anew with the encoder as it is.
     fn renew_latents(&mut self) {
-        let encoder = self.encoder();
-        let Self { team, replay, .. } = self;
+        let (encoder, team, replay) = self.encoder();
         let renewed: Result<(), std::convert::Infallible> =
             replay.renew_latents(ENCODE_CHUNK, |images| Ok(encoder.encode_all(team, images)));
         let Ok(()) = renewed;
     }
 
-    /// The encoder as actors have it, so that codes made here are those that actors send, to the last bit.
-    fn encoder(&self) -> Encoder {
-        let snapshot = self.snapshot(PolicyVersion(0));
-        encoder(&snapshot, &self.layout, self.config.vae.encoder_precision)
+    /// The encoder as actors have it, so that codes made here are those that actors send, to the last bit; and what it works with.
+    fn encoder(&mut self) -> (&Encoder, &mut Team, &mut Replay) {
+        let updates = self.vae_updates();
+        let made = self.encoder.take().filter(|(made_after, _)| *made_after == updates);
+        let make = || {
+            let snapshot = self.snapshot(PolicyVersion(0));
+            (
+                updates,
+                encoder(&snapshot, &self.layout, self.config.vae.encoder_precision),
+            )
+        };
+        let made = made.unwrap_or_else(make);
+        let (_, encoder) = self.encoder.insert(made);
+        (encoder, &mut self.team, &mut self.replay)
     }
 
     /// Does the policy updates that the steps flown since the warm-up ask for, from what snapshot `version` holds on; their metrics go into `means`. `after_each`
@@ -296,6 +320,9 @@ impl Trainer {
             self.replay.sample(&mut rng, self.config.batch_size(), &mut minibatch);
             timer.lap(Stage::Sample, 1);
             let metrics = self.algorithm.update(&mut self.team, columns(&minibatch), &mut noise)?;
+            if let Some(average) = &mut self.average {
+                average.take_in(self.algorithm.as_ref());
+            }
             timer.lap(Stage::PolicyUpdate, 1);
             means.add(&metrics);
             after_each(&metrics)?;
@@ -311,7 +338,11 @@ impl Trainer {
             Some(vae) => vae.publish(encoder),
             None => self.algorithm.publish_encoder(encoder),
         }
-        self.algorithm.publish(&mut values[self.layout.policy()]);
+        let policy = &mut values[self.layout.policy()];
+        match &self.average {
+            Some(average) => average.publish(policy),
+            None => self.algorithm.publish(policy),
+        }
         Snapshot { version, values }
     }
 
@@ -325,6 +356,7 @@ impl Trainer {
     pub fn tensors(&mut self) -> Vec<NamedTensor> {
         let mut all = self.vae.as_mut().map(Vae::named_tensors).unwrap_or_default();
         all.extend(self.algorithm.named_tensors());
+        all.extend(self.average.as_mut().map(Average::named_tensors).unwrap_or_default());
         all
     }
 }

@@ -183,6 +183,40 @@ fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
 }
 
 #[test]
+fn what_flies_is_the_average_of_the_policy_where_that_is_asked_for_and_learns_like_any_other() {
+    let mut averaged = config();
+    averaged.learning.average_updates = 8;
+    let undisturbed = train(&averaged, 0, &[]);
+    assert!(train(&averaged, 0, &[2, 4]) == undisturbed, "resumed");
+
+    // The same flights teach the same, whatever flies.
+    let after = |averaged: usize| {
+        let mut config = config();
+        config.learning.average_updates = averaged;
+        let mut trainer = Trainer::new(&config).unwrap();
+        (0..6).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+        let policy = trainer.snapshot(PolicyVersion(6)).values[trainer.layout.policy()].to_vec();
+        (policy, trainer.algorithm.named_tensors())
+    };
+    let ((latest, learned), (of_one, _), (of_many, same)) = (after(0), after(1), after(1000));
+    assert!(learned == same);
+    let distance = |policy: &[f32]| -> f32 {
+        let apart = policy.iter().zip(&latest).map(|(one, other)| (one - other).abs());
+        apart.fold(0.0, f32::max)
+    };
+    assert!(
+        distance(&of_one) < 1e-6,
+        "the average of one is the latest: {}",
+        distance(&of_one)
+    );
+    assert!(
+        distance(&of_many) > 1e-4,
+        "of many, it lags behind: {}",
+        distance(&of_many)
+    );
+}
+
+#[test]
 fn a_u_net_is_on_libtorch_and_the_policy_where_it_was() {
     let mut config = config();
     config.vae.decoder = DecoderName::UNet;

@@ -510,6 +510,16 @@ mod tests {
                 vec!["learning.critic_input = ground-truth", "end-to-end", "sees no image"],
             ),
             (
+                "[learning]\nencoder = \"end-to-end\"\naverage_updates = 10",
+                vec![],
+                vec!["learning.average_updates = 10", "end-to-end", "not averaged"],
+            ),
+            (
+                "[learning]\naverage_updates = 2000000",
+                vec![],
+                vec!["learning.average_updates = 2000000", "is above 1000000"],
+            ),
+            (
                 "[learning]\nencoder = \"end-to-end\"",
                 vec!["vae.decoder=u-net"],
                 vec!["vae.decoder = u-net", "end-to-end", "there is no VAE"],

@@ -8,6 +8,8 @@ use super::{Invalid, require};
 use crate::leg::MOST_FLOWN;
 use crate::{ACTION, LatentCode};
 
+/// Policy updates that can be averaged over at most.
+const MOST_AVERAGED: usize = 1_000_000;
 /// Earlier moments that can be seen at most.
 const MOST_HISTORY: usize = 16;
 
@@ -43,6 +45,8 @@ pub struct LearningSection {
     /// Whether every flight is learned from twice, the second time as seen in a mirror, where left and right change places. Twice the transitions for the same steps
     /// flown; they fill the replay twice as fast. Default false, as in the paper.
     pub mirror: bool,
+    /// Policy updates over which the policy that flies is averaged, exponentially weighted; 0 flies the policy as the last update left it. Default 0, as in the paper.
+    pub average_updates: usize,
     /// What the critic sees. It is needed in training alone, where the simulator can tell it more than the drone sees. Default `observation`, as in the paper.
     pub critic_input: CriticInput,
 }
@@ -62,6 +66,7 @@ impl Default for LearningSection {
             observation: Observation::Latent,
             history_steps: Vec::new(),
             mirror: false,
+            average_updates: 0,
             critic_input: CriticInput::Observation,
         }
     }
@@ -100,6 +105,12 @@ impl LearningSection {
             "learning.levels",
             self.levels,
             "is below 1: no flight could start",
+        )?;
+        require(
+            self.average_updates <= MOST_AVERAGED,
+            "learning.average_updates",
+            self.average_updates,
+            format!("is above {MOST_AVERAGED}: what flies would hardly ever change"),
         )?;
         let rising = |steps: &[usize]| steps.is_sorted_by(|earlier, later| earlier < later) && !steps.starts_with(&[0]);
         require(
@@ -144,6 +155,12 @@ impl LearningSection {
             "learning.critic_input",
             "ground-truth",
             "does not go with learning.encoder = \"end-to-end\": the critic's loss trains the encoder, and this critic sees no image; set it to \"observation\", or learning.encoder to \"vae\"",
+        )?;
+        require(
+            !self.end_to_end() || self.average_updates == 0,
+            "learning.average_updates",
+            self.average_updates,
+            "does not go with learning.encoder = \"end-to-end\": an averaged policy would see through an encoder that is not averaged; set it to 0, or learning.encoder to \"vae\"",
         )
     }
 

@@ -1,0 +1,55 @@
+//! The average of the policy over its latest updates, which flies in its place (Polyak averaging, as of a target network).
+//!
+//! Every update follows its own minibatch, so the policy goes on being tossed about when it no longer improves, and one snapshot flies worse than the next by chance. The
+//! average of many is steadier than any of them.
+
+use crate::algorithm::Algorithm;
+use crate::state::{Part, Stateful};
+
+/// Updates at the beginning of which the average hardly looks back, because an untrained policy is worth forgetting.
+const BEGINNING: f32 = 10.0;
+
+/// A moving average of a policy's parameters.
+#[derive(Debug)]
+pub struct Average {
+    /// The weight of the latest policy.
+    weight: f32,
+    values: Vec<f32>,
+    latest: Vec<f32>,
+}
+
+impl Average {
+    /// The average over some `updates`, exponentially weighted, of the policy of `algorithm`, which it begins as.
+    pub fn new(updates: usize, algorithm: &dyn Algorithm) -> Self {
+        let mut values = vec![0.0; algorithm.policy_layout().len()];
+        algorithm.publish(&mut values);
+        Self {
+            weight: 1.0 / updates as f32,
+            latest: values.clone(),
+            values,
+        }
+    }
+
+    /// Takes in the policy as an update has left it.
+    pub fn take_in(&mut self, algorithm: &dyn Algorithm) {
+        algorithm.publish(&mut self.latest);
+        let weight = self.weight.max(BEGINNING / (BEGINNING + algorithm.updates() as f32));
+        for (average, latest) in self.values.iter_mut().zip(&self.latest) {
+            *average += weight * (latest - *average);
+        }
+    }
+
+    /// Copies the average, in the snapshot layout's order.
+    ///
+    /// # Panics
+    /// When `into` is not as long as the policy's part of a snapshot.
+    pub fn publish(&self, into: &mut [f32]) {
+        into.copy_from_slice(&self.values);
+    }
+}
+
+impl Stateful for Average {
+    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        vec![("policy_average".to_owned(), Part::Numbers(&mut self.values))]
+    }
+}
