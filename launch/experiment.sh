@@ -11,8 +11,9 @@ Usage: launch/experiment.sh NAME [--seeds K] [--jobs J] [--flights N] [--runs DI
 Builds Skein and trains every arm of the experiment configs/experiments/NAME.toml with several seeds: ordinary runs in
 runs/experiments/NAME/ARM/seed-N, side by side, one core each. Then tells what they came to, in tables and pictures with 95 %
 intervals over the seeds, in runs/experiments/NAME/report/. The same command goes on with what was interrupted or failed, and
-leaves alone what is complete. What a run says goes to ARM/seed-N.log. If the experiment names an evaluation suite, the best
-snapshot of every run flies it once the run is trained; the run is complete only then.
+leaves alone what is complete. What another experiment has trained with the same configuration and seed is not trained again: a
+link leads there. What a run says goes to ARM/seed-N.log. If the experiment names an evaluation suite, the best snapshot of every
+run flies it once the run is trained; the run is complete only then.
 
 Options:
   --list       print the experiments, how many runs each is, and what it is to find out

@@ -199,6 +199,11 @@ impl PlannedRun {
     pub fn look(&self) -> Result<State, String> {
         let root = self.directory.root().display();
         if !self.directory.identity().is_file() {
+            if self.directory.root().is_symlink() {
+                return Err(format!(
+                    "  {root} is a link to a run that is gone: bring that back, or remove the link: rm {root}"
+                ));
+            }
             let is_empty = fs::read_dir(self.directory.root()).map_or(true, |mut entries| entries.next().is_none());
             return match is_empty {
                 true => Ok(State::New),
@@ -244,7 +249,7 @@ fn differences(run: &RunDirectory, expected: &Config) -> Result<Vec<String>, Str
     Ok([keys.map_err(|error| error.to_string())?, courses].concat())
 }
 
-fn io_at(path: &Path) -> impl FnOnce(io::Error) -> PlanError {
+pub(super) fn io_at(path: &Path) -> impl FnOnce(io::Error) -> PlanError {
     let path = path.to_owned();
     move |source| PlanError::Io { path, source }
 }

@@ -123,8 +123,11 @@ impl Cli {
 
     fn run(&self, experiment: &Experiment, root: &Path, seeds: u64) -> Result<Session> {
         let _claim = Plan::claim(root)?;
-        let plan = Plan::new(experiment, root, seeds)?;
+        let mut plan = Plan::new(experiment, root, seeds)?;
         plan.check_idle()?;
+        for (run, other) in plan.take_over()? {
+            eprintln!("skein: {run} was trained already: it is {}", other.display());
+        }
         let jobs = match self.jobs {
             Some(jobs) => jobs.into(),
             None => thread::available_parallelism().map_or(1, Into::into),
