@@ -18,12 +18,12 @@ Options:
   --jobs N        targets driven at one time [default: one a core]
   -h, --help      this text
 
-Exit status: 0 nothing was found, 1 something was, or the targets could not be driven.
+Exit status: 0 nothing was found, 1 something was, or the targets could not be driven; 2 called wrongly.
 END
 
 fail() {
     echo "fuzz.sh: $1: see launch/fuzz.sh --help" >&2
-    exit 1
+    exit 2
 }
 
 # Prints the value of an option that must be a positive number.

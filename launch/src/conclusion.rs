@@ -81,8 +81,10 @@ fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
     let plot = |name: &str| run.plots().join(name);
     [
         (run.config(), "the resolved configuration"),
+        (run.courses(), "the courses flown"),
         (run.flights_csv(), "one row per training flight"),
         (run.evaluation_json(), "the evaluation above"),
+        (run.evaluation_paths_csv(), "where its flights flew"),
         (run.summary_json(), "counts, times above, policy_sha256"),
         (plot("return.png"), "return over the training flights"),
         (plot("walls_passed.png"), "walls passed over the training flights"),

@@ -120,7 +120,12 @@ impl fmt::Display for Head<'_> {
         match self.progress.phase {
             Phase::Evaluating => {
                 let (flown, total) = self.progress.evaluation_flights;
-                write!(f, "evaluating {flown}/{total} · flight {flights}/{total_flights}")?;
+                let what = if flights < total_flights {
+                    " the newest snapshot"
+                } else {
+                    ""
+                };
+                write!(f, "evaluating{what} {flown}/{total} · flight {flights}/{total_flights}")?;
             }
             Phase::Finishing => write!(f, "finishing · flight {flights}/{total_flights}")?,
             Phase::Flying | Phase::Learning => write!(f, "flight {flights}/{total_flights}")?,

@@ -139,12 +139,15 @@ impl fmt::Display for EvaluationReport {
             "passed wall\n1, 2, …",
             "return",
             "hit wall\n1, 2, …",
-            "hit corridor\nbefore 1, 2, …",
-            "timed out\nbefore 1, 2, …",
+            "hit corridor\nbefore 1, …, end",
+            "timed out\nbefore 1, …, end",
         ]);
         for course in &self.courses {
             let walls: Vec<String> = course.walls_passed.iter().map(u64::to_string).collect();
-            let failed = |by: fn(&Failures) -> u64| counts(&course.failures.iter().map(by).collect::<Vec<_>>());
+            let failed = |by: fn(&Failures) -> u64| course.failures.iter().map(by).collect::<Vec<_>>();
+            // Behind the last wall there is none to hit.
+            let mut hit_wall = failed(|failures| failures.hit_wall);
+            hit_wall.truncate(walls.len());
             table.add_row([
                 course.course.clone(),
                 course.flights.to_string(),
@@ -152,9 +155,9 @@ impl fmt::Display for EvaluationReport {
                 format!("{:.1} %", 100.0 * course.completed),
                 walls.join(" "),
                 format!("{:.2}", course.mean_return),
-                failed(|failures| failures.hit_wall),
-                failed(|failures| failures.hit_corridor),
-                failed(|failures| failures.timed_out),
+                counts(&hit_wall),
+                counts(&failed(|failures| failures.hit_corridor)),
+                counts(&failed(|failures| failures.timed_out)),
             ]);
         }
         for column in table.column_iter_mut().skip(1) {
@@ -228,7 +231,10 @@ mod tests {
             courses: vec![evaluation],
         };
         let table = report.to_string();
-        assert!(table.contains("· 2 · ·") && table.contains("· · 1 1"), "{table}");
+        assert!(
+            table.contains("┆    · 2 · ┆") && table.contains("· · 1 1"),
+            "{table}"
+        );
     }
 
     #[test]
