@@ -37,7 +37,8 @@ pub struct GeneratorRanges {
 ///
 /// Some families are for training, the others are held out, so that flying them shows what an agent makes of shapes that it never met: [`GeneratedShape::TRAINED`],
 /// [`GeneratedShape::HELD_OUT`]. `shapes` decides which are drawn; by default those of training. Neighbours remain: a square on its corner is a diamond of equal
-/// diagonals, a polygon of eight corners is near a circle, and a T has an inner corner as an L and a cross have.
+/// diagonals, a polygon of eight corners is near a circle, a T has an inner corner
+/// as an L and a cross have, and a keyhole, like an L, is widest away from its middle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum GeneratedShape {
@@ -63,17 +64,20 @@ pub enum GeneratedShape {
     Star,
     /// Nine to fourteen corners around a centre, each at 0.4 to 1 of the radius: bays and points wherever they come to lie.
     Blob,
+    /// A head of six to nine corners with a slot at one side, 0.4 to 0.65 as wide as the head: what is widest is not in the middle.
+    Keyhole,
 }
 
 impl GeneratedShape {
     /// Families for training.
-    pub const TRAINED: [Self; 6] = [
+    pub const TRAINED: [Self; 7] = [
         Self::Rectangle,
         Self::Polygon,
         Self::Trapezoid,
         Self::T,
         Self::Star,
         Self::Blob,
+        Self::Keyhole,
     ];
 
     /// Families that training never shows: those of the gates in `configs/courses/non_rectangular.toml`.
@@ -94,6 +98,7 @@ impl GeneratedShape {
             Self::T => "t",
             Self::Star => "star",
             Self::Blob => "blob",
+            Self::Keyhole => "keyhole",
         }
     }
 }
@@ -299,6 +304,20 @@ impl GeneratedShape {
                 let points_m = (0..corners)
                     .map(|corner| polar(corner as f32 / corners as f32, rng.random_range(0.4..=1.0)))
                     .collect();
+                Shape::Polygon { points_m }
+            }
+            Self::Keyhole => {
+                // The slot leaves the head between its last corner and its first, both on the unit circle.
+                let (sides, half_slot) = (rng.random_range(5..=8), rng.random_range(0.065..=0.11));
+                let (length, taper) = (rng.random_range(0.8..=1.8), rng.random_range(0.7..=1.1));
+                let [neck, edge] = polar(half_slot, 1.0);
+                let head = (0..=sides).map(|corner| {
+                    let share = half_slot + (1.0 - 2.0 * half_slot) * corner as f32 / sides as f32;
+                    let is_neck = corner == 0 || corner == sides;
+                    polar(share, if is_neck { 1.0 } else { rng.random_range(0.85..=1.15) })
+                });
+                let mut points_m: Vec<_> = head.collect();
+                points_m.extend([-1.0, 1.0].map(|side| [neck + length, side * taper * edge]));
                 Shape::Polygon { points_m }
             }
         }
