@@ -231,10 +231,7 @@ mod tests {
             courses: vec![evaluation],
         };
         let table = report.to_string();
-        assert!(
-            table.contains("┆    · 2 · ┆") && table.contains("· · 1 1"),
-            "{table}"
-        );
+        assert!(table.contains("┆    · 2 · ┆") && table.contains("· · 1 1"), "{table}");
     }
 
     #[test]
