@@ -6,8 +6,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use skein_protocol::config::{Config, Observation};
-use skein_simulator::course::Course;
+use skein_simulator::course::{Course, GeneratedShape};
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
+use skein_simulator::suite::Suite;
 use skein_simulator::vehicle::Preset;
 use skein_tests::repository;
 
@@ -79,4 +80,16 @@ fn the_faithful_configuration_is_the_papers() {
     );
     let settings: SimulatorSettings = toml::Value::Table(paper.simulator).try_into().unwrap();
     assert_eq!(settings.vehicle.preset, Preset::Airsim);
+}
+
+#[test]
+fn every_shipped_suite_can_be_flown_and_one_tells_every_family_of_shapes_apart() {
+    let suite = |name: &str| Suite::load(repository().join("configs/evaluations").join(name)).unwrap();
+    let (generalist, shapes) = (suite("generalist.toml"), suite("shapes.toml"));
+    for entry in generalist.entries.iter().chain(&shapes.entries) {
+        entry.courses.of_flight(0).unwrap();
+    }
+    let told: Vec<&str> = shapes.entries.iter().map(|entry| entry.name.as_str()).collect();
+    let families = GeneratedShape::HELD_OUT.into_iter().chain(GeneratedShape::TRAINED);
+    assert_eq!(told, families.map(GeneratedShape::name).collect::<Vec<_>>());
 }
