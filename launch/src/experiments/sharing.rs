@@ -13,7 +13,7 @@ impl Plan {
     /// it found, and where.
     ///
     /// # Errors
-    /// [`PlanError::Io`] when a link cannot be made.
+    /// [`PlanError::Io`] when a link cannot be made, [`PlanError::Runs`] when what it leads to is no longer what it was.
     pub fn take_over(&mut self) -> Result<Vec<(String, PathBuf)>, PlanError> {
         let others: Vec<PathBuf> = arms_beside(&self.root);
         let mut found = Vec::new();
@@ -22,9 +22,10 @@ impl Plan {
                 continue;
             };
             run.link_to(&other)?;
-            if let Ok(state) = run.look() {
-                run.state = state;
-            }
+            run.state = run.look().map_err(|problem| PlanError::Runs {
+                root: self.root.clone(),
+                problems: vec![problem],
+            })?;
             found.push((run.name.clone(), other));
         }
         Ok(found)
