@@ -1,11 +1,11 @@
 //! A SAC update, batch 256, on one thread: on our kernels, as its networks grow wider, and on libtorch with automatic gradients.
 
 use criterion::{BenchmarkId, Criterion, Throughput};
-use skein_kernels::Team;
-use skein_learner::algorithm::{Columns, Inputs};
+use skein_kernels::{Isa, Team};
+use skein_learner::algorithm::{Algorithm, Columns, Inputs};
 use skein_learner::device::use_threads;
 use skein_learner::noise::Noise;
-use skein_learner::sac::Sac;
+use skein_learner::sac::{NativeSac, TorchSac};
 use skein_protocol::ACTION;
 use skein_protocol::config::{Engine, SacSection};
 use tch::Device;
@@ -44,7 +44,11 @@ fn update(criterion: &mut Criterion, engine: Engine, width: usize, columns: Colu
         hidden_width: width,
         ..SacSection::default()
     };
-    let mut sac = Sac::new(&section, Inputs::same(OBSERVATION), 1, engine, Device::Cpu);
+    let inputs = Inputs::same(OBSERVATION);
+    let mut sac: Box<dyn Algorithm> = match engine {
+        Engine::Native => Box::new(NativeSac::new(&section, inputs, 1, Isa::best())),
+        Engine::Libtorch => Box::new(TorchSac::new(&section, inputs, 1, Device::Cpu)),
+    };
     let (mut team, mut noise) = (Team::new(1), Noise::new(2));
     let mut group = criterion.benchmark_group("sac_update");
     group.throughput(Throughput::Elements(operations(columns.rewards.len(), width)));

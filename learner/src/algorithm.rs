@@ -14,9 +14,9 @@ use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::networks::Layout;
 use crate::noise::Noise;
-use crate::sac::Sac;
+use crate::sac::{NativeSac, TorchSac};
 use crate::state::Stateful;
-use crate::td3::{Td3, TorchTd3};
+use crate::td3::{NativeTd3, TorchTd3};
 
 /// A way to learn a policy from transitions.
 ///
@@ -49,19 +49,20 @@ pub trait Algorithm: Stateful + fmt::Debug {
     /// When `into` is not as long as the layout.
     fn publish(&self, into: &mut [f32]);
 
-    /// Copies the encoder's part of a snapshot, in the snapshot layout's order, if this trains an encoder. What learns from the VAE's codes leaves `into` alone.
+    /// Copies the encoder's part of a snapshot, in the snapshot layout's order, if this trains an encoder ([`Inputs::from_image`]). What learns from the VAE's codes leaves `into` alone.
     ///
     /// # Panics
     /// When `into` is not as long as the encoder.
-    fn publish_encoder(&self, _into: &mut [f32]) {}
+    fn publish_encoder(&self, into: &mut [f32]);
 }
 
 /// The algorithm that a configuration names, untrained. `device`: libtorch's; the native engine is on the processor.
 pub fn new(config: &Config, device: Device) -> Box<dyn Algorithm> {
     let (inputs, seed, engine) = (Inputs::of(config), config.run.seed, config.policy_engine());
     match (config.learning.algorithm, engine) {
-        (AlgorithmName::Sac, engine) => Box::new(Sac::new(&config.sac, inputs, seed, engine, device)),
-        (AlgorithmName::Td3, Engine::Native) => Box::new(Td3::new(&config.td3, inputs, seed, Isa::best())),
+        (AlgorithmName::Sac, Engine::Native) => Box::new(NativeSac::new(&config.sac, inputs, seed, Isa::best())),
+        (AlgorithmName::Sac, Engine::Libtorch) => Box::new(TorchSac::new(&config.sac, inputs, seed, device)),
+        (AlgorithmName::Td3, Engine::Native) => Box::new(NativeTd3::new(&config.td3, inputs, seed, Isa::best())),
         (AlgorithmName::Td3, Engine::Libtorch) => Box::new(TorchTd3::new(&config.td3, inputs, seed, device)),
     }
 }

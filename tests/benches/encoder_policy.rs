@@ -4,7 +4,7 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput};
 use skein_inference::{Network, Scratch};
-use skein_learner::algorithm::Inputs;
+use skein_learner::algorithm::{Algorithm, Inputs};
 use skein_learner::device::use_threads;
 use skein_learner::sac::TorchSac;
 use skein_learner::vae::{TorchVae, images_from_bytes};

@@ -5,9 +5,12 @@
 use std::fs::{self, File};
 use std::io::Read;
 use std::path::Path;
+use std::process::Command;
 
+use skein_protocol::config::Config;
 use skein_protocol::evaluation::EvaluationReport;
-use skein_tests::{Ended, Recipe, run_program};
+use skein_protocol::snapshot::Snapshot;
+use skein_tests::{Ended, Recipe, program, repository, run_program};
 
 /// Evaluates with `arguments` and returns the report.
 fn evaluate(folder: &Path, arguments: &[&str]) -> EvaluationReport {
@@ -54,6 +57,35 @@ fn a_code_of_another_length_is_learned_flown_and_recorded() {
         let later = evaluate(folder.path(), &["--run", directory]);
         assert_eq!(later, run.evaluation(), "{latent} numbers");
         a_recording_holds_every_step_of_every_flight(&run, latent, folder.path());
+    }
+}
+
+/// Trained once and shipped: whatever changes since, it has to fly as its evaluation says.
+#[test]
+fn the_shipped_generalist_flies_courses_that_it_never_saw() {
+    let folder = tempfile::tempdir().unwrap();
+    let snapshots = repository().join("configs/snapshots");
+    let said: EvaluationReport =
+        serde_json::from_str(&fs::read_to_string(snapshots.join("generalist.json")).unwrap()).unwrap();
+    let (_, config) = Snapshot::load(&snapshots.join("generalist.safetensors")).unwrap();
+    let shipped = Config::load(&repository().join("configs/generalist.toml"), &[]).unwrap();
+    let differences = shipped.differences(&config.portable()).unwrap();
+    assert_eq!(differences, ["run.learner_threads = 1 there, 2 here"]);
+
+    // By a bare name, from where it lies.
+    let json = folder.path().join("report.json");
+    let output = Command::new(program("skein-evaluate"))
+        .args(["--snapshot", "generalist.safetensors", "--flights", "10", "--json"])
+        .arg(&json)
+        .current_dir(&snapshots)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let flown: EvaluationReport = serde_json::from_str(&fs::read_to_string(json).unwrap()).unwrap();
+    assert_eq!(flown.policy_sha256, said.policy_sha256);
+    assert_eq!(flown.courses.len(), config.courses.evaluation.len());
+    for course in &flown.courses {
+        assert!(course.reached_end >= 9, "{course:?}");
     }
 }
 

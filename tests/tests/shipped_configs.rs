@@ -85,8 +85,9 @@ fn the_faithful_configuration_is_the_papers() {
 #[test]
 fn every_shipped_suite_can_be_flown_and_one_tells_every_family_of_shapes_apart() {
     let suite = |name: &str| Suite::load(repository().join("configs/evaluations").join(name)).unwrap();
-    let (generalist, shapes) = (suite("generalist.toml"), suite("shapes.toml"));
-    for entry in generalist.entries.iter().chain(&shapes.entries) {
+    let [generalist, shapes, untried] = ["generalist.toml", "shapes.toml", "untried.toml"].map(suite);
+    let all = [&generalist, &shapes, &untried, &suite("paper.toml")];
+    for entry in all.into_iter().flat_map(|suite| &suite.entries) {
         entry.courses.of_flight(0).unwrap();
     }
     let told: Vec<&str> = shapes.entries.iter().map(|entry| entry.name.as_str()).collect();

@@ -237,22 +237,17 @@ fn shapes_trained_on(config: &Config, courses: &Courses) -> Vec<String> {
         .collect()
 }
 
-/// The evaluation courses of the run that trained the snapshot: where its configuration says, or else in the run's directory, which may have moved.
+/// The evaluation courses of the run that trained the snapshot: in the run's directory, wherever that has moved.
 fn evaluation_courses(config: &Config, snapshot: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let run = snapshot.parent().and_then(Path::parent).map(RunDirectory::new);
+    let snapshot = std::path::absolute(snapshot).with_context(|| format!("{}", snapshot.display()))?;
+    // DIR/snapshots/best.safetensors, beside DIR/courses/.
+    let folder = RunDirectory::new(snapshot.ancestors().nth(2).unwrap_or(Path::new("/"))).courses();
     let find = |path: &PathBuf| {
-        let moved = run
-            .as_ref()
-            .zip(path.file_name())
-            .map(|(run, name)| run.courses().join(name));
-        let found = moved
-            .into_iter()
-            .chain([path.clone()])
-            .find(|candidate| candidate.is_file());
-        found.with_context(|| {
+        let file = folder.join(path.file_name().unwrap_or_default());
+        file.is_file().then(|| file.clone()).with_context(|| {
             format!(
-                "the course {} that the snapshot's run was evaluated on is not there any more; name the course files to fly with --course",
-                path.display()
+                "{}, which the snapshot's run was evaluated on, is not there; name the course files to fly with --course",
+                file.display()
             )
         })
     };

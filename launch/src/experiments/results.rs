@@ -10,7 +10,7 @@ use skein_protocol::summary::Summary;
 
 use super::definition::{Axis, Measure};
 use super::plan::{Plan, PlannedRun, State};
-use super::statistics::{dispersion_across_time, drawdowns, volatility};
+use super::statistics::{dispersion_across_time, drawdowns, level, volatility};
 use crate::reports::ReportError;
 use crate::reports::curves::{FlightRow, read_flights, trailing_mean};
 
@@ -103,6 +103,11 @@ impl RunResult {
     /// Return of a flight over the last window of training flights; `None` if there were none.
     pub fn final_return(&self) -> Option<f64> {
         trailing_mean(&self.values(Measure::Return), self.window).pop()
+    }
+
+    /// Walls passed a flight that training came to; see [`level`].
+    pub fn level(&self) -> Option<f64> {
+        level(&self.values(Measure::WallsPassed), self.window)
     }
 
     /// How restless its walls passed were once they had risen; see [`volatility`].

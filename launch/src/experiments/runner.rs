@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 use std::fs::{self, OpenOptions};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::process::Stdio;
+use std::process::{self, Stdio};
 use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process};
@@ -160,7 +160,7 @@ fn train(experiment: &Experiment, run: &PlannedRun, skein: &Path) -> io::Result<
 /// Flies the suite with the best snapshot of a run. What comes of it is brought to its place when it is whole: see [`Session::flown`].
 fn fly(suite: &FlownSuite, run: &PlannedRun, evaluate: &Path) -> io::Result<Child> {
     // It is read again by the other program, and training takes hours.
-    if FlownSuite::load(&suite.path).as_ref() != Ok(suite) {
+    if FlownSuite::load(&suite.path, suite.each).as_ref() != Ok(suite) {
         let file = suite.path.display();
         return Err(io::Error::other(format!(
             "{file} is not what it was when the experiment was begun: begin it again"
@@ -173,14 +173,17 @@ fn fly(suite: &FlownSuite, run: &PlannedRun, evaluate: &Path) -> io::Result<Chil
     let mut command = Command::new(evaluate);
     command.arg("--run").arg(run.directory.root());
     command.arg("--suite").arg(&suite.path);
+    if let Some(each) = suite.each {
+        command.args(["--flights", &each.to_string()]);
+    }
     command.arg("--json").arg(unfinished(&result));
     command.args(["--threads", "1"]);
     spawn(command, OpenOptions::new().append(true), run)
 }
 
-/// What `skein-evaluate` writes, before it is known to be whole.
+/// What `skein-evaluate` writes, before it is known to be whole. Another experiment may fly the same suite for the same run, to which it has a link.
 fn unfinished(result: &Path) -> PathBuf {
-    result.with_extension("part")
+    result.with_extension(format!("part-{}", process::id()))
 }
 
 /// Starts a program for a run. Whatever it says goes to the file beside the run's directory.

@@ -102,7 +102,7 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
 /// How restless a curve is once it has risen: the root mean square of the differences between the averages over successive windows of `window` values
 /// that do not overlap. What is left of a slow trend in it is small, as differences of neighbours hardly see one.
 ///
-/// The curve has risen when a window first averages 0.9 of the level that it comes to, which is the median of the averages in its second half.
+/// The curve has risen when a window first averages 0.9 of the [`level`] that it comes to.
 /// `None` when fewer than three windows follow.
 ///
 /// Where start levels are flown in turn, a window should be whole turns of them (50 flights of 5 levels, 10 each): otherwise the turns themselves show.
@@ -123,21 +123,31 @@ pub fn dispersion_across_time(values: &[f64], window: usize) -> Option<f64> {
     Some(quantile(&differences, 0.75) - quantile(&differences, 0.25))
 }
 
+/// The level that a curve comes to: the median of the averages over successive windows in its second half. `None` when there is no whole window.
+pub fn level(values: &[f64], window: usize) -> Option<f64> {
+    level_of(&window_averages(values, window))
+}
+
 /// Differences between the averages over successive windows, from the one on that has risen; at least two.
 fn differences_once_risen(values: &[f64], window: usize) -> Option<Vec<f64>> {
-    let averages: Vec<f64> = values
-        .chunks_exact(window.max(1))
-        .map(|chunk| chunk.iter().sum::<f64>() / chunk.len() as f64)
-        .collect();
-    let mut second_half = averages[averages.len() / 2..].to_vec();
-    if second_half.is_empty() {
-        return None;
-    }
-    second_half.sort_by(f64::total_cmp);
-    let level = quantile(&second_half, 0.5);
+    let averages = window_averages(values, window);
+    let level = level_of(&averages)?;
     let risen = averages.iter().position(|average| *average >= RISEN * level)?;
     let after = &averages[risen..];
     (after.len() >= 3).then(|| after.windows(2).map(|pair| pair[1] - pair[0]).collect())
+}
+
+fn window_averages(values: &[f64], window: usize) -> Vec<f64> {
+    let windows = values.chunks_exact(window.max(1));
+    windows
+        .map(|window| window.iter().sum::<f64>() / window.len() as f64)
+        .collect()
+}
+
+fn level_of(averages: &[f64]) -> Option<f64> {
+    let mut second_half = averages[averages.len() / 2..].to_vec();
+    second_half.sort_by(f64::total_cmp);
+    (!second_half.is_empty()).then(|| quantile(&second_half, 0.5))
 }
 
 /// How far each point of a curve lies below the highest before it: what was learned and is lost again.
@@ -155,6 +165,12 @@ pub fn drawdowns(curve: &[f64]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_level_is_the_median_of_the_second_half() {
+        assert_eq!(level(&[0.0, 9.0, 1.0, 3.0, 2.0], 1), Some(2.0));
+        assert_eq!(level(&[1.0], 2), None);
+    }
 
     #[test]
     fn the_level_of_an_even_number_of_windows_lies_between_the_middle_two() {

@@ -11,9 +11,10 @@ use skein_protocol::config::SacSection;
 use skein_protocol::seeds::{Purpose, derive};
 
 use self::sample::Sample;
-use super::SacMetrics;
-use crate::algorithm::{Columns, Inputs};
+use super::reported;
+use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::error::UpdateError;
+use crate::metrics::Scalar;
 use crate::networks::native::{
     CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output, output_mut, pair, smaller,
     squared_norm,
@@ -66,15 +67,6 @@ struct Work {
     policy_flowing: Layers,
 }
 
-/// What is reported, before it is known to be finite.
-#[derive(Default)]
-struct Sums {
-    critic_loss: f64,
-    policy_loss: f64,
-    log_prob: f64,
-    value: f64,
-}
-
 impl NativeSac {
     /// Untrained networks whose parameters depend on the run's seed alone.
     ///
@@ -106,126 +98,101 @@ impl NativeSac {
         }
     }
 
-    /// One step of critic, policy and temperature, and of the target behind them.
-    ///
-    /// All three gradients are taken at the same parameters before any of them moves: an update is done whole or not at all.
-    ///
-    /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the update's number; nothing was changed then.
-    ///
-    /// # Panics
-    /// When the columns have different numbers of rows, or none.
-    ///
-    /// Source: arXiv:1812.05905, algorithm 1.
-    pub fn update(
-        &mut self,
-        team: &mut Team,
-        columns: Columns<'_>,
-        noise: &mut Noise,
-    ) -> Result<SacMetrics, UpdateError> {
-        let rows = columns.check(self.inputs);
-        if self.work.rows != rows {
-            self.work = self.places(rows);
-        }
-        let share = 1.0 / rows as f32;
-        let temperature = exp(self.log_temperature.values[0]);
+    /// Actions drawn from the present policy: in the states after the replayed actions, and in the states themselves.
+    fn draw(&mut self, team: &mut Team, columns: Columns<'_>, noise: &mut Noise) {
+        let policy = &self.policy_parameters.values;
         let Work {
+            rows,
             outputs,
+            sample,
+            policy: given,
+            ..
+        } = &mut self.work;
+        let (next_outputs, state_outputs) = outputs.split_at_mut(*rows * 2 * ACTION);
+        self.policy
+            .forward_through(team, policy, columns.next_observations, next_outputs);
+        self.policy.forward(team, policy, columns.observations, given);
+        state_outputs.copy_from_slice(output(given));
+        noise.fill_normal(&mut sample.noise);
+        sample.draw(self.isa, outputs);
+    }
+
+    /// The critic's gradient: what the state after the action is worth says the slow critic (eq. 3), and both estimates are drawn towards
+    /// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')) (eq. 5). Returns the loss and the mean of the smaller estimate.
+    fn criticise(&mut self, team: &mut Team, columns: Columns<'_>, temperature: f32) -> [f32; 2] {
+        let Work {
+            rows,
             sample,
             joined,
             target_values,
-            critic: critic_given,
+            critic: given,
             critic_flowing,
+            ..
+        } = &mut self.work;
+        let (next_actions, next_log_prob) = (&sample.actions[..*rows * ACTION], &sample.log_prob[..*rows]);
+        join(columns.next_states, next_actions, joined);
+        self.critic
+            .forward_through(team, &self.target_parameters, joined, target_values);
+
+        join(columns.states, columns.actions, joined);
+        let critic = &self.critic_parameters.values;
+        self.critic.forward(team, critic, joined, given);
+        let (mut loss, mut value) = (0.0, 0.0);
+        let share = 1.0 / *rows as f32;
+        let flowing = &mut critic_flowing.values;
+        for row in 0..*rows {
+            let soft_value = smaller(pair(target_values, row)) - temperature * next_log_prob[row];
+            let target = columns.rewards[row] + (1.0 - columns.terminated[row]) * soft_value * self.discount;
+            let values = pair(&given.values, row);
+            for (value, flowing) in values.iter().zip(&mut flowing[row * ESTIMATES..]) {
+                let error = value - target;
+                loss += 0.5 * f64::from(error * error);
+                *flowing = error * share;
+            }
+            value += f64::from(smaller(values));
+        }
+        let into = &mut self.critic_parameters.gradient;
+        self.critic.gradient(team, critic, joined, given, critic_flowing, into);
+        [loss, value].map(|sum| (sum / *rows as f64) as f32)
+    }
+
+    /// The policy's gradient: it moves towards actions of higher value, as far as its entropy is worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7). Returns the mean of
+    /// that, and of log π.
+    fn improve(&mut self, team: &mut Team, columns: Columns<'_>, temperature: f32) -> [f32; 2] {
+        let Work {
+            rows,
+            sample,
+            joined,
+            critic: given,
             drawn_flowing,
             action_gradient,
             policy: policy_given,
             policy_flowing,
             ..
         } = &mut self.work;
-        let Columns {
-            observations,
-            actions,
-            next_observations,
-            states,
-            next_states,
-            ..
-        } = columns;
         let (policy, critic) = (&self.policy_parameters.values, &self.critic_parameters.values);
-
-        // Actions drawn from the present policy: in the states after the replayed actions, and in the states themselves.
-        let (next_outputs, state_outputs) = outputs.split_at_mut(rows * 2 * ACTION);
-        self.policy
-            .forward_through(team, policy, next_observations, next_outputs);
-        self.policy.forward(team, policy, observations, policy_given);
-        state_outputs.copy_from_slice(output(policy_given));
-        noise.fill_normal(&mut sample.noise);
-        sample.draw(self.isa, outputs);
-        let (next_actions, drawn_actions) = sample.actions.split_at(rows * ACTION);
-        let (next_log_prob, drawn_log_prob) = sample.log_prob.split_at(rows);
-
-        // What the state after the action is worth, by the slow critic (eq. 3): both estimates are drawn towards r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s'))
-        // (eq. 5).
-        join(next_states, next_actions, joined);
-        let target = &self.target_parameters;
-        self.critic.forward_through(team, target, joined, target_values);
-        join(states, actions, joined);
-        self.critic.forward(team, critic, joined, critic_given);
-        let mut sums = Sums::default();
-        let flowing = &mut critic_flowing.values;
-        for row in 0..rows {
-            let soft_value = smaller(pair(target_values, row)) - temperature * next_log_prob[row];
-            let target = columns.rewards[row] + (1.0 - columns.terminated[row]) * soft_value * self.discount;
-            let values = pair(&critic_given.values, row);
-            for (value, flowing) in values.iter().zip(&mut flowing[row * ESTIMATES..]) {
-                let error = value - target;
-                sums.critic_loss += 0.5 * f64::from(error * error);
-                *flowing = error * share;
-            }
-            sums.value += f64::from(smaller(values));
-        }
-        let into = &mut self.critic_parameters.gradient;
-        self.critic
-            .gradient(team, critic, joined, critic_given, critic_flowing, into);
-
-        // The policy moves towards actions of higher value, as far as its entropy is worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7).
-        join(states, drawn_actions, joined);
-        self.critic.forward(team, critic, joined, critic_given);
-        for (row, &log_prob) in drawn_log_prob.iter().enumerate() {
-            let values = pair(&critic_given.values, row);
-            sums.log_prob += f64::from(log_prob);
-            sums.policy_loss += f64::from(temperature * log_prob - smaller(values));
+        let (actions, log_prob) = (&sample.actions[*rows * ACTION..], &sample.log_prob[*rows..]);
+        join(columns.states, actions, joined);
+        self.critic.forward(team, critic, joined, given);
+        let (mut loss, mut log_prob_sum) = (0.0, 0.0);
+        let share = 1.0 / *rows as f32;
+        for (row, &log_prob) in log_prob.iter().enumerate() {
+            let values = pair(&given.values, row);
+            log_prob_sum += f64::from(log_prob);
+            loss += f64::from(temperature * log_prob - smaller(values));
             drawn_flowing[row * ESTIMATES..][..ESTIMATES]
                 .copy_from_slice(&share_of_smaller(values).map(|part| -share * part));
         }
         let action = self.inputs.critic..self.inputs.critic + ACTION;
         self.critic
-            .backward_through(team, critic, critic_given, drawn_flowing, action, action_gradient);
+            .backward_through(team, critic, given, drawn_flowing, action, action_gradient);
         // Back through the drawing and the policy.
-        sample.backward(rows, temperature * share, action_gradient, output_mut(policy_flowing));
+        sample.backward(*rows, temperature * share, action_gradient, output_mut(policy_flowing));
         self.policy.backward(team, policy, policy_given, policy_flowing);
         let into = &mut self.policy_parameters.gradient;
         self.policy
-            .gradient(team, observations, policy_given, policy_flowing, into);
-
-        // The temperature rises while the policy is more certain than asked for, and falls otherwise: the gradient of -α (log π + H̄) by log α is itself (eq. 18).
-        let mean = |sum: f64| (sum / rows as f64) as f32;
-        self.log_temperature.gradient[0] = -temperature * (mean(sums.log_prob) + self.target_entropy);
-
-        let metrics = SacMetrics {
-            critic_loss: mean(sums.critic_loss),
-            policy_loss: mean(sums.policy_loss),
-            temperature,
-            entropy: -mean(sums.log_prob),
-            mean_value: mean(sums.value),
-        };
-        self.must_be_finite(&metrics)?;
-        let isa = self.isa;
-        self.critic_parameters.step(team, isa);
-        self.policy_parameters.step(team, isa);
-        self.log_temperature.step(team, isa);
-        let (target, critic) = (&mut self.target_parameters, &self.critic_parameters.values);
-        follow(team, isa, target, critic, self.target_rate);
-        Ok(metrics)
+            .gradient(team, columns.observations, policy_given, policy_flowing, into);
+        [loss, log_prob_sum].map(|sum| (sum / *rows as f64) as f32)
     }
 
     /// Places for everything that an update of so many rows computes.
@@ -246,25 +213,25 @@ impl NativeSac {
         }
     }
 
-    fn must_be_finite(&self, metrics: &SacMetrics) -> Result<(), UpdateError> {
+    /// Looks whether what an update reports and the gradients it took are numbers. Of a gradient, the square of its length has to be.
+    fn must_be_finite(&self, reported: [f32; 5]) -> Result<(), UpdateError> {
+        let [critic_loss, policy_loss, temperature, entropy, mean_value] = reported;
         let norm = |learned: &Learned| squared_norm(self.isa, &learned.gradient);
-        let checks: [(&'static str, &dyn Fn() -> f32); 8] = [
-            ("critic loss", &|| metrics.critic_loss),
-            ("policy loss", &|| metrics.policy_loss),
-            ("temperature", &|| metrics.temperature),
-            ("entropy", &|| metrics.entropy),
-            ("mean value", &|| metrics.mean_value),
-            ("critic gradient", &|| norm(&self.critic_parameters)),
-            ("policy gradient", &|| norm(&self.policy_parameters)),
-            ("temperature gradient", &|| norm(&self.log_temperature)),
+        let numbers = [
+            ("critic loss", critic_loss),
+            ("policy loss", policy_loss),
+            ("temperature", temperature),
+            ("entropy", entropy),
+            ("mean value", mean_value),
+            ("critic gradient", norm(&self.critic_parameters)),
+            ("policy gradient", norm(&self.policy_parameters)),
+            ("temperature gradient", norm(&self.log_temperature)),
         ];
         let update = self.updates() + 1;
-        for (tensor, number) in checks {
-            if !number().is_finite() {
-                return Err(UpdateError::NonFinite { tensor, update });
-            }
+        match numbers.into_iter().find(|(_, number)| !number.is_finite()) {
+            Some((tensor, _)) => Err(UpdateError::NonFinite { tensor, update }),
+            None => Ok(()),
         }
-        Ok(())
     }
 
     /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
@@ -276,24 +243,54 @@ impl NativeSac {
         let means = outputs.chunks_exact(2 * ACTION).flat_map(|row| &row[..ACTION]);
         means.map(|mean| mean.tanh()).collect()
     }
+}
 
-    /// Names and shapes of what [`NativeSac::publish`] copies.
-    pub fn policy_layout(&self) -> &Layout {
+impl Algorithm for NativeSac {
+    /// One step of critic, policy and temperature, and of the target behind them. All three gradients are taken at the same parameters before any of them moves: an update is done
+    /// whole or not at all.
+    ///
+    /// Source: arXiv:1812.05905, algorithm 1.
+    fn update(
+        &mut self,
+        team: &mut Team,
+        columns: Columns<'_>,
+        noise: &mut Noise,
+    ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
+        let rows = columns.check(self.inputs);
+        if self.work.rows != rows {
+            self.work = self.places(rows);
+        }
+        let temperature = exp(self.log_temperature.values[0]);
+        self.draw(team, columns, noise);
+        let [critic_loss, mean_value] = self.criticise(team, columns, temperature);
+        let [policy_loss, log_prob] = self.improve(team, columns, temperature);
+        // The temperature rises while the policy is more certain than asked for, and falls otherwise: the gradient of -α (log π + H̄) by log α is itself (eq. 18).
+        self.log_temperature.gradient[0] = -temperature * (log_prob + self.target_entropy);
+
+        let metrics = [critic_loss, policy_loss, temperature, -log_prob, mean_value];
+        self.must_be_finite(metrics)?;
+        let isa = self.isa;
+        self.critic_parameters.step(team, isa);
+        self.policy_parameters.step(team, isa);
+        self.log_temperature.step(team, isa);
+        let (target, critic) = (&mut self.target_parameters, &self.critic_parameters.values);
+        follow(team, isa, target, critic, self.target_rate);
+        Ok(reported(metrics))
+    }
+
+    fn updates(&self) -> u64 {
+        self.critic_parameters.steps()
+    }
+
+    fn policy_layout(&self) -> &Layout {
         &self.policy_layout
     }
 
-    /// Copies the policy's part of a snapshot, in the snapshot layout's order.
-    ///
-    /// # Panics
-    /// When `into` is not as long as the layout.
-    pub fn publish(&self, into: &mut [f32]) {
+    fn publish(&self, into: &mut [f32]) {
         into.copy_from_slice(&self.policy_parameters.values);
     }
 
-    /// Updates done so far.
-    pub fn updates(&self) -> u64 {
-        self.critic_parameters.steps()
-    }
+    fn publish_encoder(&self, _into: &mut [f32]) {}
 }
 
 impl Stateful for NativeSac {

@@ -1,16 +1,18 @@
 //! The whole update, on both engines: exactness, determinism, and that it learns.
 
-use skein_kernels::Team;
+use skein_kernels::{Isa, Team};
 use skein_protocol::config::{Engine, Observation, SacSection, View};
 use skein_protocol::snapshot::SnapshotLayout;
-use tch::Device;
+use tch::{Device, Tensor, no_grad_guard};
 
 use super::samples::Transitions;
-use super::{Sac, SacMetrics};
+use super::{NativeSac, TorchSac};
 use crate::UpdateError;
-use crate::algorithm::Inputs;
+use crate::algorithm::{Algorithm, Inputs};
+use crate::metrics::Scalar;
+use crate::networks::{Layout, Parameters, Policy};
 use crate::noise::Noise;
-use crate::state::{NamedTensor, Stateful, TensorValues};
+use crate::state::{NamedTensor, TensorValues};
 
 /// Numbers in an observation.
 const OBSERVATION: usize = 32;
@@ -24,35 +26,58 @@ fn small() -> SacSection {
     }
 }
 
-fn sac(engine: Engine, section: &SacSection, seed: u64) -> Sac {
+fn sac(engine: Engine, section: &SacSection, seed: u64) -> Box<dyn Algorithm> {
     crate::device::use_threads(1);
-    Sac::new(section, Inputs::same(OBSERVATION), seed, engine, Device::Cpu)
+    let inputs = Inputs::same(OBSERVATION);
+    match engine {
+        Engine::Native => Box::new(NativeSac::new(section, inputs, seed, Isa::best())),
+        Engine::Libtorch => Box::new(TorchSac::new(section, inputs, seed, Device::Cpu)),
+    }
 }
 
-fn update(sac: &mut Sac, transitions: &Transitions, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {
+type Metrics = Vec<(Scalar, f32)>;
+
+fn update(sac: &mut dyn Algorithm, transitions: &Transitions, noise: &mut Noise) -> Result<Metrics, UpdateError> {
     sac.update(&mut Team::new(1), transitions.columns(), noise)
 }
 
-fn train(sac: &mut Sac, updates: usize, seed: u64) -> Vec<SacMetrics> {
+fn train(sac: &mut dyn Algorithm, updates: usize, seed: u64) -> Vec<Metrics> {
     let (mut data, mut noise) = (Noise::new(seed), Noise::new(seed + 1));
     (0..updates)
         .map(|_| update(sac, &Transitions::guessing(OBSERVATION, 32, &mut data), &mut noise).unwrap())
         .collect()
 }
 
-fn state(sac: &mut Sac) -> Vec<NamedTensor> {
+fn state(sac: &mut dyn Algorithm) -> Vec<NamedTensor> {
     sac.named_tensors()
+}
+
+fn published(sac: &dyn Algorithm) -> Vec<f32> {
+    let mut published = vec![0.0; sac.policy_layout().len()];
+    sac.publish(&mut published);
+    published
+}
+
+/// What the published policy does without noise, `[n, 2]`.
+fn mode(sac: &dyn Algorithm, section: &SacSection, observations: &[f32]) -> Vec<f32> {
+    let mut layout = Layout::default();
+    let policy = Policy::describe(&mut layout, OBSERVATION as i64, section.hidden_width as i64);
+    let mut parameters = Parameters::initialise(layout, 0, Device::Cpu);
+    let _guard = no_grad_guard();
+    parameters.flat_mut().copy_(&Tensor::from_slice(&published(sac)));
+    let observations = Tensor::from_slice(observations).view([-1, OBSERVATION as i64]);
+    Vec::try_from(policy.mode(&parameters, &observations).reshape([-1])).unwrap()
 }
 
 #[test]
 fn equal_seeds_give_equal_bits() {
     for engine in ENGINES {
         let [mut one, mut other] = [sac(engine, &small(), 1), sac(engine, &small(), 1)];
-        assert_eq!(train(&mut one, 20, 5), train(&mut other, 20, 5));
-        assert_eq!(state(&mut one), state(&mut other));
+        assert_eq!(train(&mut *one, 20, 5), train(&mut *other, 20, 5));
+        assert_eq!(state(&mut *one), state(&mut *other));
         let mut third = sac(engine, &small(), 2);
-        train(&mut third, 20, 5);
-        assert_ne!(state(&mut one), state(&mut third));
+        train(&mut *third, 20, 5);
+        assert_ne!(state(&mut *one), state(&mut *third));
     }
 }
 
@@ -60,12 +85,12 @@ fn equal_seeds_give_equal_bits() {
 fn a_restored_sac_continues_bit_for_bit() {
     for engine in ENGINES {
         let mut sac = sac(engine, &small(), 1);
-        train(&mut sac, 10, 5);
+        train(&mut *sac, 10, 5);
         let mut resumed = self::sac(engine, &small(), 77);
-        resumed.load_named(&state(&mut sac)).unwrap();
+        resumed.load_named(&state(&mut *sac)).unwrap();
         assert_eq!(resumed.updates(), 10);
-        assert_eq!(train(&mut sac, 10, 8), train(&mut resumed, 10, 8));
-        assert_eq!(state(&mut sac), state(&mut resumed));
+        assert_eq!(train(&mut *sac, 10, 8), train(&mut *resumed, 10, 8));
+        assert_eq!(state(&mut *sac), state(&mut *resumed));
     }
 }
 
@@ -73,9 +98,9 @@ fn a_restored_sac_continues_bit_for_bit() {
 fn every_part_of_the_state_moves_with_an_update() {
     for engine in ENGINES {
         let mut sac = sac(engine, &small(), 1);
-        let before = state(&mut sac);
-        train(&mut sac, 1, 5);
-        for (was, is) in before.iter().zip(&state(&mut sac)) {
+        let before = state(&mut *sac);
+        train(&mut *sac, 1, 5);
+        for (was, is) in before.iter().zip(&state(&mut *sac)) {
             assert_ne!(was, is, "{engine}: {} stood still", was.name);
         }
     }
@@ -85,14 +110,14 @@ fn every_part_of_the_state_moves_with_an_update() {
 fn an_update_that_is_not_finite_changes_nothing() {
     for engine in ENGINES {
         let mut sac = sac(engine, &small(), 1);
-        train(&mut sac, 3, 5);
-        let before = state(&mut sac);
+        train(&mut *sac, 3, 5);
+        let before = state(&mut *sac);
         let sound = Transitions::guessing(OBSERVATION, 32, &mut Noise::new(1));
         let mut refused = |damage: fn(&mut Transitions)| {
             let mut damaged = sound.clone();
             damage(&mut damaged);
-            let error = update(&mut sac, &damaged, &mut Noise::new(2)).unwrap_err();
-            assert_eq!(before, state(&mut sac), "{engine}");
+            let error = update(&mut *sac, &damaged, &mut Noise::new(2)).unwrap_err();
+            assert_eq!(before, state(&mut *sac), "{engine}");
             error
         };
         let of = |tensor| UpdateError::NonFinite { tensor, update: 4 };
@@ -114,7 +139,8 @@ fn truncated_flight_still_bootstraps() {
             let mut last = Transitions::guessing(OBSERVATION, 1, &mut Noise::new(1));
             last.terminated[0] = terminated;
             last.next_observations.fill(next);
-            update(&mut sac, &last, &mut Noise::new(2)).unwrap().critic_loss
+            let metrics = update(&mut *sac, &last, &mut Noise::new(2)).unwrap();
+            metrics[0]
         };
         let (crashed, truncated) = (1.0, 0.0);
         assert_eq!(learned(crashed, 0.1), learned(crashed, -0.7), "a crash has no future");
@@ -131,7 +157,7 @@ fn the_published_part_is_the_snapshots_policy() {
     for engine in ENGINES {
         let mut sac = sac(engine, &small(), 1);
         let layout = SnapshotLayout::new(&View::present(Observation::Latent, OBSERVATION), 32);
-        assert_eq!(layout.policy().len(), sac.published_len());
+        assert_eq!(layout.policy().len(), sac.policy_layout().len());
         let policys = layout
             .tensors()
             .iter()
@@ -144,8 +170,7 @@ fn the_published_part_is_the_snapshots_policy() {
             start += ours.len();
         }
         assert_eq!(start, layout.values());
-        let mut published = vec![0.0; sac.published_len()];
-        sac.publish(&mut published);
+        let published = published(&*sac);
         let policy = sac
             .named_tensors()
             .into_iter()
@@ -165,9 +190,9 @@ fn the_right_action_is_learned_in_a_one_step_task() {
     for engine in ENGINES {
         for seed in 1..=3 {
             let mut sac = sac(engine, &section, seed);
-            train(&mut sac, 600, seed);
+            train(&mut *sac, 600, seed);
             let test = Transitions::guessing(OBSERVATION, 256, &mut Noise::new(seed + 100));
-            let actions = sac.mode(&test.observations);
+            let actions = mode(&*sac, &section, &test.observations);
             let observations = test.observations.chunks_exact(OBSERVATION);
             let squared = observations
                 .zip(actions.chunks_exact(2))

@@ -1,16 +1,18 @@
 //! One SAC update with libtorch's automatic gradients, in reading order: the reference, and the way to a CUDA device.
 
+use skein_kernels::Team;
 use skein_protocol::ACTION;
 use skein_protocol::config::SacSection;
 use skein_protocol::seeds::{Purpose, derive};
 use tch::{Device, Tensor, no_grad_guard};
 
-use super::SacMetrics;
 use super::losses::{critic_loss, policy_loss, soft_targets, temperature_loss};
-use crate::algorithm::{Columns, Inputs};
+use super::reported;
+use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::batch::Batch;
 use crate::error::{UpdateError, finite};
-use crate::networks::{Critic, Layout, Parameters, Policy};
+use crate::metrics::Scalar;
+use crate::networks::{Critic, Layout, Parameters, Policy, PolicySample};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
 use crate::perception::{LooksAhead, Perception};
@@ -72,50 +74,58 @@ impl TorchSac {
         }
     }
 
-    /// One step of critic, policy and temperature, and of the target behind them.
-    ///
-    /// All three gradients are taken at the same parameters before any of them moves: an update is done whole or not at all.
-    ///
-    /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the update's number; nothing was changed then.
-    ///
-    /// # Panics
-    /// When the columns have different numbers of rows, or none.
-    ///
-    /// Source: arXiv:1812.05905, algorithm 1.
-    pub fn update(&mut self, columns: Columns<'_>, noise: &mut Noise) -> Result<SacMetrics, UpdateError> {
+    /// Actions drawn from the present policy, and how likely they were.
+    fn draw(&self, observations: &Tensor, noise: &mut Noise) -> PolicySample {
+        let noise = noise.normal(&[observations.size()[0], ACTION as i64], self.log_temperature.device());
+        self.policy.sample(&self.policy_parameters, observations, &noise)
+    }
+
+    /// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')): what the state after the action is worth, by the slow critic and under the present policy (eq. 3), `[n]`.
+    fn targets(&self, batch: &Batch, temperature: &Tensor, noise: &mut Noise) -> Tensor {
+        let _guard = no_grad_guard();
+        let next = self.draw(&batch.next_observations, noise);
+        let next_values = self
+            .critic
+            .smaller(&self.target_parameters, &batch.next_states, &next.actions);
+        soft_targets(
+            &batch.rewards,
+            &batch.terminated,
+            &next_values,
+            &next.log_prob,
+            temperature,
+            self.discount,
+        )
+    }
+
+    /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
+    pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
+        let _guard = no_grad_guard();
+        let observations = Tensor::from_slice(observations).view([-1, self.inputs.policy as i64]);
+        let device = self.log_temperature.device();
+        let actions = self
+            .policy
+            .mode(&self.policy_parameters, &observations.to_device(device));
+        Vec::try_from(actions.to_device(Device::Cpu).reshape([-1])).expect("actions are f32")
+    }
+}
+
+impl Algorithm for TorchSac {
+    /// As [`super::NativeSac`]'s. libtorch has threads of its own and leaves `team` alone.
+    fn update(
+        &mut self,
+        _team: &mut Team,
+        columns: Columns<'_>,
+        noise: &mut Noise,
+    ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
         let mut batch = Batch::new(columns, self.inputs, self.log_temperature.device());
         if let Some(perception) = &self.perception {
             let (critic, target) = (&self.critic_parameters, &self.target_parameters);
             perception.look(&mut batch, critic, target, LooksAhead::Learned);
         }
-        let action_shape = [batch.rows(), ACTION as i64];
-        let mut normal = || noise.normal(&action_shape, self.log_temperature.device());
         let temperature = self.log_temperature.detach().exp();
 
-        // What the state after the action is worth, by the slow critic and under the present policy (eq. 3).
-        let targets = {
-            let _guard = no_grad_guard();
-            let next = self
-                .policy
-                .sample(&self.policy_parameters, &batch.next_observations, &normal());
-            let next_values = self
-                .critic
-                .smaller(&self.target_parameters, &batch.next_states, &next.actions);
-            let Batch {
-                rewards, terminated, ..
-            } = &batch;
-            soft_targets(
-                rewards,
-                terminated,
-                &next_values,
-                &next.log_prob,
-                &temperature,
-                self.discount,
-            )
-        };
-
-        // Both estimates are drawn towards it (eq. 5).
+        // Both estimates are drawn towards their target (eq. 5).
+        let targets = self.targets(&batch, &temperature, noise);
         let values = self
             .critic
             .forward(&self.critic_parameters, &batch.states, &batch.actions);
@@ -123,9 +133,7 @@ impl TorchSac {
         let critic_gradient = self.critic_parameters.gradient(&critic_loss);
 
         // The policy moves towards actions of higher value, as far as its entropy is worth less (eq. 7).
-        let drawn = self
-            .policy
-            .sample(&self.policy_parameters, &batch.observations, &normal());
+        let drawn = self.draw(&batch.observations, noise);
         let drawn_values = self
             .critic
             .smaller(&self.critic_parameters, &batch.states.detach(), &drawn.actions);
@@ -138,7 +146,7 @@ impl TorchSac {
         let temperature_gradient =
             Tensor::run_backward(&[&temperature_loss], &[&self.log_temperature], false, false).remove(0);
 
-        let [critic_loss, policy_loss, temperature, entropy, mean_value] = finite(
+        let metrics = finite(
             self.updates() + 1,
             [
                 ("critic loss", &critic_loss),
@@ -160,52 +168,25 @@ impl TorchSac {
         self.temperature_optimizer
             .step(&mut self.log_temperature, &temperature_gradient);
         self.target_parameters.follow(&self.critic_parameters, self.target_rate);
-        Ok(SacMetrics {
-            critic_loss,
-            policy_loss,
-            temperature,
-            entropy,
-            mean_value,
-        })
+        Ok(reported(metrics))
     }
 
-    /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
-    pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
-        let _guard = no_grad_guard();
-        let observations = Tensor::from_slice(observations).view([-1, self.inputs.policy as i64]);
-        let device = self.log_temperature.device();
-        let actions = self
-            .policy
-            .mode(&self.policy_parameters, &observations.to_device(device));
-        Vec::try_from(actions.to_device(Device::Cpu).reshape([-1])).expect("actions are f32")
+    fn updates(&self) -> u64 {
+        self.critic_optimizer.steps()
     }
 
-    /// Names and shapes of what [`TorchSac::publish`] copies.
-    pub fn policy_layout(&self) -> &Layout {
+    fn policy_layout(&self) -> &Layout {
         self.policy_parameters.layout()
     }
 
-    /// Copies the policy's part of a snapshot, in the snapshot layout's order.
-    ///
-    /// # Panics
-    /// When `into` is not as long as the layout.
-    pub fn publish(&self, into: &mut [f32]) {
+    fn publish(&self, into: &mut [f32]) {
         self.policy_parameters.copy_range(0..self.policy_layout().len(), into);
     }
 
-    /// Copies the encoder's part of a snapshot, if the critic trains one.
-    ///
-    /// # Panics
-    /// When `into` is not as long as the encoder.
-    pub fn publish_encoder(&self, into: &mut [f32]) {
+    fn publish_encoder(&self, into: &mut [f32]) {
         if let Some(perception) = &self.perception {
             perception.publish(&self.critic_parameters, into);
         }
-    }
-
-    /// Updates done so far.
-    pub fn updates(&self) -> u64 {
-        self.critic_optimizer.steps()
     }
 }
 

@@ -91,7 +91,7 @@ impl TorchTd3 {
 }
 
 impl Algorithm for TorchTd3 {
-    /// As [`super::Td3`]'s. libtorch has threads of its own and leaves `team` alone.
+    /// As [`super::NativeTd3`]'s. libtorch has threads of its own and leaves `team` alone.
     fn update(
         &mut self,
         _team: &mut Team,

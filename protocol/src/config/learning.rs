@@ -20,7 +20,7 @@ pub struct LearningSection {
     /// What learns the policy: `sac` or `td3`, each with a section of its own. Default `sac`, as in the paper.
     pub algorithm: AlgorithmName,
     /// What trains the encoder that turns a depth image into the numbers the policy sees: `vae`, or `end-to-end`, where the critic's loss does and `[vae]` has no say but in
-    /// the encoder's precision. Every transition keeps its images then, 9 KiB each. Default `vae`, as in the paper.
+    /// the code's length and the encoder's precision. Every transition keeps its images then, 9 KiB each. Default `vae`, as in the paper.
     pub encoder: EncoderTraining,
     /// Flights flown with one frozen snapshot before the networks are updated. 1 is the paper's delayed learning. Default 10.
     pub flights_per_epoch: u64,

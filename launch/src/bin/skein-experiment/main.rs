@@ -96,6 +96,12 @@ impl Cli {
         let runs = runs.unwrap_or_else(|| self.repository.join("runs/experiments"));
         let root = root(&runs, &experiment, self.flights);
         // What would keep hours of work from being published is told before they begin.
+        if self.publish && (self.flights.is_some() || seeds < experiment.seeds) {
+            bail!(
+                "--publish puts the whole experiment into RESULTS.md, and --flights or fewer than {} would leave a part of it there: leave out the one or the other",
+                plural(experiment.seeds as usize, "seed")
+            );
+        }
         let publication = self
             .publish
             .then(|| Publication::find(&self.repository, name))

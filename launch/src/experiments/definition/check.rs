@@ -105,6 +105,14 @@ fn arm_of(
 /// The suite that `file` names, if every arm can be put to it and a table tells what came of it.
 fn suite_of(file: &File, folder: &Path, arms: &[Arm], path: &Path) -> Result<Option<FlownSuite>, DefinitionError> {
     let is_told = file.tables.contains(&TableKind::Suite);
+    let nothing = match (file.suite_flights, &file.suite) {
+        (Some(0), _) => Some("flies nothing: give at least 1, or leave it out for as many as the suite says"),
+        (Some(_), None) => Some("are of a suite, and none is named: add suite = \"FILE\", or leave it out"),
+        _ => None,
+    };
+    if let (Some(flights), Some(problem)) = (file.suite_flights, nothing) {
+        return Err(value_error(path, "suite_flights", flights, problem.to_owned()));
+    }
     let Some(named) = &file.suite else {
         let problem = "has the results of a suite, and none is named: add suite = \"FILE\", or take it out";
         return match is_told {
@@ -117,7 +125,7 @@ fn suite_of(file: &File, folder: &Path, arms: &[Arm], path: &Path) -> Result<Opt
         let problem = "would be flown, and no table tells it: add \"suite\" to tables, or leave it out";
         return Err(refuse(problem.to_owned()));
     }
-    let suite = FlownSuite::load(&folder.join(named)).map_err(|problem| {
+    let suite = FlownSuite::load(&folder.join(named), file.suite_flights).map_err(|problem| {
         refuse(format!(
             "cannot be flown: {problem}; name a suite file, relative to this one, or leave it out"
         ))

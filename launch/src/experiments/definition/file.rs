@@ -19,6 +19,8 @@ pub(super) struct File {
     pub(super) seeds: u64,
     /// Relative to the file.
     pub(super) suite: Option<PathBuf>,
+    /// Flights of each entry of it, if they are not as many as it says.
+    pub(super) suite_flights: Option<u64>,
     /// In what all arms differ from the base.
     #[serde(default)]
     pub(super) settings: Table,

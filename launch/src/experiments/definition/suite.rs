@@ -17,18 +17,23 @@ pub struct FlownSuite {
     pub path: PathBuf,
     /// What is flown.
     pub suite: Suite,
-    /// What the result of a run is called: the suite file's name, and a checksum of all that is flown. The result of a suite that has been changed since is
+    /// Flights of each entry, if they are not as many as the suite says.
+    pub each: Option<u64>,
+    /// What the result of a run is called: the suite file's name, `each`, and a checksum of all that is flown. The result of a suite that has been changed since is
     /// that of another one, and stays as it is.
     pub result_name: String,
 }
 
 impl FlownSuite {
-    /// The suite in the file at `path`.
+    /// The suite in the file at `path`; with `each`, so many flights of each entry.
     ///
     /// # Errors
     /// What keeps it from being flown, or told in a table.
-    pub fn load(path: &Path) -> Result<Self, String> {
-        let suite = Suite::load(path).map_err(|error| with_causes(&error))?;
+    pub fn load(path: &Path, each: Option<u64>) -> Result<Self, String> {
+        let mut suite = Suite::load(path).map_err(|error| with_causes(&error))?;
+        for entry in &mut suite.entries {
+            entry.flights = each.unwrap_or(entry.flights);
+        }
         if let Some(entry) = suite.entries.iter().find(|entry| entry.name.contains(['|', '\n'])) {
             return Err(format!(
                 "entry {:?} cannot stand in a table: call it something on one line without |",
@@ -36,10 +41,12 @@ impl FlownSuite {
             ));
         }
         let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+        let each_in_name = each.map_or_else(String::new, |each| format!("-{each}"));
         Ok(Self {
-            result_name: format!("{stem}-{:08x}", checksum(path)?),
+            result_name: format!("{stem}{each_in_name}-{:08x}", checksum(path)?),
             path: path.to_owned(),
             suite,
+            each,
         })
     }
 

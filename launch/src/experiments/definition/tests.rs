@@ -123,6 +123,14 @@ fn a_suite_is_named_relative_to_the_experiment_and_its_result_after_all_that_is_
     write("few.toml", &suite.replace('5', "6"));
     assert_ne!(load().result_name, first.result_name);
     write("few.toml", suite);
+    let fewer = format!(
+        "suite_flights = 2\nsuite = \"few.toml\"\n{}{ARM}",
+        head().replace("evaluation", "suite")
+    );
+    write("fewer.toml", &fewer);
+    let fewer = Experiment::load(folder.path(), "fewer", None).unwrap().suite.unwrap();
+    assert_eq!((fewer.each, fewer.flights()), (Some(2), 2));
+    assert_ne!(fewer.result_name, first.result_name);
     write(
         "mine.toml",
         &fs::read_to_string(shipped("courses/rearranged_34125.toml")).unwrap(),
@@ -255,6 +263,16 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
                 "mass_spread",
                 "name another suite",
             ],
+        ),
+        (
+            format!("suite_flights = 5\n{}{ARM}", head()),
+            None,
+            vec!["suite_flights = 5 are of a suite", "add suite ="],
+        ),
+        (
+            format!("suite_flights = 0\n{}", with_suite(&shipped("evaluations/paper.toml"))),
+            None,
+            vec!["suite_flights = 0 flies nothing", "at least 1"],
         ),
         (
             format!("suite = \"few.toml\"\n{}{ARM}", head()),

@@ -18,12 +18,12 @@ impl Findings<'_> {
         if let Some(note) = self.missing() {
             push(&mut text, &note);
         }
+        push(&mut text, &self.rests_on());
         for &kind in &self.experiment.tables {
             for titled in self.tables(kind) {
                 push(&mut text, &format!("*{}.*", titled.title));
                 push(&mut text, &titled.table);
             }
-            push(&mut text, &self.rests_on());
         }
         for picture in pictures {
             push(&mut text, &format!("![{}]({prefix}{})", picture.caption, picture.file));
@@ -76,7 +76,7 @@ impl Findings<'_> {
         (complete < planned).then(|| format!("**Not all of it**: {complete} of {planned} runs are complete."))
     }
 
-    /// What the figures rest on: under each table.
+    /// What all figures rest on.
     fn rests_on(&self) -> String {
         let shortened = match self.experiment.is_shortened() {
             true => "; shortened",
@@ -87,7 +87,7 @@ impl Findings<'_> {
             seeds => format!("{seeds} seeds"),
         };
         format!(
-            "<sub>{seeds} an arm{shortened}; a run: {} flights, {} steps, {} updates, {} of wall time.</sub>",
+            "{seeds} an arm{shortened}; a run: {} flights, {} steps, {} updates, {} of wall time.",
             range(
                 self.results,
                 |run| run.summary.flights as f64,
@@ -118,7 +118,7 @@ impl Findings<'_> {
         if estimates {
             text.push_str(match self.plan.seeds {
                 1 => "One seed has no interval, and says nothing about others. ",
-                2..5 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval; of so few seeds it is a rough one, and rather too narrow. ",
+                2..=5 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval; of so few seeds it is a rough one, and rather too narrow. ",
                 _ => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval. ",
             });
         }
@@ -133,7 +133,7 @@ impl Findings<'_> {
             let window = self.experiment.arms[0].config.evaluation.window_flights;
             let _ = write!(
                 text,
-                "Dispersion across time is the interquartile range of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; the largest drawdown is how far the average over {window} flights ever fell below the highest it had been (arXiv:1912.05663). "
+                "The level is what a run comes to: the median of the averages over {window} flights in its second half. Dispersion across time is the interquartile range of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; the largest drawdown is how far the average over {window} flights ever fell below the highest it had been (arXiv:1912.05663). "
             );
         }
         if !pictures.is_empty() {

@@ -2,6 +2,7 @@
 
 mod curves;
 mod document;
+mod outcomes;
 mod publication;
 mod tables;
 #[cfg(test)]

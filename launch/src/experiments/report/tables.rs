@@ -7,13 +7,14 @@ use skein_protocol::evaluation::CourseEvaluation;
 use skein_protocol::summary::Trained;
 
 use super::Findings;
+use super::outcomes::entry_of;
 use crate::display::Clock;
 use crate::experiments::definition::{Arm, TableKind};
 use crate::experiments::results::RunResult;
 use crate::experiments::statistics::{Estimate, RESAMPLES, interquartile_mean};
 
 /// What is shown where there is nothing to show.
-const NOTHING: &str = "–";
+pub(super) const NOTHING: &str = "–";
 
 /// A table and what stands above it.
 pub(super) struct Titled {
@@ -26,7 +27,7 @@ impl Findings<'_> {
     pub(super) fn tables(&self, kind: TableKind) -> Vec<Titled> {
         match kind {
             TableKind::Evaluation => self.evaluation(),
-            TableKind::Outcomes => vec![self.outcomes()],
+            TableKind::Outcomes => self.outcomes(),
             TableKind::Suite => self.suite().into_iter().collect(),
             TableKind::Learning => vec![self.learning()],
             TableKind::Steadiness => vec![self.steadiness()],
@@ -66,69 +67,6 @@ impl Findings<'_> {
         grid(header.collect(), rows, 1)
     }
 
-    /// A row for each arm and course: flights of all seeds together.
-    fn outcomes(&self) -> Titled {
-        let mut rows = Vec::new();
-        for (number, arm) in self.experiment.arms.iter().enumerate() {
-            for name in self.courses() {
-                let of_course: Vec<_> = self
-                    .of_arm(number)
-                    .filter_map(|result| course_of(result, &name))
-                    .collect();
-                let sum = |count: &dyn Fn(&CourseEvaluation) -> u64| {
-                    of_course.iter().map(|course| count(course)).sum::<u64>()
-                };
-                let flights = sum(&|course| course.flights);
-                let walls = of_course
-                    .iter()
-                    .map(|course| course.walls_passed.len())
-                    .max()
-                    .unwrap_or(0);
-                let passed: Vec<u64> = (0..walls)
-                    .map(|wall| sum(&|course| course.walls_passed.get(wall).copied().unwrap_or(0)))
-                    .collect();
-                let hit: Vec<String> = (0..passed.len())
-                    .map(|at| sum(&|course| course.failures.get(at).map_or(0, |there| there.hit_wall)).to_string())
-                    .collect();
-                let hit_corridor = |course: &CourseEvaluation| course.failures.iter().map(|at| at.hit_corridor).sum();
-                let share = |part: u64, whole: u64| match whole {
-                    0 => NOTHING.to_owned(),
-                    whole => format!("{:.3}", part as f64 / whole as f64),
-                };
-                let r = share(passed.iter().sum(), flights * walls as u64);
-                let by_wall: Vec<_> = passed.iter().map(u64::to_string).collect();
-                rows.push(vec![
-                    arm.label.clone(),
-                    name,
-                    of_course.len().to_string(),
-                    flights.to_string(),
-                    r,
-                    by_wall.join(" "),
-                    sum(&|course| course.reached_end).to_string(),
-                    hit.join(" "),
-                    sum(&hit_corridor).to_string(),
-                    sum(&|course| course.timed_out).to_string(),
-                ]);
-            }
-        }
-        let header = [
-            "arm",
-            "course",
-            "seeds",
-            "flights",
-            "R",
-            "passed wall 1, 2, …",
-            "completed",
-            "hit wall 1, 2, …",
-            "hit the corridor",
-            "timed out",
-        ];
-        Titled {
-            title: "How the evaluation flights went, all seeds together".to_owned(),
-            table: grid(header.map(str::to_owned).to_vec(), rows, 2),
-        }
-    }
-
     /// A row for each arm and entry of the suite.
     fn suite(&self) -> Option<Titled> {
         let flown = self.experiment.suite.as_ref()?;
@@ -136,24 +74,25 @@ impl Findings<'_> {
         for (number, arm) in self.experiment.arms.iter().enumerate() {
             for entry in &flown.suite.entries {
                 let estimate = |value: fn(&CourseEvaluation) -> f64| {
-                    let of_entry = |result: &RunResult| {
-                        let courses = &result.suite.as_ref()?.courses;
-                        courses.iter().find(|course| course.course == entry.name).map(value)
-                    };
+                    let of_entry = |result: &RunResult| entry_of(result, &entry.name).map(value);
                     self.estimate(number, of_entry)
                 };
                 let [label, seeds] = self.head(number, arm);
+                let completed = self.values(number, |run| Some(entry_of(run, &entry.name)?.completed));
                 rows.push(vec![
                     label,
                     entry.name.clone(),
                     seeds,
                     entry.flights.to_string(),
+                    completed
+                        .and_then(|values| mean(&values))
+                        .map_or(NOTHING.to_owned(), share),
                     estimate(|course| course.completed).map_or(NOTHING.to_owned(), percent),
                     estimate(|course| course.r).map_or(NOTHING.to_owned(), rate),
                 ]);
             }
         }
-        let header = ["arm", "entry", "seeds", "flights", "completed", "R"];
+        let header = ["arm", "entry", "seeds", "flights", "completed, mean", "completed", "R"];
         Some(Titled {
             title: format!(
                 "How the best snapshot flew the suite `{}` without exploration: the share of flights that completed their course, and R",
@@ -225,13 +164,25 @@ impl Findings<'_> {
             let mut row = self.head(number, arm).to_vec();
             row.extend(self.measured(
                 number,
-                &[RunResult::dispersion_across_time, RunResult::largest_drawdown],
+                &[
+                    RunResult::level,
+                    RunResult::volatility,
+                    RunResult::dispersion_across_time,
+                    RunResult::largest_drawdown,
+                ],
             ));
             rows.push(row);
         }
-        let header = ["arm", "seeds", "dispersion across time", "largest drawdown"];
+        let header = [
+            "arm",
+            "seeds",
+            "level",
+            "volatility",
+            "dispersion across time",
+            "largest drawdown",
+        ];
         Titled {
-            title: "Steadiness of the walls passed in training: the smaller, the steadier".to_owned(),
+            title: "Steadiness of the walls passed in training: the smaller beside its level, the steadier".to_owned(),
             table: grid(header.map(str::to_owned).to_vec(), rows, 1),
         }
     }
@@ -300,12 +251,16 @@ impl Findings<'_> {
 
     /// The estimate of what `of_run` says of the complete runs of an arm; `None` when it says nothing of one of them.
     fn estimate(&self, arm: usize, of_run: impl Fn(&RunResult) -> Option<f64>) -> Option<Estimate> {
-        let values: Option<Vec<f64>> = self.of_arm(arm).map(of_run).collect();
-        self.bootstrap(arm, RESAMPLES).estimate(&values?)
+        self.bootstrap(arm, RESAMPLES).estimate(&self.values(arm, of_run)?)
+    }
+
+    /// What `of_run` says of each of the complete runs of an arm; `None` when it says nothing of one of them.
+    fn values(&self, arm: usize, of_run: impl Fn(&RunResult) -> Option<f64>) -> Option<Vec<f64>> {
+        self.of_arm(arm).map(of_run).collect()
     }
 
     /// Names of the evaluation courses.
-    fn courses(&self) -> Vec<String> {
+    pub(super) fn courses(&self) -> Vec<String> {
         let first = self.results.first();
         first.map_or(Vec::new(), |result| {
             let courses = result.evaluation.courses.iter();
@@ -314,8 +269,13 @@ impl Findings<'_> {
     }
 }
 
-fn course_of<'a>(result: &'a RunResult, name: &str) -> Option<&'a CourseEvaluation> {
+pub(super) fn course_of<'a>(result: &'a RunResult, name: &str) -> Option<&'a CourseEvaluation> {
     result.evaluation.courses.iter().find(|course| course.course == name)
+}
+
+/// `None` of none.
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 fn rate(estimate: Estimate) -> String {
@@ -323,7 +283,11 @@ fn rate(estimate: Estimate) -> String {
 }
 
 fn percent(estimate: Estimate) -> String {
-    with_interval(estimate, |value| format!("{:.1} %", 100.0 * value))
+    with_interval(estimate, share)
+}
+
+fn share(value: f64) -> String {
+    format!("{:.1} %", 100.0 * value)
 }
 
 /// `IQM [low, high]`.
@@ -336,7 +300,7 @@ fn with_interval(estimate: Estimate, show: impl Fn(f64) -> String) -> String {
 }
 
 /// A Markdown table whose first `left` columns are aligned left, all others right.
-fn grid(header: Vec<String>, rows: Vec<Vec<String>>, left: usize) -> String {
+pub(super) fn grid(header: Vec<String>, rows: Vec<Vec<String>>, left: usize) -> String {
     let mut table = Table::new();
     table.load_preset(ASCII_MARKDOWN).set_header(header);
     for row in rows {

@@ -79,10 +79,10 @@ fn a_suite_is_told_entry_by_entry_over_the_seeds() {
     };
     assert_eq!(
         told(&plan),
-        "| arm | entry | seeds | flights |                completed |                    R |\n\
-         |-----|-------|------:|--------:|-------------------------:|---------------------:|\n\
-         | A   | calm  |     2 |       4 | 75.0 % [50.0 %, 100.0 %] | 0.750 [0.500, 1.000] |\n\
-         | A   | windy |     2 |       4 |  25.0 % [25.0 %, 25.0 %] | 0.250 [0.250, 0.250] |"
+        "| arm | entry | seeds | flights | completed, mean |                completed |                    R |\n\
+         |-----|-------|------:|--------:|----------------:|-------------------------:|---------------------:|\n\
+         | A   | calm  |     2 |       4 |          75.0 % | 75.0 % [50.0 %, 100.0 %] | 0.750 [0.500, 1.000] |\n\
+         | A   | windy |     2 |       4 |          25.0 % |  25.0 % [25.0 %, 25.0 %] | 0.250 [0.250, 0.250] |"
     );
     // A run that did not fly it says nothing, and nothing is made up for it.
     plan.runs[1].state = State::Trained;

@@ -273,7 +273,16 @@ fn ranges(script: &mut Script<'_>) -> GeneratorRanges {
             .map(|wall| gap_m * f32::from(wall) + script.number(-1.0..=1.0))
             .collect(),
         shapes: (0..script.u8() % 4)
-            .map(|_| script.one_of(&[&GeneratedShape::TRAINED[..], &GeneratedShape::HELD_OUT].concat()))
+            .map(|_| {
+                script.one_of(
+                    &[
+                        &GeneratedShape::TRAINED[..],
+                        &GeneratedShape::HELD_OUT,
+                        &GeneratedShape::UNTRIED,
+                    ]
+                    .concat(),
+                )
+            })
             .collect(),
         clearance_m,
         rotation_deg,

@@ -2,6 +2,7 @@
 
 use tch::Device;
 
+use super::super::TorchTd3;
 use super::*;
 use crate::networks::Parameters;
 use crate::sac::samples::Transitions;
@@ -22,8 +23,8 @@ fn section() -> Td3Section {
     }
 }
 
-fn td3(section: &Td3Section, seed: u64) -> Td3 {
-    Td3::new(section, Inputs::same(OBSERVATION), seed, Isa::best())
+fn td3(section: &Td3Section, seed: u64) -> NativeTd3 {
+    NativeTd3::new(section, Inputs::same(OBSERVATION), seed, Isa::best())
 }
 
 fn numbers(parameters: &Parameters) -> Vec<f32> {
@@ -46,7 +47,7 @@ fn forty_updates_stay_close_to_automatic_gradients() {
         ..section()
     };
     for (seed, section) in [(1, section()), (2, section()), (3, apart), (4, cut_off)] {
-        let mut native = Td3::new(&section, TOLD, seed, Isa::best());
+        let mut native = NativeTd3::new(&section, TOLD, seed, Isa::best());
         let mut torch = TorchTd3::new(&section, TOLD, seed, Device::Cpu);
         let (mut data, mut noise, mut same_noise) = (Noise::new(seed), Noise::new(9), Noise::new(9));
         let before = native.policy_parameters.values.clone();
@@ -102,7 +103,7 @@ fn forty_updates_stay_close_to_automatic_gradients() {
 fn the_policy_and_the_targets_wait_for_their_turn() {
     let mut algorithm = td3(&section(), 1);
     let (mut data, mut noise) = (Noise::new(1), Noise::new(2));
-    let mut step = |algorithm: &mut Td3| {
+    let mut step = |algorithm: &mut NativeTd3| {
         let transitions = Transitions::random(OBSERVATION, 20, &mut data);
         algorithm
             .update(&mut Team::new(1), transitions.columns(), &mut noise)
@@ -127,7 +128,7 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
     for seed in 1..=3 {
         let (mut data, mut noise, mut team) = (Noise::new(seed), Noise::new(seed + 1), Team::new(1));
         let mut algorithm = td3(&section, seed);
-        let error = |algorithm: &Td3| {
+        let error = |algorithm: &NativeTd3| {
             let asked = Transitions::guessing(OBSERVATION, 200, &mut Noise::new(77));
             let mut actions = vec![0.0; 400];
             algorithm.policy.forward_through(
@@ -166,7 +167,7 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
 #[test]
 fn neither_threads_nor_instructions_change_a_bit() {
     let run = |isa: Isa, members: usize| {
-        let mut algorithm = Td3::new(&section(), Inputs::same(OBSERVATION), 1, isa);
+        let mut algorithm = NativeTd3::new(&section(), Inputs::same(OBSERVATION), 1, isa);
         let (mut data, mut noise, mut team) = (Noise::new(1), Noise::new(2), Team::new(members));
         for _ in 0..4 {
             let transitions = Transitions::random(OBSERVATION, 37, &mut data);

@@ -1,9 +1,4 @@
-//! Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477): what the paper compares SAC with (its Fig. 11).
-//!
-//! On the kernels, forward and backward written out; [`TorchTd3`] is the same on libtorch. The critic is that of [`crate::sac`], one network with two estimates, so that the algorithms differ in nothing else; its
-//! second estimate only ever steadies the targets. tanh is the C library's, as in actors: bits are equal on any processor with the same one.
-
-mod torch;
+//! One TD3 update on the kernels, forward and backward written out; [`super::TorchTd3`] is the same on libtorch. tanh is the C library's, as in actors: bits are equal on any processor with the same one.
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::ACTION;
@@ -21,11 +16,9 @@ use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
 use crate::state::{Part, Stateful};
 
-pub use torch::TorchTd3;
-
 /// Policy and critic, the targets that follow them slowly, and their optimizers.
 #[derive(Debug)]
-pub struct Td3 {
+pub struct NativeTd3 {
     isa: Isa,
     inputs: Inputs,
     settings: Td3Section,
@@ -59,7 +52,7 @@ struct Work {
     policy_flowing: Layers,
 }
 
-impl Td3 {
+impl NativeTd3 {
     /// Untrained networks whose parameters depend on the run's seed alone.
     pub fn new(section: &Td3Section, inputs: Inputs, run_seed: u64, isa: Isa) -> Self {
         let width = section.hidden_width as i64;
@@ -200,7 +193,7 @@ impl Td3 {
     }
 }
 
-impl Algorithm for Td3 {
+impl Algorithm for NativeTd3 {
     /// One step of the critic, and each `td3.policy_period` of them one of the policy and of both targets. Both gradients are taken before anything moves.
     ///
     /// Source: arXiv:1802.09477, algorithm 1, which moves the critic before it takes the policy's gradient.
@@ -250,9 +243,11 @@ impl Algorithm for Td3 {
     fn publish(&self, into: &mut [f32]) {
         into.copy_from_slice(&self.policy_parameters.values);
     }
+
+    fn publish_encoder(&self, _into: &mut [f32]) {}
 }
 
-impl Stateful for Td3 {
+impl Stateful for NativeTd3 {
     fn parts(&mut self) -> Vec<(String, Part<'_>)> {
         let mut parts = self.policy_parameters.parts("td3.policy.parameters", "td3.policy.adam");
         parts.extend(self.critic_parameters.parts("td3.critic.parameters", "td3.critic.adam"));
