@@ -69,7 +69,9 @@ fn the_shipped_generalist_flies_courses_that_it_never_saw() {
         serde_json::from_str(&fs::read_to_string(snapshots.join("generalist.json")).unwrap()).unwrap();
     let (_, config) = Snapshot::load(&snapshots.join("generalist.safetensors")).unwrap();
     let shipped = Config::load(&repository().join("configs/generalist.toml"), &[]).unwrap();
-    let differences = shipped.differences(&config.portable()).unwrap();
+    let mut differences = shipped.differences(&config.portable()).unwrap();
+    // The simulator's defaults, which the snapshot writes out and the file does not.
+    differences.retain(|difference| !difference.ends_with("nothing here"));
     assert_eq!(differences, ["run.learner_threads = 1 there, 2 here"]);
 
     // By a bare name, from where it lies.

@@ -146,7 +146,8 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
         "non_rectangular",
         "flew the suite `few.toml`",
         "| in any order |     2 |       5 |",
-        "| hit wall 1, 2, … | hit the corridor | timed out |",
+        "| hit wall 1, 2, … | hit the corridor before 1, …, end | timed out before 1, …, end |",
+        "How the flights of the suite `few.toml` went",
         "2 seeds an arm",
     ] {
         assert!(text.contains(part), "`{part}` is missing in\n{text}");
