@@ -297,7 +297,7 @@ fn errors_name_the_file_and_the_remedy() {
     std::fs::remove_dir_all(at.join("courses")).unwrap();
     let gone = with(&[]);
     assert!(
-        gone.contains("/elsewhere/training.toml") && gone.contains("--course"),
+        gone.contains("/courses/training.toml") && gone.contains("--course"),
         "{gone}"
     );
     std::fs::write(at.join("snapshots/latest.safetensors"), b"nothing of the kind").unwrap();
