@@ -36,10 +36,17 @@ pub(crate) fn finite<const SCALARS: usize, const GRADIENTS: usize>(
         .iter()
         .map(|(name, _)| *name)
         .chain(gradients.iter().map(|(name, _)| *name));
-    for (tensor, number) in names.zip(&numbers) {
-        if !f32::is_finite(*number) {
-            return Err(UpdateError::NonFinite { tensor, update });
-        }
-    }
+    must_be_finite(update, names.zip(numbers.iter().copied()))?;
     Ok(std::array::from_fn(|place| numbers[place]))
+}
+
+/// Looks whether everything that update number `update` computed is a number; the first that is not is named.
+pub(crate) fn must_be_finite(
+    update: u64,
+    numbers: impl IntoIterator<Item = (&'static str, f32)>,
+) -> Result<(), UpdateError> {
+    match numbers.into_iter().find(|(_, number)| !number.is_finite()) {
+        Some((tensor, _)) => Err(UpdateError::NonFinite { tensor, update }),
+        None => Ok(()),
+    }
 }

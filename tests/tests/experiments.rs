@@ -169,6 +169,7 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
 
     assert_published(&scene, &text);
     assert_only_the_suite_is_flown_again(&scene, &runs);
+    assert_a_suite_is_flown_as_often_as_the_experiment_says(&scene, &runs);
     assert_refused_when_changed(&scene);
 }
 
@@ -185,6 +186,12 @@ fn assert_published(scene: &Scene, report: &str) {
     assert!(results.contains(picture) && scene.path(picture).is_file());
     let published = results.replace("launch/pictures/experiments/tiny_", "");
     assert!(published.contains(report.trim_end()), "{published}\n---\n{report}");
+    // A part of it is no result to replace that by.
+    for part in [["--seeds", "1"], ["--flights", "20"]] {
+        let output = scene.finish(&[&part[..], &["--report", "--publish"]].concat());
+        output.assert_refused(&["--publish", "2 seeds"]);
+        assert_eq!(scene.results(), results);
+    }
 }
 
 /// What came of the suites of a run.
@@ -264,6 +271,32 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     assert_eq!(output.code, Some(0), "{}", output.stderr);
     assert_eq!(suite_results(&runs[1]), [result]);
     assert_eq!(runs.iter().map(files).collect::<Vec<_>>(), before, "trained again");
+}
+
+/// And that is another result, beside the suite's own.
+fn assert_a_suite_is_flown_as_often_as_the_experiment_says(scene: &Scene, runs: &[RunDirectory]) {
+    let file = scene.path("configs/experiments/tiny.toml");
+    let text = fs::read_to_string(&file).unwrap();
+    fs::write(&file, format!("suite_flights = 2\n{text}")).unwrap();
+    let output = scene.finish(&[]);
+    assert_eq!(output.code, Some(0), "{}", output.stderr);
+    for run in runs {
+        let results = suite_results(run);
+        let flown = |result: &PathBuf| -> Vec<u64> {
+            let report: EvaluationReport = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
+            report.courses.iter().map(|entry| entry.flights).collect()
+        };
+        assert_eq!(
+            results.iter().filter(|result| flown(result) == [2, 2]).count(),
+            1,
+            "{results:?}"
+        );
+        assert_eq!(
+            results.iter().filter(|result| flown(result) == [5, 5]).count(),
+            1,
+            "{results:?}"
+        );
+    }
 }
 
 /// What was learned from another configuration is never mixed with what the file says now, and never removed.

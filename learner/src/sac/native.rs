@@ -13,7 +13,7 @@ use skein_protocol::seeds::{Purpose, derive};
 use self::sample::Sample;
 use super::reported;
 use crate::algorithm::{Algorithm, Columns, Inputs};
-use crate::error::UpdateError;
+use crate::error::{UpdateError, must_be_finite};
 use crate::metrics::Scalar;
 use crate::networks::native::{
     CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output, output_mut, pair, smaller,
@@ -214,7 +214,7 @@ impl NativeSac {
     }
 
     /// Looks whether what an update reports and the gradients it took are numbers. Of a gradient, the square of its length has to be.
-    fn must_be_finite(&self, reported: [f32; 5]) -> Result<(), UpdateError> {
+    fn check(&self, reported: [f32; 5]) -> Result<(), UpdateError> {
         let [critic_loss, policy_loss, temperature, entropy, mean_value] = reported;
         let norm = |learned: &Learned| squared_norm(self.isa, &learned.gradient);
         let numbers = [
@@ -227,11 +227,7 @@ impl NativeSac {
             ("policy gradient", norm(&self.policy_parameters)),
             ("temperature gradient", norm(&self.log_temperature)),
         ];
-        let update = self.updates() + 1;
-        match numbers.into_iter().find(|(_, number)| !number.is_finite()) {
-            Some((tensor, _)) => Err(UpdateError::NonFinite { tensor, update }),
-            None => Ok(()),
-        }
+        must_be_finite(self.updates() + 1, numbers)
     }
 
     /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
@@ -268,7 +264,7 @@ impl Algorithm for NativeSac {
         self.log_temperature.gradient[0] = -temperature * (log_prob + self.target_entropy);
 
         let metrics = [critic_loss, policy_loss, temperature, -log_prob, mean_value];
-        self.must_be_finite(metrics)?;
+        self.check(metrics)?;
         let isa = self.isa;
         self.critic_parameters.step(team, isa);
         self.policy_parameters.step(team, isa);

@@ -6,7 +6,7 @@ use skein_protocol::config::Td3Section;
 use skein_protocol::seeds::{Purpose, derive};
 
 use crate::algorithm::{Algorithm, Columns, Inputs};
-use crate::error::UpdateError;
+use crate::error::{UpdateError, must_be_finite};
 use crate::metrics::Scalar;
 use crate::networks::native::{
     CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output, output_mut, pair, smaller,
@@ -218,10 +218,7 @@ impl Algorithm for NativeTd3 {
             numbers.push(("policy loss", self.improve(team, columns)));
             numbers.push(("policy gradient", self.norm(&self.policy_parameters)));
         }
-        if let Some((tensor, _)) = numbers.into_iter().find(|(_, number)| !number.is_finite()) {
-            let update = self.updates() + 1;
-            return Err(UpdateError::NonFinite { tensor, update });
-        }
+        must_be_finite(self.updates() + 1, numbers)?;
         let (isa, rate) = (self.isa, self.settings.target_rate as f32);
         self.critic_parameters.step(team, isa);
         if improves {
