@@ -1,7 +1,7 @@
 //! A flight seen in a mirror: left and right change places.
 //!
 //! Corridor, drone and reward are the same on both sides, so what is seen in the mirror is a flight, too, through another course that nobody had to fly. Only a stereo camera has sides: its shadows
-//! lie to the left of what is near, and in the mirror to the right.
+//! lie to the left of what is near, and in the mirror to the right, as if its second lens were on the other side.
 
 use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_WIDTH};
 

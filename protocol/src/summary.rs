@@ -37,11 +37,11 @@ pub struct Summary {
     pub flights: u64,
     /// Environment steps of training flights.
     pub steps: u64,
-    /// SAC updates.
+    /// Updates of the agent, SAC or TD3.
     pub updates: u64,
     /// VAE steps.
     pub vae_updates: u64,
-    /// Evaluation flights.
+    /// Flights without exploration: those that the best snapshot was chosen by, and those of its evaluation. Their steps are in no other count.
     pub evaluation_flights: u64,
     /// Tickets issued again, for whatever reason.
     pub tickets_reissued: u64,

@@ -17,7 +17,7 @@ use skein_protocol::failure::with_causes;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::snapshot::Snapshot;
 use skein_simulator::camera::Instructions;
-use skein_simulator::suite::{EntryCourses, Suite, SuiteEntry};
+use skein_simulator::suite::{EntryCourses, MOST_FLIGHTS, Suite, SuiteEntry};
 
 /// Flies a trained snapshot through courses and prints how it fares.
 ///
@@ -38,7 +38,7 @@ struct Arguments {
     #[arg(long, value_name = "FILE", conflicts_with = "course")]
     suite: Option<PathBuf>,
     /// Flights per course, or of each entry of the suite. By default evaluation.flights of that run, or what the suite says.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=MOST_FLIGHTS))]
     flights: Option<u64>,
     /// Also write the result to this file, as JSON.
     #[arg(long, value_name = "FILE")]

@@ -221,9 +221,18 @@ impl PlannedRun {
                 differences.join(", ")
             ));
         }
-        if Summary::of(&self.directory).is_some_and(|summary| summary.ending == Ending::Completed) {
-            let is_flown = self.suite_json.as_ref().is_none_or(|result| result.is_file());
-            return Ok(if is_flown { State::Complete } else { State::Trained });
+        match Summary::of(&self.directory) {
+            Some(summary) if summary.ending == Ending::Completed => {
+                let is_flown = self.suite_json.as_ref().is_none_or(|result| result.is_file());
+                return Ok(if is_flown { State::Complete } else { State::Trained });
+            }
+            None if self.directory.summary_json().exists() => {
+                return Err(format!(
+                    "  {} is damaged: bring it back, or, {aside}",
+                    self.directory.summary_json().display()
+                ));
+            }
+            _ => {}
         }
         match self.directory.is_under_way() {
             Ok(false) => Ok(State::Begun),
@@ -313,6 +322,13 @@ mod tests {
             states("completed"),
             [State::Begun, State::New, State::New, State::Complete]
         );
+        // What it came to cannot be told, and its checkpoints are gone: it is no run to go on with.
+        let summary = plan.runs[3].directory.summary_json();
+        fs::write(&summary, "{").unwrap();
+        let error = Plan::new(&experiment, &root, 2).unwrap_err().to_string();
+        for part in ["summary.json is damaged", "mv "] {
+            assert!(error.contains(part), "{error}");
+        }
     }
 
     #[test]

@@ -5,13 +5,10 @@ use std::sync::Arc;
 
 use serde::Deserialize;
 
-use super::{EntryCourses, MOST_WALLS_TO_ORDER, Suite, SuiteEntry, orders};
+use super::{EntryCourses, MOST_FLIGHTS, MOST_WALLS_TO_ORDER, Suite, SuiteEntry, orders};
 use crate::course::{Course, CourseError, CourseFault, GeneratorRanges, RangesError};
 use crate::disturbances::DisturbanceSettings;
 use crate::text::read_text;
-
-/// Most flights of an entry.
-const MOST_FLIGHTS: u64 = 1_000_000;
 
 /// Most entries of a suite.
 const MOST_ENTRIES: usize = 64;

@@ -14,6 +14,8 @@ pub use file::{EntryFault, SuiteError};
 use crate::course::{Course, GeneratorRanges, RangesError};
 use crate::disturbances::DisturbanceSettings;
 
+/// Most flights of an entry.
+pub const MOST_FLIGHTS: u64 = 1_000_000;
 /// Most walls of a course of which all orders are flown: 720 courses.
 pub const MOST_WALLS_TO_ORDER: usize = 6;
 

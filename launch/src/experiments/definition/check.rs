@@ -4,14 +4,13 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use skein_protocol::config::Config;
+use skein_simulator::suite::MOST_FLIGHTS;
 
 use super::file::{ArmFile, File, as_overrides};
-use super::{Arm, DefinitionError, Experiment, FlownSuite, MOST_ARMS, TableKind};
+use super::{Arm, DefinitionError, Experiment, FOR_ALL, FlownSuite, MOST_ARMS, TableKind};
 use crate::experiments::plan::{ACTORS, REPORT};
 use crate::prepare::{self, PrepareError};
 
-/// What is set in every run: it gets one core, and the native engine's results do not depend on it.
-const FOR_ALL: &str = "run.learner_threads=1";
 /// Keys that no file may set, and why.
 const OURS: [(&str, &str); 2] = [
     (
@@ -49,6 +48,7 @@ pub(super) fn resolve(
         arms.push(arm_of(arm, own, overrides, &base, flights, path)?);
     }
     check_comparable(&arms, path)?;
+    check_same_flights(&file, &arms, path)?;
     let suite = suite_of(&file, folder, &arms, path)?;
     Ok(Experiment {
         name: name.to_owned(),
@@ -106,7 +106,9 @@ fn arm_of(
 fn suite_of(file: &File, folder: &Path, arms: &[Arm], path: &Path) -> Result<Option<FlownSuite>, DefinitionError> {
     let is_told = file.tables.contains(&TableKind::Suite);
     let nothing = match (file.suite_flights, &file.suite) {
-        (Some(0), _) => Some("flies nothing: give at least 1, or leave it out for as many as the suite says"),
+        (Some(flights), _) if !(1..=MOST_FLIGHTS).contains(&flights) => {
+            Some("is outside 1..=1000000: leave it out for as many as the suite says")
+        }
         (Some(_), None) => Some("are of a suite, and none is named: add suite = \"FILE\", or leave it out"),
         _ => None,
     };
@@ -211,6 +213,29 @@ fn check_comparable(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
             ),
         )),
     }
+}
+
+/// Whether what is told of the arms' own flights, training's and evaluation's, is of flights of one kind. A suite flies all arms alike, whatever they were trained on.
+fn check_same_flights(file: &File, arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
+    let of_own_flights = |kind: &TableKind| !matches!(kind, TableKind::Suite | TableKind::Cost);
+    if file.curves.is_empty() && !file.tables.iter().any(of_own_flights) {
+        return Ok(());
+    }
+    let Some(first) = arms.first() else { return Ok(()) };
+    for key in ["generator", "disturbances"] {
+        let of = |arm: &Arm| arm.config.simulator.get(key).cloned();
+        if let Some(other) = arms.iter().find(|arm| of(arm) != of(first)) {
+            return Err(settings_error(
+                path,
+                &format!("arm {}", other.name),
+                format!(
+                    "simulator.{key} cannot differ from that of arm {}, or the two would be measured on different flights: put them to a suite, and write tables = [\"suite\", \"cost\"] and curves = []",
+                    first.name
+                ),
+            ));
+        }
+    }
+    Ok(())
 }
 
 fn settings_error(path: &Path, whose: &str, problem: String) -> DefinitionError {

@@ -270,9 +270,19 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             vec!["suite_flights = 5 are of a suite", "add suite ="],
         ),
         (
+            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.generator.clearance_m = [0.9, 1.25]"),
+            None,
+            vec!["arm b: simulator.generator cannot differ", "arm a", "\"suite\""],
+        ),
+        (
+            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.disturbances.share = 0.5"),
+            None,
+            vec!["arm b: simulator.disturbances cannot differ", "arm a", "\"suite\""],
+        ),
+        (
             format!("suite_flights = 0\n{}", with_suite(&shipped("evaluations/paper.toml"))),
             None,
-            vec!["suite_flights = 0 flies nothing", "at least 1"],
+            vec!["suite_flights = 0 is outside 1..=1000000", "leave it out"],
         ),
         (
             format!("suite = \"few.toml\"\n{}{ARM}", head()),

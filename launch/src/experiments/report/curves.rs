@@ -42,7 +42,7 @@ impl Findings<'_> {
             false => "",
         };
         Ok(Comparison {
-            title: format!("{what} a training flight, average over {window} flights{shortened}"),
+            title: format!("{what} per training flight, average over {window} flights{shortened}"),
             x: match curve.over {
                 Axis::Flights => "training flights",
                 Axis::Steps => "environment steps",

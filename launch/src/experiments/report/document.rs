@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use super::{Findings, Picture};
 use crate::display::Clock;
-use crate::experiments::definition::{Experiment, TableKind};
+use crate::experiments::definition::{Experiment, FOR_ALL, TableKind};
 use crate::experiments::results::RunResult;
 
 impl Findings<'_> {
@@ -39,10 +39,8 @@ impl Findings<'_> {
             arms,
             ..
         } = self.experiment;
-        let mut text = format!("Trained with `configs/{base_name}`");
-        if !settings.is_empty() {
-            let _ = write!(text, " and {}", code(settings));
-        }
+        let of_all = [&[FOR_ALL.to_owned()], &settings[..]].concat();
+        let mut text = format!("Trained with `configs/{base_name}` and {}", code(&of_all));
         if let [arm] = &arms[..]
             && arm.settings.is_empty()
         {
@@ -78,16 +76,12 @@ impl Findings<'_> {
 
     /// What all figures rest on.
     fn rests_on(&self) -> String {
-        let shortened = match self.experiment.is_shortened() {
-            true => "; shortened",
-            false => "",
-        };
         let seeds = match self.plan.seeds {
             1 => "1 seed".to_owned(),
             seeds => format!("{seeds} seeds"),
         };
         format!(
-            "{seeds} an arm{shortened}; a run: {} flights, {} steps, {} updates, {} of wall time.",
+            "{seeds} an arm; a run: {} flights, {} steps, {} updates, {} of wall time.",
             range(
                 self.results,
                 |run| run.summary.flights as f64,
@@ -126,7 +120,7 @@ impl Findings<'_> {
             let window = self.experiment.arms[0].config.evaluation.window_flights;
             let _ = write!(
                 text,
-                "A run that never reached the rate counts with all that it took (≥). Volatility is the root mean square of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to. "
+                "A run that never reached the rate counts with all that it took (≥). Volatility is the root mean square of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; – where a run has too few flights after that. "
             );
         }
         if tables.contains(&TableKind::Steadiness) {

@@ -1,6 +1,6 @@
 //! Putting a report where readers find it: RESULTS.md, and the pictures of the documents.
 
-use std::fs;
+use std::fs::{self, File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -18,7 +18,11 @@ const PICTURES: &str = "launch/pictures/experiments";
 #[derive(Debug)]
 pub struct Publication {
     results: PathBuf,
-    begin: String,
+    name: String,
+}
+
+/// RESULTS.md without the part of the experiment.
+struct Surroundings {
     before: String,
     after: String,
 }
@@ -43,6 +47,9 @@ pub enum PublicationError {
         /// What is wrong with it, and what to write.
         problem: String,
     },
+    /// Somebody is publishing.
+    #[error("{}: another experiment is being published: do it again, with --report --publish", .0.display())]
+    Busy(PathBuf),
 }
 
 impl Publication {
@@ -52,45 +59,53 @@ impl Publication {
     /// # Errors
     /// [`PublicationError`] names the file and what is wrong with the markers.
     pub fn find(repository: &Path, name: &str) -> Result<Self, PublicationError> {
-        let results = repository.join("RESULTS.md");
-        let text = fs::read_to_string(&results).map_err(at(&results))?;
-        let begin = format!("{BEGIN}{name} -->");
-        let markers = |problem| PublicationError::Markers {
-            path: results.clone(),
-            problem,
+        let found = Self {
+            results: repository.join("RESULTS.md"),
+            name: name.to_owned(),
         };
-        let parts: Vec<&str> = text.split(&begin).collect();
-        let (before, after) = match parts[..] {
-            [all] => (
-                format!("{}\n\n## Experiment: {name}\n\n", all.trim_end()),
-                "\n".to_owned(),
-            ),
+        found.surroundings().map(|_| found)
+    }
+
+    /// What RESULTS.md has around the experiment's part now.
+    fn surroundings(&self) -> Result<Surroundings, PublicationError> {
+        let text = fs::read_to_string(&self.results).map_err(at(&self.results))?;
+        let begin = &self.begin();
+        let markers = |problem| {
+            Err(PublicationError::Markers {
+                path: self.results.clone(),
+                problem,
+            })
+        };
+        let parts: Vec<&str> = text.split(begin).collect();
+        match parts[..] {
+            [all] => Ok(Surroundings {
+                before: format!("{}\n\n## Experiment: {}\n\n", all.trim_end(), self.name),
+                after: "\n".to_owned(),
+            }),
             [before, after] => match after.split_once(END) {
-                Some((mine, after)) if !mine.contains(BEGIN) => (before.to_owned(), after.to_owned()),
-                _ => {
-                    return Err(markers(format!(
-                        "nothing ends what `{begin}` begins: write {END} after it"
-                    )));
-                }
+                Some((mine, after)) if !mine.contains(BEGIN) => Ok(Surroundings {
+                    before: before.to_owned(),
+                    after: after.to_owned(),
+                }),
+                _ => markers(format!("nothing ends what `{begin}` begins: write {END} after it")),
             },
-            _ => return Err(markers(format!("`{begin}` is there more than once: leave one"))),
-        };
-        Ok(Self {
-            results,
-            begin,
-            before,
-            after,
-        })
+            _ => markers(format!("`{begin}` is there more than once: leave one")),
+        }
+    }
+
+    fn begin(&self) -> String {
+        format!("{BEGIN}{} -->", self.name)
     }
 
     /// Puts the report there, and its pictures beside the documents' others. Returns what was written.
     ///
     /// # Errors
-    /// [`PublicationError::Io`] names the file.
+    /// [`PublicationError`] names the file; nothing was written where another experiment is just being published.
     pub fn publish(&self, findings: &Findings<'_>, report: &Written) -> Result<Vec<PathBuf>, PublicationError> {
         let repository = self.results.parent().unwrap_or(Path::new(""));
         let folder = repository.join(PICTURES);
         fs::create_dir_all(&folder).map_err(at(&folder))?;
+        let _claim = claim(&folder)?;
         let mut written = Vec::new();
         let mut pictures = Vec::new();
         for picture in &report.pictures {
@@ -103,20 +118,30 @@ impl Publication {
                 caption: picture.caption.clone(),
             });
         }
-        let document = findings.document(&pictures, &format!("{PICTURES}/"));
-        let text = format!(
-            "{}{}\n{}\n{END}{}",
-            self.before,
-            self.begin,
-            document.trim_end(),
-            self.after
-        );
+        self.write(&findings.document(&pictures, &format!("{PICTURES}/")))?;
+        written.push(self.results.clone());
+        Ok(written)
+    }
+
+    /// Puts `document` into RESULTS.md as it is now: hours have passed since its place was found.
+    fn write(&self, document: &str) -> Result<(), PublicationError> {
+        let Surroundings { before, after } = self.surroundings()?;
+        let text = format!("{before}{}\n{}\n{END}{after}", self.begin(), document.trim_end());
         let aside = self.results.with_extension("md.partial");
         fs::write(&aside, text)
             .and_then(|()| fs::rename(&aside, &self.results))
-            .map_err(at(&self.results))?;
-        written.push(self.results.clone());
-        Ok(written)
+            .map_err(at(&self.results))
+    }
+}
+
+/// Claims the documents for this process until what it gives is dropped.
+fn claim(folder: &Path) -> Result<File, PublicationError> {
+    let folder = folder.to_owned();
+    let handle = File::open(&folder).map_err(at(&folder))?;
+    match handle.try_lock() {
+        Ok(()) => Ok(handle),
+        Err(TryLockError::WouldBlock) => Err(PublicationError::Busy(folder)),
+        Err(TryLockError::Error(error)) => Err(at(&folder)(error)),
     }
 }
 
@@ -129,24 +154,46 @@ fn at(path: &Path) -> impl FnOnce(io::Error) -> PublicationError {
 mod tests {
     use super::*;
 
-    fn place(results: &str) -> Result<(String, String), String> {
+    /// What RESULTS.md becomes when `new` is published for the experiment `lag`, and somebody has put `changed` there since its place was found.
+    fn published(results: &str, changed: &str) -> Result<String, String> {
         let repository = tempfile::tempdir().unwrap();
-        fs::write(repository.path().join("RESULTS.md"), results).unwrap();
-        Publication::find(repository.path(), "lag")
-            .map(|found| (found.before, found.after))
-            .map_err(|error| error.to_string())
+        let file = repository.path().join("RESULTS.md");
+        fs::write(&file, results).unwrap();
+        let place = Publication::find(repository.path(), "lag").map_err(|error| error.to_string())?;
+        fs::write(&file, changed).unwrap();
+        place.write("new\n\n").map_err(|error| error.to_string())?;
+        Ok(fs::read_to_string(&file).unwrap())
+    }
+
+    fn place(results: &str) -> Result<String, String> {
+        published(results, results)
     }
 
     #[test]
     fn only_what_lies_between_the_markers_is_replaced() {
         let results = "# Results\n<!-- experiment: lagging -->\nx\n<!-- end -->\n<!-- experiment: lag -->\nold\n<!-- end -->\nafter\n<!-- end -->\n";
-        let (before, after) = place(results).unwrap();
-        assert_eq!(before, "# Results\n<!-- experiment: lagging -->\nx\n<!-- end -->\n");
-        assert_eq!(after, "\nafter\n<!-- end -->\n");
+        assert_eq!(place(results).unwrap(), results.replace("old", "new"));
         assert_eq!(
             place("# Results\n\n").unwrap(),
-            ("# Results\n\n## Experiment: lag\n\n".to_owned(), "\n".to_owned())
+            "# Results\n\n## Experiment: lag\n\n<!-- experiment: lag -->\nnew\n<!-- end -->\n"
         );
+    }
+
+    #[test]
+    fn what_was_written_while_runs_were_under_way_stays() {
+        let results = |words| format!("{words}\n<!-- experiment: lag -->\nold\n<!-- end -->\n");
+        let published = published(&results("before"), &results("since"));
+        assert_eq!(published.unwrap(), results("since").replace("old", "new"));
+    }
+
+    #[test]
+    fn two_do_not_publish_at_a_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let first = claim(folder.path()).unwrap();
+        let second = claim(folder.path()).unwrap_err().to_string();
+        assert!(second.contains("--report --publish"), "{second}");
+        drop(first);
+        claim(folder.path()).unwrap();
     }
 
     #[test]
