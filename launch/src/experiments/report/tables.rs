@@ -233,7 +233,16 @@ impl Findings<'_> {
             row.push(mean(&|run| run.summary.wall_secs).map_or(NOTHING.to_owned(), |secs| Clock(secs).to_string()));
             rows.push(row);
         }
-        let header = ["arm", "seeds", "flights", "steps", "updates", "VAE steps", "evaluation flights", "wall time"];
+        let header = [
+            "arm",
+            "seeds",
+            "flights",
+            "steps",
+            "updates",
+            "VAE steps",
+            "evaluation flights",
+            "wall time",
+        ];
         Titled {
             title: "What a run took, side by side with others".to_owned(),
             table: grid(header.map(str::to_owned).to_vec(), rows, 1),
