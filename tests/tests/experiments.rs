@@ -186,6 +186,12 @@ fn assert_published(scene: &Scene, report: &str) {
     assert!(results.contains(picture) && scene.path(picture).is_file());
     let published = results.replace("launch/pictures/experiments/tiny_", "");
     assert!(published.contains(report.trim_end()), "{published}\n---\n{report}");
+    // Not while another is being published.
+    let pictures = fs::File::open(scene.path("launch/pictures/experiments")).unwrap();
+    pictures.lock().unwrap();
+    let output = scene.finish(&["--report", "--publish"]);
+    output.assert_refused(&["another experiment is being published"]);
+    drop(pictures);
     // A part of it is no result to replace that by.
     for part in [["--seeds", "1"], ["--flights", "20"]] {
         let output = scene.finish(&[&part[..], &["--report", "--publish"]].concat());

@@ -7,10 +7,12 @@ use skein_protocol::config::Config;
 use skein_simulator::suite::MOST_FLIGHTS;
 
 use super::file::{ArmFile, File, as_overrides};
-use super::{Arm, DefinitionError, Experiment, FOR_ALL, FlownSuite, MOST_ARMS, TableKind};
+use super::{Arm, DefinitionError, Experiment, FlownSuite, MOST_ARMS, TableKind};
 use crate::experiments::plan::{ACTORS, REPORT};
 use crate::prepare::{self, PrepareError};
 
+/// What is set in every run, because it gets one core. Sums of several threads round otherwise on libtorch; the native engine's do not.
+const FOR_ALL: &str = "run.learner_threads=1";
 /// Keys that no file may set, and why.
 const OURS: [(&str, &str); 2] = [
     (
@@ -38,13 +40,13 @@ pub(super) fn resolve(
             .and_then(refuse_ours)
             .map_err(|problem| settings_error(path, whose, problem))
     };
-    let settings = settings_of("[settings]", &file.settings)?;
+    let settings = [vec![FOR_ALL.to_owned()], settings_of("[settings]", &file.settings)?].concat();
     let base_config = Config::load(&base, &[])
         .map_err(|error| settings_error(path, "base", PrepareError::from(error).to_string()))?;
     let mut arms = Vec::with_capacity(file.arms.len());
     for arm in &file.arms {
         let own = settings_of(&format!("arm {}", arm.name), &arm.settings)?;
-        let overrides = [&[FOR_ALL.to_owned()], &settings[..], &own].concat();
+        let overrides = [&settings[..], &own].concat();
         arms.push(arm_of(arm, own, overrides, &base, flights, path)?);
     }
     check_comparable(&arms, path)?;
@@ -106,14 +108,14 @@ fn arm_of(
 fn suite_of(file: &File, folder: &Path, arms: &[Arm], path: &Path) -> Result<Option<FlownSuite>, DefinitionError> {
     let is_told = file.tables.contains(&TableKind::Suite);
     let nothing = match (file.suite_flights, &file.suite) {
-        (Some(flights), _) if !(1..=MOST_FLIGHTS).contains(&flights) => {
-            Some("is outside 1..=1000000: leave it out for as many as the suite says")
-        }
-        (Some(_), None) => Some("are of a suite, and none is named: add suite = \"FILE\", or leave it out"),
+        (Some(flights), _) if !(1..=MOST_FLIGHTS).contains(&flights) => Some(format!(
+            "is outside 1..={MOST_FLIGHTS}: leave it out for as many as the suite says"
+        )),
+        (Some(_), None) => Some("are of a suite, and none is named: add suite = \"FILE\", or leave it out".to_owned()),
         _ => None,
     };
     if let (Some(flights), Some(problem)) = (file.suite_flights, nothing) {
-        return Err(value_error(path, "suite_flights", flights, problem.to_owned()));
+        return Err(value_error(path, "suite_flights", flights, problem));
     }
     let Some(named) = &file.suite else {
         let problem = "has the results of a suite, and none is named: add suite = \"FILE\", or take it out";
@@ -201,18 +203,11 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
 /// Whether all arms are measured alike.
 fn check_comparable(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
     let measured = |arm: &Arm| (arm.config.evaluation.clone(), arm.config.courses.evaluation.clone());
-    let Some(first) = arms.first() else { return Ok(()) };
-    match arms.iter().find(|arm| measured(arm) != measured(first)) {
-        None => Ok(()),
-        Some(other) => Err(settings_error(
-            path,
-            &format!("arm {}", other.name),
-            format!(
-                "[evaluation] and courses.evaluation cannot differ from those of arm {}, or the two could not be compared: set them in [settings]",
-                first.name
-            ),
-        )),
-    }
+    refuse_other(arms, path, measured, |first| {
+        format!(
+            "[evaluation] and courses.evaluation cannot differ from those of arm {first}, or the two could not be compared: set them in [settings]"
+        )
+    })
 }
 
 /// Whether what is told of the arms' own flights, training's and evaluation's, is of flights of one kind. A suite flies all arms alike, whatever they were trained on.
@@ -221,21 +216,33 @@ fn check_same_flights(file: &File, arms: &[Arm], path: &Path) -> Result<(), Defi
     if file.curves.is_empty() && !file.tables.iter().any(of_own_flights) {
         return Ok(());
     }
-    let Some(first) = arms.first() else { return Ok(()) };
     for key in ["generator", "disturbances"] {
-        let of = |arm: &Arm| arm.config.simulator.get(key).cloned();
-        if let Some(other) = arms.iter().find(|arm| of(arm) != of(first)) {
-            return Err(settings_error(
-                path,
-                &format!("arm {}", other.name),
-                format!(
-                    "simulator.{key} cannot differ from that of arm {}, or the two would be measured on different flights: put them to a suite, and write tables = [\"suite\", \"cost\"] and curves = []",
-                    first.name
-                ),
-            ));
-        }
+        let flown = |arm: &Arm| arm.config.simulator.get(key).cloned();
+        refuse_other(arms, path, flown, |first| {
+            format!(
+                "simulator.{key} cannot differ from that of arm {first}, or the two would be measured on different flights: put them to a suite, and write tables = [\"suite\", \"cost\"] and curves = []"
+            )
+        })?;
     }
     Ok(())
+}
+
+/// Refuses the first arm that has not what the first of all has; `problem` is told that one's name.
+fn refuse_other<T: PartialEq>(
+    arms: &[Arm],
+    path: &Path,
+    of: impl Fn(&Arm) -> T,
+    problem: impl Fn(&str) -> String,
+) -> Result<(), DefinitionError> {
+    let Some(first) = arms.first() else { return Ok(()) };
+    match arms.iter().find(|arm| of(arm) != of(first)) {
+        None => Ok(()),
+        Some(other) => Err(settings_error(
+            path,
+            &format!("arm {}", other.name),
+            problem(&first.name),
+        )),
+    }
 }
 
 fn settings_error(path: &Path, whose: &str, problem: String) -> DefinitionError {

@@ -16,9 +16,6 @@ use crate::prepare::PrepareError;
 pub use file::names;
 pub use suite::FlownSuite;
 
-/// What is set in every run, because it gets one core. Sums of several threads round otherwise on libtorch; the native engine's do not.
-pub const FOR_ALL: &str = "run.learner_threads=1";
-
 /// More arms than this could not be told apart in one picture.
 pub const MOST_ARMS: usize = 8;
 
@@ -35,7 +32,7 @@ pub struct Experiment {
     pub base: PathBuf,
     /// Training flights that the base configuration flies.
     pub base_flights: u64,
-    /// In what all arms differ from the base, beside [`FOR_ALL`]: `section.key=value`.
+    /// In what all arms differ from the base, the one thread of each run among it: `section.key=value`.
     pub settings: Vec<String>,
     /// Runs of each arm, with seeds from 1.
     pub seeds: u64,

@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use super::{Findings, Picture};
 use crate::display::Clock;
-use crate::experiments::definition::{Experiment, FOR_ALL, TableKind};
+use crate::experiments::definition::{Experiment, TableKind};
 use crate::experiments::results::RunResult;
 
 impl Findings<'_> {
@@ -39,8 +39,7 @@ impl Findings<'_> {
             arms,
             ..
         } = self.experiment;
-        let of_all = [&[FOR_ALL.to_owned()], &settings[..]].concat();
-        let mut text = format!("Trained with `configs/{base_name}` and {}", code(&of_all));
+        let mut text = format!("Trained with `configs/{base_name}` and {}", code(settings));
         if let [arm] = &arms[..]
             && arm.settings.is_empty()
         {

@@ -1,11 +1,11 @@
 //! Putting a report where readers find it: RESULTS.md, and the pictures of the documents.
 
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
 use super::{Findings, Picture, Written};
-use crate::experiments::plan::REPORT;
+use crate::experiments::plan::{self, REPORT};
 
 /// What begins the part of RESULTS.md that belongs to an experiment, before its name.
 const BEGIN: &str = "<!-- experiment: ";
@@ -104,7 +104,6 @@ impl Publication {
     pub fn publish(&self, findings: &Findings<'_>, report: &Written) -> Result<Vec<PathBuf>, PublicationError> {
         let repository = self.results.parent().unwrap_or(Path::new(""));
         let folder = repository.join(PICTURES);
-        fs::create_dir_all(&folder).map_err(at(&folder))?;
         let _claim = claim(&folder)?;
         let mut written = Vec::new();
         let mut pictures = Vec::new();
@@ -134,15 +133,10 @@ impl Publication {
     }
 }
 
-/// Claims the documents for this process until what it gives is dropped.
+/// Claims the documents, by the folder of their pictures, until what it gives is dropped.
 fn claim(folder: &Path) -> Result<File, PublicationError> {
-    let folder = folder.to_owned();
-    let handle = File::open(&folder).map_err(at(&folder))?;
-    match handle.try_lock() {
-        Ok(()) => Ok(handle),
-        Err(TryLockError::WouldBlock) => Err(PublicationError::Busy(folder)),
-        Err(TryLockError::Error(error)) => Err(at(&folder)(error)),
-    }
+    let claimed = plan::claim(folder).map_err(at(folder))?;
+    claimed.ok_or_else(|| PublicationError::Busy(folder.to_owned()))
 }
 
 fn at(path: &Path) -> impl FnOnce(io::Error) -> PublicationError {
