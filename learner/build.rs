@@ -1,4 +1,7 @@
-//! Tells the linker where libtorch lies at run time, so that binaries and tests start without `LD_LIBRARY_PATH`.
+//! Tells the linker where libtorch lies at run time, so that binaries and tests start without `LD_LIBRARY_PATH`, and the learner of which sources it is made.
+
+use std::path::Path;
+use std::process::Command;
 
 fn main() {
     println!("cargo:rerun-if-changed=build.rs");
@@ -7,4 +10,34 @@ fn main() {
     if let Ok(libtorch) = std::env::var("DEP_TCH_LIBTORCH_LIB") {
         println!("cargo:rustc-link-arg=-Wl,-rpath,{libtorch}");
     }
+    let version = env!("CARGO_PKG_VERSION");
+    match commit() {
+        Some(commit) => println!("cargo:rustc-env=SKEIN_VERSION={version}+{commit}"),
+        None => println!("cargo:rustc-env=SKEIN_VERSION={version}"),
+    }
+}
+
+/// The commit, with `-dirty` behind it where the sources are others; `None` outside a clone.
+fn commit() -> Option<String> {
+    let package = std::env::var_os("CARGO_MANIFEST_DIR")?;
+    let root = Path::new(&package).parent()?;
+    // Sources that were copied into another repository are not of its commits.
+    if Path::new(&git(root, &["rev-parse", "--show-toplevel"])?) != root.canonicalize().ok()? {
+        return None;
+    }
+    // What learning depends on, and where a change of commit shows. A path that does not exist would make cargo ask at every build.
+    let moves = git(root, &["rev-parse", "--git-path", "logs/HEAD"])?;
+    for path in ["Cargo.lock", "learner", "protocol", "actor", &moves] {
+        let path = root.join(path);
+        if path.exists() {
+            println!("cargo:rerun-if-changed={}", path.display());
+        }
+    }
+    git(root, &["describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"])
+}
+
+fn git(root: &Path, arguments: &[&str]) -> Option<String> {
+    let output = Command::new("git").arg("-C").arg(root).args(arguments).output().ok()?;
+    let text = String::from_utf8(output.stdout).ok()?;
+    output.status.success().then(|| text.trim().to_owned())
 }

@@ -361,7 +361,7 @@ fn first_line(config: &Config, saved: &Progress) -> progress::Progress {
 fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &Progress, resumes: u64) -> Summary {
     let best = progress.best.as_ref();
     Summary {
-        skein_version: env!("CARGO_PKG_VERSION").to_owned(),
+        skein_version: env!("SKEIN_VERSION").to_owned(),
         run: identity.run,
         seed: config.run.seed,
         ending,

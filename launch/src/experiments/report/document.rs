@@ -1,5 +1,6 @@
 //! The text of a report: everything a reader needs to judge a figure, and to have it again.
 
+use std::collections::BTreeSet;
 use std::fmt::Write;
 
 use super::{Findings, Picture};
@@ -19,6 +20,9 @@ impl Findings<'_> {
             push(&mut text, &note);
         }
         push(&mut text, &self.rests_on());
+        if let Some(note) = self.of_several_builds() {
+            push(&mut text, &note);
+        }
         for &kind in &self.experiment.tables {
             for titled in self.tables(kind) {
                 push(&mut text, &format!("*{}.*", titled.title));
@@ -80,7 +84,7 @@ impl Findings<'_> {
             seeds => format!("{seeds} seeds"),
         };
         format!(
-            "{seeds} an arm; a run: {} flights, {} steps, {} updates, {} of wall time.",
+            "{seeds} an arm; a run: {} flights, {} steps, {} updates, {} of wall time. Skein {}.",
             range(
                 self.results,
                 |run| run.summary.flights as f64,
@@ -101,7 +105,24 @@ impl Findings<'_> {
                 |run| run.summary.wall_secs,
                 |secs| Clock(secs).to_string()
             ),
+            self.builds().join(", ")
         )
+    }
+
+    fn of_several_builds(&self) -> Option<String> {
+        (self.builds().len() > 1).then(|| {
+            "**Of several builds**: what differs between runs may be what changed between them. Runs that are moved away are done again, with one build.".to_owned()
+        })
+    }
+
+    /// Versions that the runs were trained with, each once.
+    fn builds(&self) -> Vec<&str> {
+        let versions: BTreeSet<_> = self
+            .results
+            .iter()
+            .map(|run| run.summary.skein_version.as_str())
+            .collect();
+        versions.into_iter().collect()
     }
 
     fn how_to_read(&self, pictures: &[Picture]) -> String {

@@ -48,24 +48,30 @@ fn leave(run: &PlannedRun, suite: &[CourseEvaluation]) {
     fs::write(run.directory.flights_csv(), "steps,walls_passed,return\n4,2,1.0\n").unwrap();
 }
 
-#[test]
-fn a_suite_is_told_entry_by_entry_over_the_seeds() {
-    let folder = tempfile::tempdir().unwrap();
+/// An experiment in `folder` of one arm and two seeds, and its runs, which are complete: the first completed half of its calm flights, the second all.
+fn two_runs(folder: &Path) -> (Experiment, Plan) {
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
     let (base, course) = (configs.join("smoke.toml"), configs.join("courses/training.toml"));
     let entry = |name: &str| format!("[[entry]]\nname = \"{name}\"\ncourse = {course:?}\n");
     let suite = format!("name = \"few\"\nflights = 4\n{}{}", entry("calm"), entry("windy"));
-    fs::write(folder.path().join("few.toml"), suite).unwrap();
+    fs::write(folder.join("few.toml"), suite).unwrap();
     let experiment = format!(
         "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\ncurves = []\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
     );
-    fs::write(folder.path().join("test.toml"), experiment).unwrap();
-    let experiment = Experiment::load(folder.path(), "test", None).unwrap();
-    let mut plan = Plan::new(&experiment, &folder.path().join("runs"), 2).unwrap();
+    fs::write(folder.join("test.toml"), experiment).unwrap();
+    let experiment = Experiment::load(folder, "test", None).unwrap();
+    let mut plan = Plan::new(&experiment, &folder.join("runs"), 2).unwrap();
     for (run, calm) in plan.runs.iter_mut().zip([2, 4]) {
         leave(run, &[flown("calm", calm), flown("windy", 1)]);
         run.state = State::Complete;
     }
+    (experiment, plan)
+}
+
+#[test]
+fn a_suite_is_told_entry_by_entry_over_the_seeds() {
+    let folder = tempfile::tempdir().unwrap();
+    let (experiment, mut plan) = two_runs(folder.path());
     let told = |plan: &Plan| {
         let findings = Findings {
             experiment: &experiment,
@@ -95,4 +101,26 @@ fn a_suite_is_told_entry_by_entry_over_the_seeds() {
         error.contains(&result.display().to_string()) && error.contains("move this file away"),
         "{error}"
     );
+}
+
+#[test]
+fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let (experiment, plan) = two_runs(folder.path());
+    let told = || {
+        let findings = Findings {
+            experiment: &experiment,
+            plan: &plan,
+            results: &results::read(&plan).unwrap(),
+            command: String::new(),
+        };
+        findings.document(&[], "")
+    };
+    let (one, several) = (told(), "**Of several builds**");
+    assert!(one.contains("Skein 0.\n") && !one.contains(several), "{one}");
+
+    let newer = SUMMARY.replace(r#""skein_version":"0""#, r#""skein_version":"0+b873565""#);
+    fs::write(plan.runs[1].directory.summary_json(), newer).unwrap();
+    let two = told();
+    assert!(two.contains("Skein 0, 0+b873565.\n") && two.contains(several), "{two}");
 }
