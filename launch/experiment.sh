@@ -22,8 +22,8 @@ Options:
   --flights N  shorten every run to N training flights, in a place of their own: runs/experiments/NAME_N_flights
   --runs DIR   where the runs of all experiments go [default: runs/experiments]
   --report     run nothing: tell again what is there
-  --publish    put the report into RESULTS.md, between <!-- experiment: NAME --> and <!-- end -->, and its pictures into
-               launch/pictures/experiments/
+  --publish    put the report into RESULTS.md, between <!-- experiment: NAME --> and <!-- end -->, and its pictures and the
+               figures of each run into launch/pictures/experiments/
   -h, --help   this text
 
 Ctrl-C stops in order: every training under way finishes the updates of its epoch and saves; a suite under way is flown anew

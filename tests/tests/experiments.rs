@@ -184,6 +184,12 @@ fn assert_published(scene: &Scene, report: &str) {
     assert_eq!(results.matches("<!-- end -->").count(), 1);
     let picture = "launch/pictures/experiments/tiny_walls_passed_over_flights.png";
     assert!(results.contains(picture) && scene.path(picture).is_file());
+    let lines = fs::read_to_string(scene.path("launch/pictures/experiments/tiny_runs.csv")).unwrap();
+    for (arm, seed) in [("one-part", 1), ("half", 1), ("one-part", 2), ("half", 2)] {
+        let learned = Summary::of(&scene.run(arm, seed)).unwrap().policy_sha256;
+        let line = lines.lines().find(|line| line.starts_with(&format!("{arm},{seed},")));
+        assert!(line.is_some_and(|line| line.contains(&learned)), "{lines}");
+    }
     let published = results.replace("launch/pictures/experiments/tiny_", "");
     assert!(published.contains(report.trim_end()), "{published}\n---\n{report}");
     // Not while another is being published.

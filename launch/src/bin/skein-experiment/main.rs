@@ -43,7 +43,7 @@ struct Cli {
     /// Run nothing: tell again what is there.
     #[arg(long)]
     report: bool,
-    /// Put the report into RESULTS.md, and its pictures into launch/pictures/experiments/.
+    /// Put the report into RESULTS.md, and its pictures and the figures of each run into launch/pictures/experiments/.
     #[arg(long)]
     publish: bool,
 }

@@ -9,8 +9,8 @@ use crate::experiments::definition::{Experiment, TableKind};
 use crate::experiments::results::RunResult;
 
 impl Findings<'_> {
-    /// The report as Markdown; its pictures lie where `prefix` and a file's name say.
-    pub(super) fn document(&self, pictures: &[Picture], prefix: &str) -> String {
+    /// The report as Markdown; its pictures and `runs`, the figures of each run, lie where `prefix` and a file's name say.
+    pub(super) fn document(&self, pictures: &[Picture], prefix: &str, runs: &str) -> String {
         let mut text = format!("**{}**\n\n```sh\n{}\n```\n\n", self.experiment.question, self.command);
         push(&mut text, &self.what_was_run());
         if let Some(note) = self.shortened() {
@@ -32,6 +32,10 @@ impl Findings<'_> {
         for picture in pictures {
             push(&mut text, &format!("![{}]({prefix}{})", picture.caption, picture.file));
         }
+        push(
+            &mut text,
+            &format!("Every run's own figures, and the SHA-256 of what it learned: [one line a run]({prefix}{runs})."),
+        );
         push(&mut text, &self.how_to_read(pictures));
         text
     }

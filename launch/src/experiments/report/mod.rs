@@ -4,6 +4,7 @@ mod curves;
 mod document;
 mod outcomes;
 mod publication;
+mod runs;
 mod tables;
 #[cfg(test)]
 mod tests;
@@ -17,6 +18,7 @@ use super::results::{ResultError, RunResult};
 use super::statistics::Bootstrap;
 use crate::prepare::PrepareError;
 use crate::reports::ReportError;
+use runs::RUNS;
 
 pub use publication::{Publication, PublicationError};
 
@@ -71,7 +73,7 @@ pub struct Picture {
 /// A report that was written.
 #[derive(Debug)]
 pub struct Written {
-    /// The document, whose pictures lie beside it.
+    /// The document, beside which lie its pictures and the figures of each run.
     pub document: PathBuf,
     /// Its text.
     pub text: String,
@@ -95,7 +97,9 @@ impl Findings<'_> {
         };
         fs::create_dir_all(&folder).map_err(write(&folder))?;
         let pictures = self.draw(&folder)?;
-        let text = self.document(&pictures, "");
+        let runs = folder.join(RUNS);
+        self.write_runs(&runs).map_err(write(&runs))?;
+        let text = self.document(&pictures, "", RUNS);
         let document = folder.join("report.md");
         fs::write(&document, &text).map_err(write(&document))?;
         Ok(Written {

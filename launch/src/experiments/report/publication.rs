@@ -4,6 +4,7 @@ use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
+use super::runs::RUNS;
 use super::{Findings, Picture, Written};
 use crate::experiments::plan::{self, REPORT};
 
@@ -11,7 +12,7 @@ use crate::experiments::plan::{self, REPORT};
 const BEGIN: &str = "<!-- experiment: ";
 /// What ends the part of RESULTS.md that belongs to an experiment.
 const END: &str = "<!-- end -->";
-/// Where the pictures lie, relative to RESULTS.md.
+/// Where the pictures and the figures of each run lie, relative to RESULTS.md.
 const PICTURES: &str = "launch/pictures/experiments";
 
 /// RESULTS.md, with a place for an experiment.
@@ -97,7 +98,7 @@ impl Publication {
         format!("{BEGIN}{} -->", self.name)
     }
 
-    /// Puts the report there, and its pictures beside the documents' others. Returns what was written.
+    /// Puts the report there, and its pictures and the figures of each run beside the documents' others. Returns what was written.
     ///
     /// # Errors
     /// [`PublicationError`] names the file; nothing was written where another experiment is just being published.
@@ -106,18 +107,23 @@ impl Publication {
         let folder = repository.join(PICTURES);
         let _claim = claim(&folder)?;
         let mut written = Vec::new();
-        let mut pictures = Vec::new();
-        for picture in &report.pictures {
-            let file = format!("{}_{}", findings.experiment.name, picture.file);
-            let (from, to) = (findings.plan.root.join(REPORT).join(&picture.file), folder.join(&file));
+        let mut put = |file: &str| {
+            let published = format!("{}_{file}", findings.experiment.name);
+            let (from, to) = (findings.plan.root.join(REPORT).join(file), folder.join(&published));
             fs::copy(&from, &to).map_err(at(&to))?;
             written.push(to);
+            Ok(published)
+        };
+        let runs = put(RUNS)?;
+        let mut pictures = Vec::new();
+        for Picture { file, caption } in &report.pictures {
+            let caption = caption.clone();
             pictures.push(Picture {
-                file,
-                caption: picture.caption.clone(),
+                file: put(file)?,
+                caption,
             });
         }
-        self.write(&findings.document(&pictures, &format!("{PICTURES}/")))?;
+        self.write(&findings.document(&pictures, &format!("{PICTURES}/"), &runs))?;
         written.push(self.results.clone());
         Ok(written)
     }

@@ -114,7 +114,7 @@ fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
             results: &results::read(&plan).unwrap(),
             command: String::new(),
         };
-        findings.document(&[], "")
+        findings.document(&[], "", "runs.csv")
     };
     let (one, several) = (told(), "**Of several builds**");
     assert!(one.contains("Skein 0.\n") && !one.contains(several), "{one}");
@@ -123,4 +123,32 @@ fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
     fs::write(plan.runs[1].directory.summary_json(), newer).unwrap();
     let two = told();
     assert!(two.contains("Skein 0, 0+b873565.\n") && two.contains(several), "{two}");
+}
+
+#[test]
+fn every_run_has_a_line_of_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let (experiment, plan) = two_runs(folder.path());
+    let learned = SUMMARY.replace(r#""policy_sha256":"""#, r#""policy_sha256":"ab""#);
+    fs::write(plan.runs[1].directory.summary_json(), learned).unwrap();
+    let findings = Findings {
+        experiment: &experiment,
+        plan: &plan,
+        results: &results::read(&plan).unwrap(),
+        command: String::new(),
+    };
+    let file = folder.path().join("runs.csv");
+    findings.write_runs(&file).unwrap();
+    let mut reader = csv::Reader::from_path(file).unwrap();
+    let header = reader.headers().unwrap().clone();
+    let rows: Vec<_> = reader.records().map(Result::unwrap).collect();
+    let column = |name: &str| {
+        let place = header.iter().position(|column| column == name).unwrap();
+        rows.iter().map(|row| row[place].to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(column("seed"), ["1", "2"]);
+    assert_eq!(column("policy_sha256"), ["", "ab"]);
+    assert_eq!(column("completed calm"), ["0.5000", "1.0000"]);
+    assert_eq!(column("R windy"), ["0.2500", "0.2500"]);
+    assert_eq!(column("trained_flights"), ["", ""], "never");
 }
