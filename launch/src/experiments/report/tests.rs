@@ -68,17 +68,22 @@ fn two_runs(folder: &Path) -> (Experiment, Plan) {
     (experiment, plan)
 }
 
+fn findings<'a>(experiment: &'a Experiment, plan: &'a Plan, results: &'a [RunResult]) -> Findings<'a> {
+    Findings {
+        experiment,
+        plan,
+        results,
+        command: String::new(),
+    }
+}
+
 #[test]
 fn a_suite_is_told_entry_by_entry_over_the_seeds() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, mut plan) = two_runs(folder.path());
     let told = |plan: &Plan| {
-        let findings = Findings {
-            experiment: &experiment,
-            plan,
-            results: &results::read(plan).unwrap(),
-            command: String::new(),
-        };
+        let runs = results::read(plan).unwrap();
+        let findings = findings(&experiment, plan, &runs);
         let tables = findings.tables(TableKind::Suite);
         assert!(tables[0].title.contains("`few.toml`"), "{}", tables[0].title);
         tables[0].table.clone()
@@ -108,13 +113,8 @@ fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, plan) = two_runs(folder.path());
     let told = || {
-        let findings = Findings {
-            experiment: &experiment,
-            plan: &plan,
-            results: &results::read(&plan).unwrap(),
-            command: String::new(),
-        };
-        findings.document(&[], "", "runs.csv")
+        let runs = results::read(&plan).unwrap();
+        findings(&experiment, &plan, &runs).document(&[], "", "runs.csv")
     };
     let (one, several) = (told(), "**Of several builds**");
     assert!(one.contains("Skein 0.\n") && !one.contains(several), "{one}");
@@ -131,14 +131,9 @@ fn every_run_has_a_line_of_its_own() {
     let (experiment, plan) = two_runs(folder.path());
     let learned = SUMMARY.replace(r#""policy_sha256":"""#, r#""policy_sha256":"ab""#);
     fs::write(plan.runs[1].directory.summary_json(), learned).unwrap();
-    let findings = Findings {
-        experiment: &experiment,
-        plan: &plan,
-        results: &results::read(&plan).unwrap(),
-        command: String::new(),
-    };
+    let runs = results::read(&plan).unwrap();
     let file = folder.path().join("runs.csv");
-    findings.write_runs(&file).unwrap();
+    findings(&experiment, &plan, &runs).write_runs(&file).unwrap();
     let mut reader = csv::Reader::from_path(file).unwrap();
     let header = reader.headers().unwrap().clone();
     let rows: Vec<_> = reader.records().map(Result::unwrap).collect();
