@@ -270,7 +270,7 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     let mut experiment = scene.start();
     until("a suite is flown", || {
         let said = fs::read_to_string(runs[0].root().with_extension("log")).unwrap();
-        said.contains("1000000 flights on each of 2 courses").then_some(())
+        said.contains("1000000 flights on each of 2 entries").then_some(())
     });
     kill_process(Pid::from_raw(experiment.id().cast_signed()).unwrap(), Signal::INT).unwrap();
     let status = until("the experiment stops", || experiment.try_wait().unwrap());

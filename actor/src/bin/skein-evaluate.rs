@@ -104,7 +104,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "snapshot {} of {}: {}, {} threads",
         snapshot.version,
         path.display(),
-        what_is_flown(&courses),
+        what_is_flown(&courses, arguments.suite.as_ref().map_or("courses", |_| "entries")),
         evaluation.threads()
     );
     eprintln!(
@@ -202,14 +202,14 @@ fn courses(arguments: &Arguments, config: &Config, snapshot: &Path) -> anyhow::R
     })
 }
 
-/// How many flights of what, in words.
-fn what_is_flown(courses: &Courses) -> String {
+/// How many flights of what, in words; `entries` is what there is a number of flights for.
+fn what_is_flown(courses: &Courses, entries: &str) -> String {
     let flights: Vec<u64> = courses.evaluation().map(|entry| entry.flights).collect();
     match flights.as_slice() {
         [first, others @ ..] if others.iter().all(|flights| flights == first) => {
-            format!("{first} flights on each of {} courses", flights.len())
+            format!("{first} flights on each of {} {entries}", flights.len())
         }
-        _ => format!("{} flights in {} entries", flights.iter().sum::<u64>(), flights.len()),
+        _ => format!("{} flights in {} {entries}", flights.iter().sum::<u64>(), flights.len()),
     }
 }
 
