@@ -26,15 +26,12 @@ impl Findings<'_> {
             title: "How the evaluation flights went, all seeds together".to_owned(),
             table: self.outcomes_of(&self.courses(), course_of),
         };
-        let suite = self.experiment.suite.as_ref().map(|flown| {
-            let entries: Vec<_> = flown.suite.entries.iter().map(|entry| entry.name.clone()).collect();
-            Titled {
-                title: format!(
-                    "How the flights of the suite `{}` went, all seeds together",
-                    flown.file_name()
-                ),
-                table: self.outcomes_of(&entries, entry_of),
-            }
+        let suite = self.experiment.suite.as_ref().map(|flown| Titled {
+            title: format!(
+                "How the flights of the suite `{}` went, all seeds together",
+                flown.file_name()
+            ),
+            table: self.outcomes_of(&self.entries(), entry_of),
         });
         [courses].into_iter().chain(suite).collect()
     }

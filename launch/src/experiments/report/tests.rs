@@ -129,6 +129,9 @@ fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
 fn every_run_has_a_line_of_its_own() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, plan) = two_runs(folder.path());
+    let mut calm = flown("calm", 2);
+    calm.r = 0.75;
+    leave(&plan.runs[0], &[calm, flown("windy", 1)]);
     let learned = SUMMARY.replace(r#""policy_sha256":"""#, r#""policy_sha256":"ab""#);
     fs::write(plan.runs[1].directory.summary_json(), learned).unwrap();
     let runs = results::read(&plan).unwrap();
@@ -144,6 +147,7 @@ fn every_run_has_a_line_of_its_own() {
     assert_eq!(column("seed"), ["1", "2"]);
     assert_eq!(column("policy_sha256"), ["", "ab"]);
     assert_eq!(column("completed calm"), ["0.5000", "1.0000"]);
+    assert_eq!(column("R calm"), ["0.7500", "1.0000"]);
     assert_eq!(column("R windy"), ["0.2500", "0.2500"]);
     assert_eq!(column("trained_flights"), ["", ""], "never");
 }
