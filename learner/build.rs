@@ -17,7 +17,10 @@ fn main() {
     }
 }
 
-/// The commit, with `-dirty` behind it where the sources are others; `None` outside a clone.
+/// What learning depends on: the packages that fly and learn, and what they are built with.
+const SOURCES: [&str; 5] = ["Cargo.toml", "Cargo.lock", "learner", "protocol", "actor"];
+
+/// The last commit that changed one of the [`SOURCES`], with `-dirty` behind it where they are others now; `None` outside a clone.
 fn commit() -> Option<String> {
     let package = std::env::var_os("CARGO_MANIFEST_DIR")?;
     let root = Path::new(&package).parent()?;
@@ -25,15 +28,18 @@ fn commit() -> Option<String> {
     if Path::new(&git(root, &["rev-parse", "--show-toplevel"])?) != root.canonicalize().ok()? {
         return None;
     }
-    // What learning depends on, and where a change of commit shows. A path that does not exist would make cargo ask at every build.
+    // A change of commit shows in the last of them. A path that does not exist would make cargo ask at every build.
     let moves = git(root, &["rev-parse", "--git-path", "logs/HEAD"])?;
-    for path in ["Cargo.lock", "learner", "protocol", "actor", &moves] {
+    for path in SOURCES.into_iter().chain([moves.as_str()]) {
         let path = root.join(path);
         if path.exists() {
             println!("cargo:rerun-if-changed={}", path.display());
         }
     }
-    git(root, &["describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"])
+    let of_sources = |command: &[&str]| git(root, &[command, &["--"], &SOURCES].concat());
+    let commit = of_sources(&["log", "-1", "--format=%h", "--abbrev=12"])?;
+    let is_clean = of_sources(&["status", "--porcelain"])?.is_empty();
+    Some(if is_clean { commit } else { format!("{commit}-dirty") })
 }
 
 fn git(root: &Path, arguments: &[&str]) -> Option<String> {

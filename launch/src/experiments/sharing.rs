@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use skein_protocol::run::RunDirectory;
 
 use super::plan::{Plan, PlanError, PlannedRun, State, io_at};
+use super::results::RunResult;
 
 impl Plan {
     /// Makes every run of which there is nothing a link to the same one in another experiment beside this one, where that is trained to its end. Returns the names of those
@@ -60,7 +61,8 @@ impl PlannedRun {
             suite_json: None,
             ..self.clone()
         };
-        (other.look() == Ok(State::Complete)).then_some(directory)
+        // What cannot be reported is of no use here: it is trained anew.
+        (other.look() == Ok(State::Complete) && RunResult::trained(&other).is_ok()).then_some(directory)
     }
 
     /// Relative, so that all experiments can be moved together.
@@ -107,6 +109,9 @@ mod tests {
             "best_confirmed_walls_passed":4.9,"flights":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_flights":4,
             "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
         fs::write(run.directory.summary_json(), summary).unwrap();
+        let evaluation = r#"{"policy_version":7,"policy_sha256":"","courses":[]}"#;
+        fs::write(run.directory.evaluation_json(), evaluation).unwrap();
+        fs::write(run.directory.flights_csv(), "steps,walls_passed,return\n4,2,1.0\n").unwrap();
     }
 
     fn taken_over(plan: &mut Plan) -> Vec<String> {
@@ -138,6 +143,14 @@ mod tests {
         );
         assert_eq!(Plan::new(&second, &root("second"), 2).unwrap(), plan, "it stays");
         assert!(taken_over(&mut plan).is_empty());
+
+        // What cannot be reported is not taken over.
+        let damaged = plan.runs[1].directory.evaluation_json();
+        let whole = fs::read(&damaged).unwrap();
+        fs::write(&damaged, "{").unwrap();
+        let other = experiment(folder.path(), "other", ["0.25", "0.75"]);
+        assert!(taken_over(&mut Plan::new(&other, &root("other"), 1).unwrap()).is_empty());
+        fs::write(&damaged, whole).unwrap();
 
         // A third leads to where the run is, not to the link.
         let third = experiment(folder.path(), "third", ["0.25", "0.75"]);

@@ -106,7 +106,7 @@ impl Comparison<'_> {
                 .legend(|point| legend_line(point, LEVEL));
         }
         for (line, colour) in self.lines.iter().zip(COLOURS) {
-            let points: Vec<_> = line.points.iter().map(|(x, estimate)| (*x, estimate.iqm)).collect();
+            let points: Vec<_> = line.points.iter().map(|(x, estimate)| (*x, estimate.value)).collect();
             chart
                 .draw_series(thick_line(&points, colour, px(2)))?
                 .label(line.label)
@@ -132,7 +132,7 @@ impl Comparison<'_> {
     fn ranges(&self) -> (std::ops::Range<f64>, std::ops::Range<f64>) {
         let mut values: Vec<f64> = self.level.iter().map(|level| level.0).collect();
         for (_, estimate) in self.lines.iter().flat_map(|line| &line.points) {
-            let (low, high) = estimate.interval.unwrap_or((estimate.iqm, estimate.iqm));
+            let (low, high) = estimate.interval.unwrap_or((estimate.value, estimate.value));
             values.extend([low, high]);
         }
         let (low, high) = padded_range(&values);

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::thread;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use clap::Parser;
 use skein_launch::experiments::board::Board;
 use skein_launch::experiments::definition::{Experiment, names};
@@ -76,11 +76,17 @@ fn main() -> ExitCode {
 fn list(folder: &Path) -> Result<()> {
     let names = names(folder)?;
     let width = names.iter().map(|name| name.chars().count()).max().unwrap_or(0);
+    let mut unusable = Vec::new();
     for name in &names {
-        let experiment = Experiment::load(folder, name, None)?;
-        let runs = format!("{} × {}", experiment.arms.len(), experiment.seeds);
-        println!("{name:width$}  {runs:>7} runs  {}", experiment.question);
+        match Experiment::load(folder, name, None) {
+            Ok(experiment) => {
+                let runs = format!("{} × {}", experiment.arms.len(), experiment.seeds);
+                println!("{name:width$}  {runs:>7} runs  {}", experiment.question);
+            }
+            Err(error) => unusable.push(with_causes(&error)),
+        }
     }
+    ensure!(unusable.is_empty(), "{}", unusable.join("\n"));
     Ok(())
 }
 
@@ -254,12 +260,10 @@ fn announce(experiment: &Experiment, plan: &Plan, jobs: usize) {
             plural(flown.flights() as usize, "flight")
         );
     }
-    if experiment.is_shortened() {
+    if let Some((whole, whose)) = experiment.shortened_from() {
         eprintln!(
-            "skein: shortened: {} training flights a run instead of the {} of {}",
-            experiment.flights(),
-            experiment.base_flights,
-            experiment.base_name
+            "skein: shortened: {} training flights a run instead of the {whole} of {whose}",
+            experiment.flights()
         );
     }
 }

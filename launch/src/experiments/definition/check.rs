@@ -58,6 +58,7 @@ pub(super) fn resolve(
         base_name: file.base.file_name().unwrap_or_default().to_string_lossy().into_owned(),
         base,
         base_flights: base_config.run.flights,
+        paper_flights: file.paper_flights,
         settings,
         seeds: file.seeds,
         suite,
@@ -164,6 +165,20 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
             "asks nothing: write what the experiment is to find out",
         );
     }
+    if file.question.contains('\n') || file.question.contains("<!--") {
+        return refuse(
+            "question",
+            &format!("{:?}", file.question),
+            "cannot head a report: write one line without <!--",
+        );
+    }
+    if file.paper_flights == Some(0) {
+        return refuse(
+            "paper_flights",
+            &0,
+            "are no run: write how many the paper's have, or leave it out",
+        );
+    }
     if !(1..=100).contains(&file.seeds) {
         return refuse("seeds", &file.seeds, "is outside 1..=100");
     }
@@ -183,11 +198,11 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
             );
             return refuse("arm.name", &arm.name, &problem);
         }
-        if arm.label.trim().is_empty() || arm.label.contains(['|', '\n']) {
+        if arm.label.trim().is_empty() || arm.label.contains(['|', '\n']) || arm.label.contains("<!--") {
             return refuse(
                 "arm.label",
                 &arm.label,
-                "cannot stand in a table: write one line without |",
+                "cannot stand in a table: write one line without | and <!--",
             );
         }
         if !names.insert(&arm.name) {
@@ -210,18 +225,32 @@ fn check_comparable(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
     })
 }
 
+/// Why arms that fly elsewhere cannot be compared by their own flights, and how they can.
+const ELSEWHERE: &str = ", or the two would be measured on different flights: put them to a suite, and write tables = [\"suite\", \"cost\"] and curves = []";
+
 /// Whether what is told of the arms' own flights, training's and evaluation's, is of flights of one kind. A suite flies all arms alike, whatever they were trained on.
 fn check_same_flights(file: &File, arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
     let of_own_flights = |kind: &TableKind| !matches!(kind, TableKind::Suite | TableKind::Cost);
     if file.curves.is_empty() && !file.tables.iter().any(of_own_flights) {
         return Ok(());
     }
+    let courses = |arm: &Arm| {
+        let courses = &arm.config.courses;
+        (
+            courses.training.clone(),
+            courses.generated_share,
+            arm.config.learning.levels,
+        )
+    };
+    refuse_other(arms, path, courses, |first| {
+        format!(
+            "courses.training, courses.generated_share and learning.levels cannot differ from those of arm {first}{ELSEWHERE}"
+        )
+    })?;
     for key in ["generator", "disturbances"] {
         let flown = |arm: &Arm| arm.config.simulator.get(key).cloned();
         refuse_other(arms, path, flown, |first| {
-            format!(
-                "simulator.{key} cannot differ from that of arm {first}, or the two would be measured on different flights: put them to a suite, and write tables = [\"suite\", \"cost\"] and curves = []"
-            )
+            format!("simulator.{key} cannot differ from that of arm {first}{ELSEWHERE}")
         })?;
     }
     Ok(())

@@ -21,6 +21,8 @@ pub(super) struct File {
     pub(super) suite: Option<PathBuf>,
     /// Flights of each entry of it, if they are not as many as it says.
     pub(super) suite_flights: Option<u64>,
+    /// Training flights of the paper's own runs, where the experiment stands for them.
+    pub(super) paper_flights: Option<u64>,
     /// In what all arms differ from the base.
     #[serde(default)]
     pub(super) settings: Table,

@@ -32,6 +32,8 @@ pub struct Experiment {
     pub base: PathBuf,
     /// Training flights that the base configuration flies.
     pub base_flights: u64,
+    /// Training flights of the paper's own runs, where the experiment stands for them.
+    pub paper_flights: Option<u64>,
     /// In what all arms differ from the base, the one thread of each run among it: `section.key=value`.
     pub settings: Vec<String>,
     /// Runs of each arm, with seeds from 1.
@@ -194,8 +196,17 @@ impl Experiment {
         self.arms.iter().map(|arm| arm.config.run.flights).max().unwrap_or(0)
     }
 
-    /// Whether an arm flies less than the configuration that it is based on.
-    pub fn is_shortened(&self) -> bool {
-        self.arms.iter().any(|arm| arm.config.run.flights < self.base_flights)
+    /// Training flights of a whole run, and whose, where an arm flies fewer: the paper's, or those of the configuration that all are based on.
+    pub fn shortened_from(&self) -> Option<(u64, String)> {
+        let paper = self.paper_flights.map(|flights| (flights, "the paper".to_owned()));
+        let base = (self.base_flights, format!("`configs/{}`", self.base_name));
+        let fewest = self.arms.iter().map(|arm| arm.config.run.flights).min()?;
+        paper.into_iter().chain([base]).find(|(whole, _)| fewest < *whole)
+    }
+
+    /// Whether all arms are rewarded alike, so that their returns can be compared.
+    pub fn has_one_reward(&self) -> bool {
+        let reward = |arm: &Arm| arm.config.simulator.get("reward").cloned();
+        self.arms.windows(2).all(|pair| reward(&pair[0]) == reward(&pair[1]))
     }
 }

@@ -36,7 +36,8 @@ fn every_shipped_experiment_can_be_run() {
             "{name}: fewer seeds than anything can be said of"
         );
         assert!(
-            Experiment::load(&folder, &name, Some(experiment.flights() - 1)).is_ok_and(|short| short.is_shortened())
+            Experiment::load(&folder, &name, Some(experiment.flights() - 1))
+                .is_ok_and(|short| short.shortened_from().is_some())
         );
     }
 }
@@ -66,7 +67,14 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
         (experiment.seeds, b.settings.len(), experiment.base_flights),
         (3, 0, 300)
     );
-    assert!(experiment.is_shortened());
+    assert_eq!(
+        experiment.shortened_from(),
+        Some((300, "`configs/smoke.toml`".to_owned()))
+    );
+    assert!(
+        !experiment.has_one_reward(),
+        "arm a is rewarded twice as much for the view ahead"
+    );
     assert_eq!(load(&text, Some(40)).unwrap().arms[1].config.run.flights, 40);
 }
 

@@ -37,9 +37,9 @@ impl Findings<'_> {
             Measure::Return => "Return",
             Measure::Drawdown => "Drawdown of the walls passed",
         };
-        let shortened = match self.experiment.is_shortened() {
-            true => " (shortened runs)",
-            false => "",
+        let shortened = match self.experiment.shortened_from() {
+            Some(_) => " (shortened runs)",
+            None => "",
         };
         Ok(Comparison {
             title: format!("{what} per training flight, average over {window} flights{shortened}"),
@@ -106,7 +106,7 @@ fn summed_up(curves: &[Vec<(f64, f64)>], bootstrap: &Bootstrap) -> Vec<(f64, Est
         .map(|place| begin + (end - begin) * place as f64 / (PLACES - 1) as f64)
         .filter_map(|x| {
             let values: Vec<f64> = curves.iter().map(|curve| value_at(curve, x)).collect();
-            Some((x, bootstrap.estimate(&values)?))
+            Some((x, bootstrap.interquartile_mean(&values)?))
         })
         .collect()
 }
@@ -146,7 +146,7 @@ mod tests {
         let line = summed_up(&curves, &Bootstrap::new(2, 100));
         assert_eq!((line[0].0, line[line.len() - 1].0), (5.0, 15.0));
         // At 5 the values are 1 and 1, at 15 they are 2 and 4.
-        assert_eq!((line[0].1.iqm, line[line.len() - 1].1.iqm), (1.0, 3.0));
+        assert_eq!((line[0].1.value, line[line.len() - 1].1.value), (1.0, 3.0));
         assert!(summed_up(&[vec![], vec![(1.0, 1.0)]], &Bootstrap::new(2, 100)).is_empty());
         assert!(summed_up(&[], &Bootstrap::new(0, 100)).is_empty());
     }

@@ -66,14 +66,11 @@ impl Findings<'_> {
     }
 
     fn shortened(&self) -> Option<String> {
-        self.experiment.is_shortened().then(|| {
-            format!(
-                "**Shortened**: {} training flights a run instead of the {} of `configs/{}`.",
-                self.experiment.flights(),
-                self.experiment.base_flights,
-                self.experiment.base_name
-            )
-        })
+        let (whole, whose) = self.experiment.shortened_from()?;
+        let flights = self.experiment.flights();
+        Some(format!(
+            "**Shortened**: {flights} training flights a run instead of the {whole} of {whose}."
+        ))
     }
 
     fn missing(&self) -> Option<String> {
@@ -136,7 +133,8 @@ impl Findings<'_> {
         if estimates {
             text.push_str(match self.plan.seeds {
                 1 => "One seed has no interval, and says nothing about others. ",
-                2..=5 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval; of so few seeds it is a rough one, and rather too narrow. ",
+                2 | 3 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval: with so few seeds, from the least of them to the greatest, and rather too narrow. ",
+                4 | 5 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval; of so few seeds it is a rough one, and rather too narrow. ",
                 _ => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval. ",
             });
         }
@@ -144,7 +142,7 @@ impl Findings<'_> {
             let window = self.experiment.arms[0].config.evaluation.window_flights;
             let _ = write!(
                 text,
-                "A run that never reached the rate counts with all that it took (≥). Volatility is the root mean square of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; – where a run has too few flights after that. "
+                "A run that never came to a wall or to the rate counts with all that it took (≥). Volatility is the root mean square of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; – where a run has too few flights after that. What has learned nothing does not swing either. "
             );
         }
         if tables.contains(&TableKind::Steadiness) {

@@ -48,6 +48,11 @@ impl Findings<'_> {
             ("trained_steps", trained(|at| at.steps.to_string())),
             ("trained_updates", trained(|at| at.updates.to_string())),
             ("trained_wall_secs", trained(|at| format!("{:.1}", at.wall_secs))),
+            (
+                "one_wall_flights",
+                run.one_wall_after()
+                    .map_or(String::new(), |flights| flights.to_string()),
+            ),
             ("final_walls_passed", measure(run.final_walls_passed())),
             ("final_return", measure(run.final_return())),
             ("volatility", measure(run.volatility())),

@@ -16,6 +16,9 @@ use crate::experiments::statistics::{Estimate, RESAMPLES, interquartile_mean};
 /// What is shown where there is nothing to show.
 pub(super) const NOTHING: &str = "–";
 
+/// What is measured of a run; `None` where there is too little to measure.
+type Measured = fn(&RunResult) -> Option<f64>;
+
 /// A table and what stands above it.
 pub(super) struct Titled {
     pub(super) title: String,
@@ -79,14 +82,13 @@ impl Findings<'_> {
                 };
                 let [label, seeds] = self.head(number, arm);
                 let completed = self.values(number, |run| Some(entry_of(run, &entry.name)?.completed));
+                let mean = completed.and_then(|values| self.bootstrap(number, RESAMPLES).mean(&values));
                 rows.push(vec![
                     label,
                     entry.name.clone(),
                     seeds,
                     entry.flights.to_string(),
-                    completed
-                        .and_then(|values| mean(&values))
-                        .map_or(NOTHING.to_owned(), share),
+                    mean.map_or(NOTHING.to_owned(), percent),
                     estimate(|course| course.completed).map_or(NOTHING.to_owned(), percent),
                     estimate(|course| course.r).map_or(NOTHING.to_owned(), rate),
                 ]);
@@ -104,49 +106,50 @@ impl Findings<'_> {
 
     fn learning(&self) -> Titled {
         let evaluation = &self.experiment.arms[0].config.evaluation;
+        let window = evaluation.window_flights;
+        let at_the_end: &[(&str, Measured)] = match self.experiment.has_one_reward() {
+            true => &[
+                ("walls passed, last", RunResult::final_walls_passed),
+                ("return, last", RunResult::final_return),
+            ],
+            false => &[("walls passed, last", RunResult::final_walls_passed)],
+        };
+        let measures: Vec<_> = at_the_end.iter().map(|(_, measure)| *measure).collect();
         let count = |value: f64| format!("{value:.0}");
+        let time = |secs| Clock(secs).to_string();
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
             let mut row = self.head(number, arm).to_vec();
+            let flights = |run: &RunResult| run.summary.flights as f64;
+            row.push(self.until(number, RunResult::one_wall_after, flights, &count));
             let trained = self
                 .of_arm(number)
                 .filter(|result| result.summary.trained.is_some())
                 .count();
             row.push(format!("{trained} of {}", self.of_arm(number).count()));
-            row.push(self.until_trained(number, |at| at.flights as f64, |run| run.summary.flights as f64, &count));
+            row.push(self.until_trained(number, |at| at.flights as f64, flights, &count));
             row.push(self.until_trained(number, |at| at.steps as f64, |run| run.summary.steps as f64, &count));
             row.push(self.until_trained(number, |at| at.updates as f64, |run| run.summary.updates as f64, &count));
-            row.push(
-                self.until_trained(number, |at| at.wall_secs, |run| run.summary.wall_secs, &|secs| {
-                    Clock(secs).to_string()
-                }),
-            );
-            row.extend(self.measured(
-                number,
-                &[
-                    RunResult::final_walls_passed,
-                    RunResult::final_return,
-                    RunResult::volatility,
-                ],
-            ));
+            row.push(self.until_trained(number, |at| at.wall_secs, |run| run.summary.wall_secs, &time));
+            row.extend(self.measured(number, &measures));
+            row.extend(self.measured(number, &[RunResult::volatility]));
             rows.push(row);
         }
-        let window = evaluation.window_flights;
-        let header = [
+        let mut header = vec![
             "arm".to_owned(),
             "seeds".to_owned(),
+            "one wall after".to_owned(),
             format!("R ≥ {} reached", evaluation.trained_rate),
             "after flights".to_owned(),
             "steps".to_owned(),
             "updates".to_owned(),
             "time".to_owned(),
-            format!("walls passed, last {window}"),
-            format!("return, last {window}"),
-            "volatility".to_owned(),
         ];
+        header.extend(at_the_end.iter().map(|(what, _)| format!("{what} {window}")));
+        header.push("volatility".to_owned());
         Titled {
             title: format!(
-                "Learning: when R ≥ {} was first confirmed in {} evaluation flights on {}, and the last {window} training flights",
+                "Learning: after how many flights the average of {window} came to one wall passed, when R ≥ {} was first confirmed in {} evaluation flights on {}, and the last {window} training flights",
                 evaluation.trained_rate,
                 evaluation.confirm_flights,
                 match evaluation.confirm_on {
@@ -154,7 +157,7 @@ impl Findings<'_> {
                     ConfirmOn::Generated => "generated courses",
                 }
             ),
-            table: grid(header.to_vec(), rows, 1),
+            table: grid(header, rows, 1),
         }
     }
 
@@ -188,8 +191,8 @@ impl Findings<'_> {
     }
 
     /// Cells of what is measured of the runs of an arm.
-    fn measured(&self, arm: usize, measures: &[fn(&RunResult) -> Option<f64>]) -> Vec<String> {
-        let cell = |of_run: &fn(&RunResult) -> Option<f64>| {
+    fn measured(&self, arm: usize, measures: &[Measured]) -> Vec<String> {
+        let cell = |of_run: &Measured| {
             let estimate = self.estimate(arm, of_run);
             estimate.map_or(NOTHING.to_owned(), |estimate| {
                 with_interval(estimate, |value| format!("{value:.2}"))
@@ -198,7 +201,7 @@ impl Findings<'_> {
         measures.iter().map(cell).collect()
     }
 
-    /// When the runs of an arm were trained. A run that never was counts with all that it took, which is the least it would have taken.
+    /// When the runs of an arm were trained.
     fn until_trained(
         &self,
         arm: usize,
@@ -206,11 +209,22 @@ impl Findings<'_> {
         whole: impl Fn(&RunResult) -> f64,
         show: &dyn Fn(f64) -> String,
     ) -> String {
-        let all_trained = self.of_arm(arm).all(|result| result.summary.trained.is_some());
-        let value = |result: &RunResult| Some(result.summary.trained.as_ref().map_or(whole(result), &at));
+        self.until(arm, |result| result.summary.trained.as_ref().map(&at), whole, show)
+    }
+
+    /// When the runs of an arm had `reached` something. A run that never had counts with the `whole` that it took, which is the least it would have taken.
+    fn until(
+        &self,
+        arm: usize,
+        reached: impl Fn(&RunResult) -> Option<f64>,
+        whole: impl Fn(&RunResult) -> f64,
+        show: &dyn Fn(f64) -> String,
+    ) -> String {
+        let by_all = self.of_arm(arm).all(|result| reached(result).is_some());
+        let value = |result: &RunResult| Some(reached(result).unwrap_or_else(|| whole(result)));
         match self.estimate(arm, value) {
             None => NOTHING.to_owned(),
-            Some(estimate) if all_trained => with_interval(estimate, show),
+            Some(estimate) if by_all => with_interval(estimate, show),
             Some(estimate) => format!("≥ {}", with_interval(estimate, show)),
         }
     }
@@ -261,7 +275,8 @@ impl Findings<'_> {
 
     /// The estimate of what `of_run` says of the complete runs of an arm; `None` when it says nothing of one of them.
     fn estimate(&self, arm: usize, of_run: impl Fn(&RunResult) -> Option<f64>) -> Option<Estimate> {
-        self.bootstrap(arm, RESAMPLES).estimate(&self.values(arm, of_run)?)
+        self.bootstrap(arm, RESAMPLES)
+            .interquartile_mean(&self.values(arm, of_run)?)
     }
 
     /// What `of_run` says of each of the complete runs of an arm; `None` when it says nothing of one of them.
@@ -283,11 +298,6 @@ pub(super) fn course_of<'a>(result: &'a RunResult, name: &str) -> Option<&'a Cou
     result.evaluation.courses.iter().find(|course| course.course == name)
 }
 
-/// `None` of none.
-fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-}
-
 fn rate(estimate: Estimate) -> String {
     with_interval(estimate, |value| format!("{value:.3}"))
 }
@@ -300,12 +310,12 @@ fn share(value: f64) -> String {
     format!("{:.1} %", 100.0 * value)
 }
 
-/// `IQM [low, high]`.
+/// `value [low, high]`.
 fn with_interval(estimate: Estimate, show: impl Fn(f64) -> String) -> String {
-    let iqm = show(estimate.iqm);
+    let value = show(estimate.value);
     match estimate.interval {
-        None => iqm,
-        Some((low, high)) => format!("{iqm} [{}, {}]", show(low), show(high)),
+        None => value,
+        Some((low, high)) => format!("{value} [{}, {}]", show(low), show(high)),
     }
 }
 
@@ -355,7 +365,7 @@ mod tests {
     #[test]
     fn an_interval_is_shown_where_there_is_one() {
         let show = |value: f64| format!("{value:.1}");
-        let of = |interval| with_interval(Estimate { iqm: 0.5, interval }, show);
+        let of = |interval| with_interval(Estimate { value: 0.5, interval }, show);
         assert_eq!(
             (of(None), of(Some((0.25, 1.0)))),
             ("0.5".to_owned(), "0.5 [0.2, 1.0]".to_owned())

@@ -56,7 +56,7 @@ fn two_runs(folder: &Path) -> (Experiment, Plan) {
     let suite = format!("name = \"few\"\nflights = 4\n{}{}", entry("calm"), entry("windy"));
     fs::write(folder.join("few.toml"), suite).unwrap();
     let experiment = format!(
-        "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\ncurves = []\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
+        "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\npaper_flights = 4000\ncurves = []\n[settings]\nevaluation.window_flights = 2\nlearning.warmup_steps = 20\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
     );
     fs::write(folder.join("test.toml"), experiment).unwrap();
     let experiment = Experiment::load(folder, "test", None).unwrap();
@@ -90,10 +90,10 @@ fn a_suite_is_told_entry_by_entry_over_the_seeds() {
     };
     assert_eq!(
         told(&plan),
-        "| arm | entry | seeds | flights | completed, mean |                completed |                    R |\n\
-         |-----|-------|------:|--------:|----------------:|-------------------------:|---------------------:|\n\
-         | A   | calm  |     2 |       4 |          75.0 % | 75.0 % [50.0 %, 100.0 %] | 0.750 [0.500, 1.000] |\n\
-         | A   | windy |     2 |       4 |          25.0 % |  25.0 % [25.0 %, 25.0 %] | 0.250 [0.250, 0.250] |"
+        "| arm | entry | seeds | flights |          completed, mean |                completed |                    R |\n\
+         |-----|-------|------:|--------:|-------------------------:|-------------------------:|---------------------:|\n\
+         | A   | calm  |     2 |       4 | 75.0 % [50.0 %, 100.0 %] | 75.0 % [50.0 %, 100.0 %] | 0.750 [0.500, 1.000] |\n\
+         | A   | windy |     2 |       4 |  25.0 % [25.0 %, 25.0 %] |  25.0 % [25.0 %, 25.0 %] | 0.250 [0.250, 0.250] |"
     );
     // A run that did not fly it says nothing, and nothing is made up for it.
     plan.runs[1].state = State::Trained;
@@ -150,4 +150,75 @@ fn every_run_has_a_line_of_its_own() {
     assert_eq!(column("R calm"), ["0.7500", "1.0000"]);
     assert_eq!(column("R windy"), ["0.2500", "0.2500"]);
     assert_eq!(column("trained_flights"), ["", ""], "never");
+}
+
+/// Two runs of six flights, told by hand: the first rises and is trained after four of them, the second falls back and never is.
+#[test]
+fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let (experiment, plan) = two_runs(folder.path());
+    let flights = |walls: [u8; 6], steps: u32| {
+        let row = |walls: u8| format!("{steps},{walls},{walls}.5\n");
+        format!("steps,walls_passed,return\n{}", walls.map(row).concat())
+    };
+    let summary = |steps: u64, updates: u64, trained: &str| {
+        let counts = format!(r#""flights":6,"steps":{steps},"updates":{updates}"#);
+        SUMMARY
+            .replace(r#""flights":8,"steps":4,"updates":2"#, &counts)
+            .replace(r#""wall_secs":3.3}"#, &format!(r#""wall_secs":63.3{trained}}}"#))
+    };
+    let trained = r#","trained":{"flights":4,"steps":40,"updates":20,"wall_secs":30.0}"#;
+    for (run, walls, steps, summary) in [
+        (&plan.runs[0], [0, 0, 1, 1, 3, 3], 10, summary(60, 30, trained)),
+        (&plan.runs[1], [0, 2, 0, 0, 0, 0], 20, summary(120, 60, "")),
+    ] {
+        fs::write(run.directory.flights_csv(), flights(walls, steps)).unwrap();
+        fs::write(run.directory.summary_json(), summary).unwrap();
+    }
+    let runs = results::read(&plan).unwrap();
+    let findings = findings(&experiment, &plan, &runs);
+    let row = |kind| {
+        let table = findings.tables(kind)[0].table.clone();
+        let cells = table
+            .lines()
+            .nth(2)
+            .unwrap()
+            .split('|')
+            .map(|cell| cell.trim().to_owned());
+        cells.filter(|cell| !cell.is_empty()).collect::<Vec<_>>()
+    };
+    assert_eq!(
+        row(TableKind::Learning),
+        [
+            "A",
+            "2",
+            "3 [2, 4]",
+            "1 of 2",
+            "≥ 5 [4, 6]",
+            "≥ 80 [40, 120]",
+            "≥ 40 [20, 60]",
+            "≥ 0:46 [0:30, 1:03]",
+            "1.50 [0.00, 3.00]",
+            "2.00 [0.50, 3.50]",
+            "–"
+        ]
+    );
+    // Averages over two flights: 0, 0.5, 1, 2, 3 rises only; 1, 1, 0, 0, 0 has lost all it had.
+    assert_eq!(
+        row(TableKind::Steadiness),
+        ["A", "2", "1.00 [0.00, 2.00]", "–", "–", "0.50 [0.00, 1.00]"]
+    );
+    assert_eq!(row(TableKind::Cost), ["A", "2", "6", "90", "45", "4", "4", "1:03"]);
+
+    use crate::experiments::definition::{Axis, Measure};
+    let at = |axis| runs[0].curve(Measure::WallsPassed, axis);
+    assert_eq!(
+        at(Axis::Flights),
+        [(2.0, 0.0), (3.0, 0.5), (4.0, 1.0), (5.0, 2.0), (6.0, 3.0)]
+    );
+    assert_eq!(at(Axis::Steps).first(), Some(&(20.0, 0.0)));
+    assert_eq!(at(Axis::Steps).last(), Some(&(60.0, 3.0)));
+    // All updates are behind the last flight, and none before the warm-up is over.
+    assert_eq!(at(Axis::Updates).first(), Some(&(0.0, 0.0)));
+    assert_eq!(at(Axis::Updates).last(), Some(&(30.0, 3.0)));
 }
