@@ -56,7 +56,7 @@ fn two_runs(folder: &Path) -> (Experiment, Plan) {
     let suite = format!("name = \"few\"\nflights = 4\n{}{}", entry("calm"), entry("windy"));
     fs::write(folder.join("few.toml"), suite).unwrap();
     let experiment = format!(
-        "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\npaper_flights = 4000\ncurves = []\n[settings]\nevaluation.window_flights = 2\nlearning.warmup_steps = 20\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
+        "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\npaper_flights = 4000\ncurves = []\n[settings]\nevaluation.window_flights = 2\nlearning.warmup_steps = 20\nsac.batch_size = 16\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
     );
     fs::write(folder.join("test.toml"), experiment).unwrap();
     let experiment = Experiment::load(folder, "test", None).unwrap();
@@ -167,7 +167,7 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
             .replace(r#""flights":8,"steps":4,"updates":2"#, &counts)
             .replace(r#""wall_secs":3.3}"#, &format!(r#""wall_secs":63.3{trained}}}"#))
     };
-    let trained = r#","trained":{"flights":4,"steps":40,"updates":20,"wall_secs":30.0}"#;
+    let trained = r#","trained":{"rate":0.95,"flights":4,"steps":40,"updates":20,"wall_secs":30.0}"#;
     for (run, walls, steps, summary) in [
         (&plan.runs[0], [0, 0, 1, 1, 3, 3], 10, summary(60, 30, trained)),
         (&plan.runs[1], [0, 2, 0, 0, 0, 0], 20, summary(120, 60, "")),
@@ -197,7 +197,7 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
             "≥ 5 [4, 6]",
             "≥ 80 [40, 120]",
             "≥ 40 [20, 60]",
-            "≥ 0:46 [0:30, 1:03]",
+            "≥ 0:47 [0:30, 1:03]",
             "1.50 [0.00, 3.00]",
             "2.00 [0.50, 3.50]",
             "–"
