@@ -20,7 +20,8 @@ fn main() {
 /// What learning depends on: the packages that fly and learn, and what they are built with.
 const SOURCES: [&str; 5] = ["Cargo.toml", "Cargo.lock", "learner", "protocol", "actor"];
 
-/// The last commit that changed one of the [`SOURCES`], with `-dirty` behind it where they are others now; `None` outside a clone.
+/// The last commit that changed one of the [`SOURCES`], with `-dirty` behind it where they are others now, new files among them; `None` outside a clone, and where
+/// none of them was ever committed.
 fn commit() -> Option<String> {
     let package = std::env::var_os("CARGO_MANIFEST_DIR")?;
     let root = Path::new(&package).parent()?;
@@ -37,7 +38,7 @@ fn commit() -> Option<String> {
         }
     }
     let of_sources = |command: &[&str]| git(root, &[command, &["--"], &SOURCES].concat());
-    let commit = of_sources(&["log", "-1", "--format=%h", "--abbrev=12"])?;
+    let commit = of_sources(&["log", "-1", "--format=%h", "--abbrev=12"]).filter(|commit| !commit.is_empty())?;
     let is_clean = of_sources(&["status", "--porcelain"])?.is_empty();
     Some(if is_clean { commit } else { format!("{commit}-dirty") })
 }

@@ -14,7 +14,7 @@ use crate::stages::Times;
 /// What a run came to.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Version of Skein, and the commit that the learner was built from where that is known: `0.1.0+b8735651a2c3`, with `-dirty` behind it if sources had been changed.
+    /// Version of Skein, and the last commit that changed what the learner is made of, where that is known: `0.1.0+b8735651a2c3`, with `-dirty` behind it if it had been changed since.
     pub skein_version: String,
     /// The run.
     pub run: RunId,

@@ -173,6 +173,25 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
     assert_refused_when_changed(&scene);
 }
 
+#[test]
+fn an_experiment_that_cannot_be_run_does_not_hide_the_others() {
+    let scene = Scene::new();
+    fs::write(scene.path("configs/experiments/broken.toml"), "question = 1\n").unwrap();
+    let repository = scene.path("").display().to_string();
+    let output = run_program("skein-experiment", &["--repository", &repository, "--list"]);
+    assert_eq!(output.code, Some(1));
+    assert!(
+        output.stdout.contains("tiny") && output.stdout.contains("What for?"),
+        "{}",
+        output.stdout
+    );
+    assert!(
+        output.stderr.contains("broken.toml is no experiment"),
+        "{}",
+        output.stderr
+    );
+}
+
 /// Telling it again runs nothing, gives the same report, and replaces what was published before.
 fn assert_published(scene: &Scene, report: &str) {
     for _ in 0..2 {

@@ -108,11 +108,8 @@ impl RunResult {
     /// Training flights until the average over a window of them first came to one wall passed; `None` if it never did. The rise itself: whether the agent is
     /// trained is looked at in confirmations alone, which are far apart.
     pub fn one_wall_after(&self) -> Option<f64> {
-        let curve = self.curve(Measure::WallsPassed, Axis::Flights).into_iter();
-        curve
-            .filter(|(_, walls)| *walls >= 1.0)
-            .map(|(flights, _)| flights)
-            .next()
+        let mut curve = self.curve(Measure::WallsPassed, Axis::Flights).into_iter();
+        curve.find(|(_, walls)| *walls >= 1.0).map(|(flights, _)| flights)
     }
 
     /// Walls passed a flight that training came to; see [`level`].

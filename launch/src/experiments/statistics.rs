@@ -1,6 +1,6 @@
-//! A few numbers, one a seed, summed up honestly: interquartile mean and a bootstrap interval; and how restless a curve is.
+//! A few numbers, one a seed, summed up honestly: interquartile mean or mean, and a bootstrap interval; and how restless a curve is.
 //!
-//! Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv:2108.13264, which recommends both for few runs.
+//! Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv:2108.13264, which recommends the interquartile mean and the bootstrap for few runs.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;

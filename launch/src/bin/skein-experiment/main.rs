@@ -260,11 +260,8 @@ fn announce(experiment: &Experiment, plan: &Plan, jobs: usize) {
             plural(flown.flights() as usize, "flight")
         );
     }
-    if let Some((whole, whose)) = experiment.shortened_from() {
-        eprintln!(
-            "skein: shortened: {} training flights a run instead of the {whole} of {whose}",
-            experiment.flights()
-        );
+    if let Some(shortened) = experiment.shortened() {
+        eprintln!("skein: shortened: {shortened}");
     }
 }
 

@@ -7,7 +7,7 @@ use skein_protocol::config::Config;
 use skein_simulator::suite::MOST_FLIGHTS;
 
 use super::file::{ArmFile, File, as_overrides};
-use super::{Arm, DefinitionError, Experiment, FlownSuite, MOST_ARMS, TableKind};
+use super::{Arm, DefinitionError, Experiment, FlownSuite, MOST_ARMS, Measure, TableKind};
 use crate::experiments::plan::{ACTORS, REPORT};
 use crate::prepare::{self, PrepareError};
 
@@ -51,6 +51,7 @@ pub(super) fn resolve(
     }
     check_comparable(&arms, path)?;
     check_same_flights(&file, &arms, path)?;
+    check_same_reward(&file, &arms, path)?;
     let suite = suite_of(&file, folder, &arms, path)?;
     Ok(Experiment {
         name: name.to_owned(),
@@ -254,6 +255,18 @@ fn check_same_flights(file: &File, arms: &[Arm], path: &Path) -> Result<(), Defi
         })?;
     }
     Ok(())
+}
+
+/// Whether returns that are drawn beside one another are of one scale.
+fn check_same_reward(file: &File, arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
+    if file.curves.iter().all(|curve| curve.measure != Measure::Return) {
+        return Ok(());
+    }
+    refuse_other(arms, path, Arm::reward, |first| {
+        format!(
+            "simulator.reward cannot differ from that of arm {first} where returns are drawn: they would be of another scale; draw walls_passed"
+        )
+    })
 }
 
 /// Refuses the first arm that has not what the first of all has; `problem` is told that one's name.

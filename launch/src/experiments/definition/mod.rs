@@ -6,6 +6,7 @@ mod suite;
 #[cfg(test)]
 mod tests;
 
+use std::fmt::{self, Display, Formatter};
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
@@ -48,6 +49,24 @@ pub struct Experiment {
     pub arms: Vec<Arm>,
 }
 
+/// Runs that fly less than whole ones.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Shortened {
+    /// Their training flights.
+    pub flown: u64,
+    /// Those of a whole run.
+    pub whole: u64,
+    /// Whose that is, for readers.
+    pub whose: String,
+}
+
+impl Display for Shortened {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let Self { flown, whole, whose } = self;
+        write!(f, "{flown} training flights a run instead of the {whole} of {whose}")
+    }
+}
+
 /// One way of training, of several that are compared.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Arm {
@@ -73,7 +92,7 @@ pub enum TableKind {
     Outcomes,
     /// Completed courses and R of the best snapshot, for each entry of the suite.
     Suite,
-    /// What it took until the agent was trained, and how well and steadily it flew at the end of training.
+    /// What it took until the first wall was passed and until the agent was trained, and how well and steadily it flew at the end of training.
     Learning,
     /// How much training swung, and how much of what was learned was lost again.
     Steadiness,
@@ -191,22 +210,23 @@ impl Experiment {
         check::resolve(file::read(&path)?, &path, name, flights)
     }
 
-    /// Training flights that the runs of an arm fly at most.
-    pub fn flights(&self) -> u64 {
-        self.arms.iter().map(|arm| arm.config.run.flights).max().unwrap_or(0)
-    }
-
-    /// Training flights of a whole run, and whose, where an arm flies fewer: the paper's, or those of the configuration that all are based on.
-    pub fn shortened_from(&self) -> Option<(u64, String)> {
+    /// How much less the shortest arm flies than the paper, or than the configuration that all are based on; `None` if it flies as much.
+    pub fn shortened(&self) -> Option<Shortened> {
         let paper = self.paper_flights.map(|flights| (flights, "the paper".to_owned()));
         let base = (self.base_flights, format!("`configs/{}`", self.base_name));
-        let fewest = self.arms.iter().map(|arm| arm.config.run.flights).min()?;
-        paper.into_iter().chain([base]).find(|(whole, _)| fewest < *whole)
+        let flown = self.arms.iter().map(|arm| arm.config.run.flights).min()?;
+        let (whole, whose) = paper.into_iter().chain([base]).find(|(whole, _)| flown < *whole)?;
+        Some(Shortened { flown, whole, whose })
     }
 
     /// Whether all arms are rewarded alike, so that their returns can be compared.
     pub fn has_one_reward(&self) -> bool {
-        let reward = |arm: &Arm| arm.config.simulator.get("reward").cloned();
-        self.arms.windows(2).all(|pair| reward(&pair[0]) == reward(&pair[1]))
+        self.arms.windows(2).all(|pair| pair[0].reward() == pair[1].reward())
+    }
+}
+
+impl Arm {
+    fn reward(&self) -> Option<toml::Value> {
+        self.config.simulator.get("reward").cloned()
     }
 }

@@ -31,14 +31,12 @@ fn every_shipped_experiment_can_be_run() {
     assert!(names.contains(&"paper".to_owned()), "{names:?}");
     for name in names {
         let experiment = Experiment::load(&folder, &name, None).unwrap();
+        let fewest = experiment.arms.iter().map(|arm| arm.config.run.flights).min().unwrap();
         assert!(
             experiment.seeds >= 3,
             "{name}: fewer seeds than anything can be said of"
         );
-        assert!(
-            Experiment::load(&folder, &name, Some(experiment.flights() - 1))
-                .is_ok_and(|short| short.shortened_from().is_some())
-        );
+        assert!(Experiment::load(&folder, &name, Some(fewest - 1)).is_ok_and(|short| short.shortened().is_some()));
     }
 }
 
@@ -46,7 +44,7 @@ fn every_shipped_experiment_can_be_run() {
 fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
     let text = format!(
         "{}[settings]\nrun.flights = 90\nreplay = {{ success_share = 0.5, success = \"approach\" }}\n{ARM}settings.\"replay.success_share\" = 0.25\nsettings.simulator.reward.action_scale = 2.0\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n",
-        head()
+        head().replace("\"return\"", "\"walls_passed\"")
     );
     let experiment = load(&text, None).unwrap();
     let [a, b] = &experiment.arms[..] else {
@@ -68,14 +66,25 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
         (3, 0, 300)
     );
     assert_eq!(
-        experiment.shortened_from(),
-        Some((300, "`configs/smoke.toml`".to_owned()))
+        experiment.shortened().unwrap().to_string(),
+        "90 training flights a run instead of the 300 of `configs/smoke.toml`"
     );
     assert!(
         !experiment.has_one_reward(),
         "arm a is rewarded twice as much for the view ahead"
     );
     assert_eq!(load(&text, Some(40)).unwrap().arms[1].config.run.flights, 40);
+}
+
+#[test]
+fn what_flies_less_than_the_paper_is_shortened_and_what_flies_as_much_is_not() {
+    let shortened = |keys: &str| load(&format!("{keys}{}{ARM}", head()), None).unwrap().shortened();
+    assert_eq!(shortened(""), None);
+    assert_eq!(shortened("paper_flights = 300\n"), None);
+    assert_eq!(
+        shortened("paper_flights = 4000\n").unwrap().to_string(),
+        "300 training flights a run instead of the 4000 of the paper"
+    );
 }
 
 #[test]
@@ -178,6 +187,21 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             vec!["question = \"\" asks nothing"],
         ),
         (
+            head().replace("What for?", "What\\nfor?") + ARM,
+            None,
+            vec!["question = \"What\\nfor?\" cannot head a report", "one line"],
+        ),
+        (
+            head().replace("What for?", "<!-- end -->") + ARM,
+            None,
+            vec!["cannot head a report", "without <!--"],
+        ),
+        (
+            format!("paper_flights = 0\n{}{ARM}", head()),
+            None,
+            vec!["paper_flights = 0 are no run", "leave it out"],
+        ),
+        (
             format!("seeds = 0\n{}{ARM}", head()),
             None,
             vec!["seeds = 0", "1..=100"],
@@ -197,6 +221,11 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             head() + &ARM.replace("\"A\"", "\"a|b\""),
             None,
             vec!["arm.label = a|b", "without |"],
+        ),
+        (
+            head() + &ARM.replace("\"A\"", "\"<!-- end -->\""),
+            None,
+            vec!["arm.label = <!-- end -->", "without | and <!--"],
         ),
         (
             with_arm("settings.run.sed = 1"),
@@ -286,6 +315,26 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.disturbances.share = 0.5"),
             None,
             vec!["arm b: simulator.disturbances cannot differ", "arm a", "\"suite\""],
+        ),
+        (
+            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.learning.levels = 3"),
+            None,
+            vec![
+                "arm b: courses.training",
+                "learning.levels cannot differ",
+                "arm a",
+                "\"suite\"",
+            ],
+        ),
+        (
+            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.courses.generated_share = 0.5"),
+            None,
+            vec!["arm b: courses.training, courses.generated_share", "\"suite\""],
+        ),
+        (
+            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.reward.action_scale = 2.0"),
+            None,
+            vec!["arm b: simulator.reward cannot differ", "arm a", "walls_passed"],
         ),
         (
             format!("suite_flights = 0\n{}", with_suite(&shipped("evaluations/paper.toml"))),

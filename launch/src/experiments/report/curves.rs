@@ -37,7 +37,7 @@ impl Findings<'_> {
             Measure::Return => "Return",
             Measure::Drawdown => "Drawdown of the walls passed",
         };
-        let shortened = match self.experiment.shortened_from() {
+        let shortened = match self.experiment.shortened() {
             Some(_) => " (shortened runs)",
             None => "",
         };

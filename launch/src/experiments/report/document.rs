@@ -66,11 +66,8 @@ impl Findings<'_> {
     }
 
     fn shortened(&self) -> Option<String> {
-        let (whole, whose) = self.experiment.shortened_from()?;
-        let flights = self.experiment.flights();
-        Some(format!(
-            "**Shortened**: {flights} training flights a run instead of the {whole} of {whose}."
-        ))
+        let shortened = self.experiment.shortened()?;
+        Some(format!("**Shortened**: {shortened}."))
     }
 
     fn missing(&self) -> Option<String> {
@@ -133,20 +130,25 @@ impl Findings<'_> {
         if estimates {
             text.push_str(match self.plan.seeds {
                 1 => "One seed has no interval, and says nothing about others. ",
-                2 | 3 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval: with so few seeds, from the least of them to the greatest, and rather too narrow. ",
+                2 | 3 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval, which of so few seeds reaches from the least value to the greatest, and is rather too narrow. ",
                 4 | 5 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval; of so few seeds it is a rough one, and rather too narrow. ",
                 _ => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval. ",
             });
         }
+        if tables.contains(&TableKind::Suite) {
+            text.push_str("*Completed, mean* is the plain mean, in which the worst seed counts as much as any, with an interval of its own. ");
+        }
+        let window = self.experiment.arms[0].config.evaluation.window_flights;
         if tables.contains(&TableKind::Learning) {
-            let window = self.experiment.arms[0].config.evaluation.window_flights;
+            text.push_str("A run that never came to a wall or to the rate counts with all that it took (≥). ");
+        }
+        if tables.contains(&TableKind::Learning) || tables.contains(&TableKind::Steadiness) {
             let _ = write!(
                 text,
-                "A run that never came to a wall or to the rate counts with all that it took (≥). Volatility is the root mean square of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; – where a run has too few flights after that. What has learned nothing does not swing either. "
+                "Volatility is the root mean square of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; – where a run has too few flights after that. A run that has learned nothing has a small one as well: read it beside the walls passed. "
             );
         }
         if tables.contains(&TableKind::Steadiness) {
-            let window = self.experiment.arms[0].config.evaluation.window_flights;
             let _ = write!(
                 text,
                 "The level is what a run comes to: the median of the averages over {window} flights in its second half. Dispersion across time is the interquartile range of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; the largest drawdown is how far the average over {window} flights ever fell below the highest it had been (arXiv:1912.05663). "

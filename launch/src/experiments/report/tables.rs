@@ -107,14 +107,13 @@ impl Findings<'_> {
     fn learning(&self) -> Titled {
         let evaluation = &self.experiment.arms[0].config.evaluation;
         let window = evaluation.window_flights;
-        let at_the_end: &[(&str, Measured)] = match self.experiment.has_one_reward() {
-            true => &[
-                ("walls passed, last", RunResult::final_walls_passed),
-                ("return, last", RunResult::final_return),
-            ],
-            false => &[("walls passed, last", RunResult::final_walls_passed)],
-        };
-        let measures: Vec<_> = at_the_end.iter().map(|(_, measure)| *measure).collect();
+        let mut at_the_end: Vec<(String, Measured)> =
+            vec![(format!("walls passed, last {window}"), RunResult::final_walls_passed)];
+        if self.experiment.has_one_reward() {
+            at_the_end.push((format!("return, last {window}"), RunResult::final_return));
+        }
+        at_the_end.push(("volatility".to_owned(), RunResult::volatility));
+        let (names, measures): (Vec<_>, Vec<_>) = at_the_end.into_iter().unzip();
         let count = |value: f64| format!("{value:.0}");
         let time = |secs| Clock(secs).to_string();
         let mut rows = Vec::new();
@@ -132,21 +131,19 @@ impl Findings<'_> {
             row.push(self.until_trained(number, |at| at.updates as f64, |run| run.summary.updates as f64, &count));
             row.push(self.until_trained(number, |at| at.wall_secs, |run| run.summary.wall_secs, &time));
             row.extend(self.measured(number, &measures));
-            row.extend(self.measured(number, &[RunResult::volatility]));
             rows.push(row);
         }
         let mut header = vec![
             "arm".to_owned(),
             "seeds".to_owned(),
-            "one wall after".to_owned(),
+            "flights to one wall".to_owned(),
             format!("R ≥ {} reached", evaluation.trained_rate),
             "after flights".to_owned(),
             "steps".to_owned(),
             "updates".to_owned(),
             "time".to_owned(),
         ];
-        header.extend(at_the_end.iter().map(|(what, _)| format!("{what} {window}")));
-        header.push("volatility".to_owned());
+        header.extend(names);
         Titled {
             title: format!(
                 "Learning: after how many flights the average of {window} came to one wall passed, when R ≥ {} was first confirmed in {} evaluation flights on {}, and the last {window} training flights",

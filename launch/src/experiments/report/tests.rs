@@ -8,7 +8,7 @@ use skein_protocol::ids::PolicyVersion;
 use skein_protocol::transition::Outcome;
 
 use super::*;
-use crate::experiments::definition::TableKind;
+use crate::experiments::definition::{Axis, Measure, TableKind};
 use crate::experiments::plan::PlannedRun;
 use crate::experiments::results;
 
@@ -117,6 +117,8 @@ fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
         findings(&experiment, &plan, &runs).document(&[], "", "runs.csv")
     };
     let (one, several) = (told(), "**Of several builds**");
+    let shortened = "**Shortened**: 300 training flights a run instead of the 4000 of the paper.";
+    assert!(one.contains(shortened), "{one}");
     assert!(one.contains("Skein 0.\n") && !one.contains(several), "{one}");
 
     let newer = SUMMARY.replace(r#""skein_version":"0""#, r#""skein_version":"0+b873565""#);
@@ -150,27 +152,33 @@ fn every_run_has_a_line_of_its_own() {
     assert_eq!(column("R calm"), ["0.7500", "1.0000"]);
     assert_eq!(column("R windy"), ["0.2500", "0.2500"]);
     assert_eq!(column("trained_flights"), ["", ""], "never");
+    assert_eq!(column("one_wall_flights"), ["", ""], "one flight is not two");
 }
 
-/// Two runs of six flights, told by hand: the first rises and is trained after four of them, the second falls back and never is.
+/// Two runs of ten flights, told by hand: the first rises and is trained after six of them, the second never comes to a wall.
 #[test]
 fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, plan) = two_runs(folder.path());
-    let flights = |walls: [u8; 6], steps: u32| {
+    let flights = |walls: [u8; 10], steps: u32| {
         let row = |walls: u8| format!("{steps},{walls},{walls}.5\n");
         format!("steps,walls_passed,return\n{}", walls.map(row).concat())
     };
     let summary = |steps: u64, updates: u64, trained: &str| {
-        let counts = format!(r#""flights":6,"steps":{steps},"updates":{updates}"#);
+        let counts = format!(r#""flights":10,"steps":{steps},"updates":{updates}"#);
         SUMMARY
             .replace(r#""flights":8,"steps":4,"updates":2"#, &counts)
-            .replace(r#""wall_secs":3.3}"#, &format!(r#""wall_secs":63.3{trained}}}"#))
+            .replace(r#""wall_secs":3.3}"#, &format!(r#""wall_secs":70.0{trained}}}"#))
     };
-    let trained = r#","trained":{"rate":0.95,"flights":4,"steps":40,"updates":20,"wall_secs":30.0}"#;
+    let trained = r#","trained":{"rate":0.95,"flights":6,"steps":60,"updates":20,"wall_secs":30.0}"#;
     for (run, walls, steps, summary) in [
-        (&plan.runs[0], [0, 0, 1, 1, 3, 3], 10, summary(60, 30, trained)),
-        (&plan.runs[1], [0, 2, 0, 0, 0, 0], 20, summary(120, 60, "")),
+        (
+            &plan.runs[0],
+            [0, 0, 1, 3, 3, 3, 2, 2, 2, 3],
+            10,
+            summary(100, 40, trained),
+        ),
+        (&plan.runs[1], [0, 0, 1, 0, 0, 0, 0, 1, 0, 1], 20, summary(200, 60, "")),
     ] {
         fs::write(run.directory.flights_csv(), flights(walls, steps)).unwrap();
         fs::write(run.directory.summary_json(), summary).unwrap();
@@ -187,38 +195,75 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
             .map(|cell| cell.trim().to_owned());
         cells.filter(|cell| !cell.is_empty()).collect::<Vec<_>>()
     };
+    // Averages of two flights: 0, 2, 3, 2, 2.5, whose level is 2.5, and 0, 0.5, 0, 0.5, 0.5, whose is 0.5. Once risen they change by -1 and 0.5, and by -0.5, 0.5
+    // and 0: the root mean squares are 0.79 and 0.41, the interquartile ranges 0.75 and 0.5.
+    let volatility = "0.60 [0.41, 0.79]";
     assert_eq!(
         row(TableKind::Learning),
         [
             "A",
             "2",
-            "3 [2, 4]",
+            "≥ 7 [4, 10]",
             "1 of 2",
-            "≥ 5 [4, 6]",
-            "≥ 80 [40, 120]",
+            "≥ 8 [6, 10]",
+            "≥ 130 [60, 200]",
             "≥ 40 [20, 60]",
-            "≥ 0:47 [0:30, 1:03]",
-            "1.50 [0.00, 3.00]",
-            "2.00 [0.50, 3.50]",
-            "–"
+            "≥ 0:50 [0:30, 1:10]",
+            "1.50 [0.50, 2.50]",
+            "2.00 [1.00, 3.00]",
+            volatility
         ]
     );
-    // Averages over two flights: 0, 0.5, 1, 2, 3 rises only; 1, 1, 0, 0, 0 has lost all it had.
     assert_eq!(
         row(TableKind::Steadiness),
-        ["A", "2", "1.00 [0.00, 2.00]", "–", "–", "0.50 [0.00, 1.00]"]
+        [
+            "A",
+            "2",
+            "1.50 [0.50, 2.50]",
+            volatility,
+            "0.62 [0.50, 0.75]",
+            "0.75 [0.50, 1.00]"
+        ]
     );
-    assert_eq!(row(TableKind::Cost), ["A", "2", "6", "90", "45", "4", "4", "1:03"]);
+    assert_eq!(row(TableKind::Cost), ["A", "2", "10", "150", "50", "4", "4", "1:10"]);
 
-    use crate::experiments::definition::{Axis, Measure};
-    let at = |axis| runs[0].curve(Measure::WallsPassed, axis);
+    let walls = |axis| runs[0].curve(Measure::WallsPassed, axis);
+    let averages = [0.0, 0.5, 2.0, 3.0, 3.0, 2.5, 2.0, 2.0, 2.5];
+    let over = |places: [f64; 9]| places.into_iter().zip(averages).collect::<Vec<_>>();
     assert_eq!(
-        at(Axis::Flights),
-        [(2.0, 0.0), (3.0, 0.5), (4.0, 1.0), (5.0, 2.0), (6.0, 3.0)]
+        walls(Axis::Flights),
+        over([2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0])
     );
-    assert_eq!(at(Axis::Steps).first(), Some(&(20.0, 0.0)));
-    assert_eq!(at(Axis::Steps).last(), Some(&(60.0, 3.0)));
-    // All updates are behind the last flight, and none before the warm-up is over.
-    assert_eq!(at(Axis::Updates).first(), Some(&(0.0, 0.0)));
-    assert_eq!(at(Axis::Updates).last(), Some(&(30.0, 3.0)));
+    assert_eq!(
+        walls(Axis::Steps),
+        over([20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0])
+    );
+    // None before the warm-up is over, all behind the last flight.
+    assert_eq!(
+        walls(Axis::Updates),
+        over([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0])
+    );
+    assert_eq!(
+        runs.iter().map(RunResult::one_wall_after).collect::<Vec<_>>(),
+        [Some(4.0), None]
+    );
+}
+
+#[test]
+fn returns_of_different_rewards_are_in_no_table() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut experiment, plan) = two_runs(folder.path());
+    let runs = results::read(&plan).unwrap();
+    let told = |experiment: &Experiment| {
+        let tables = findings(experiment, &plan, &runs).tables(TableKind::Learning);
+        tables[0].table.contains("return, last 2")
+    };
+    assert!(told(&experiment));
+    let mut other = experiment.arms[0].clone();
+    other
+        .config
+        .simulator
+        .insert("reward".to_owned(), toml::Table::new().into());
+    experiment.arms.push(other);
+    assert!(!told(&experiment));
 }
