@@ -88,7 +88,7 @@ pub enum PrepareError {
     #[error(transparent)]
     Folders(#[from] FoldersTooSmall),
     /// There is something in the run's directory.
-    #[error("{} is not empty: choose another --run-dir, or remove it if nobody needs it", .0.display())]
+    #[error("{folder} is not empty: choose another --run-dir, or, if it holds a run, go on with that: --resume {folder}", folder = .0.display())]
     NotEmpty(PathBuf),
     /// A file or folder of the run cannot be written.
     #[error("{}: {source}", path.display())]

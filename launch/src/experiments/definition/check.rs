@@ -40,7 +40,7 @@ pub(super) fn resolve(
             .and_then(refuse_ours)
             .map_err(|problem| settings_error(path, whose, problem))
     };
-    let settings = [vec![FOR_ALL.to_owned()], settings_of("[settings]", &file.settings)?].concat();
+    let mut settings = [vec![FOR_ALL.to_owned()], settings_of("[settings]", &file.settings)?].concat();
     let base_config = Config::load(&base, &[])
         .map_err(|error| settings_error(path, "base", PrepareError::from(error).to_string()))?;
     let mut arms = Vec::with_capacity(file.arms.len());
@@ -48,6 +48,9 @@ pub(super) fn resolve(
         let own = settings_of(&format!("arm {}", arm.name), &arm.settings)?;
         let overrides = [&settings[..], &own].concat();
         arms.push(arm_of(arm, own, overrides, &base, flights, path)?);
+    }
+    if let Some(flights) = flights {
+        tell_flights(flights, &mut settings, &mut arms);
     }
     check_comparable(&arms, path)?;
     check_same_flights(&file, &arms, path)?;
@@ -104,6 +107,15 @@ fn arm_of(
         overrides,
         config,
     })
+}
+
+/// Has readers told what is flown, instead of what the file says.
+fn tell_flights(flights: u64, settings: &mut Vec<String>, arms: &mut [Arm]) {
+    let own = arms.iter_mut().map(|arm| &mut arm.settings);
+    for told in own.chain([&mut *settings]) {
+        told.retain(|setting| !setting.starts_with("run.flights="));
+    }
+    settings.push(format!("run.flights={flights}"));
 }
 
 /// The suite that `file` names, if every arm can be put to it and a table tells what came of it.

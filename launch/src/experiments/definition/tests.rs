@@ -73,7 +73,13 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
         !experiment.has_one_reward(),
         "arm a is rewarded twice as much for the view ahead"
     );
-    assert_eq!(load(&text, Some(40)).unwrap().arms[1].config.run.flights, 40);
+    let short = load(&text, Some(40)).unwrap();
+    assert_eq!(short.arms[1].config.run.flights, 40);
+    let flights = |setting: &&String| setting.starts_with("run.flights");
+    assert_eq!(
+        short.settings.iter().filter(flights).collect::<Vec<_>>(),
+        ["run.flights=40"]
+    );
 }
 
 #[test]
