@@ -158,10 +158,7 @@ fn differences_once_risen(values: &[f64], window: usize) -> Option<Vec<f64>> {
 }
 
 fn window_averages(values: &[f64], window: usize) -> Vec<f64> {
-    let windows = values.chunks_exact(window.max(1));
-    windows
-        .map(|window| window.iter().sum::<f64>() / window.len() as f64)
-        .collect()
+    values.chunks_exact(window.max(1)).filter_map(mean).collect()
 }
 
 fn level_of(averages: &[f64]) -> Option<f64> {
