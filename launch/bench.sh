@@ -13,7 +13,7 @@ ratio, and the machine. Figures and their baselines are measured by the same run
 Options:
   --quick       a fraction of a second for each, to see that they work: no time is judged, and results lie in target/bench-quick/
   --only NAME   this benchmark alone; may be repeated. launch/benchmarks.toml names them
-  --growth      measure as well how cost grows with the flights of an epoch, and draw all growth into launch/pictures/
+  --growth      measure as well how cost grows with the episodes of an epoch, and draw all growth into launch/pictures/
   -h, --help    this text
 
 What was measured lies in target/bench/: table.md, table.json, criterion's samples, and what each benchmark printed.

@@ -11,7 +11,7 @@ Usage: launch/chaos.sh [--config FILE] [--set section.key=value ...] [--seed N] 
        launch/chaos.sh --cost TIMES [...]
 
 Trains the configuration undisturbed, then once more while it kills, freezes, attaches and takes away the run's processes at random
-moments, and compares what was learned, bit for bit: policy, flights, best snapshot, evaluation, curves. Then it looks for what is
+moments, and compares what was learned, bit for bit: policy, episodes, best snapshot, evaluation, curves. Then it looks for what is
 left of the run on the machine. Everything that was done is in DIR/disturbances.jsonl; the same seed does the same.
 
 Options:
@@ -30,7 +30,7 @@ Options:
   --soak MINUTES           instead of all that, train for so long with actors coming and going, sample what every process holds
                            (DIR/soak.csv), and look for anything that grows
   --cost TIMES             instead of all that, train so many times with checkpoints and so many times without, in turn, and tell what
-                           checkpoints and assembling flights cost; on a machine that does nothing else
+                           checkpoints and assembling episodes cost; on a machine that does nothing else
   -h, --help               this text
 
 Exit status: 0 everything was done, nothing differs, grew, is left or costs 3 %; 1 otherwise; 2 called wrongly.

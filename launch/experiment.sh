@@ -4,7 +4,7 @@ set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 
 help_if_asked "$@" <<END
-Usage: launch/experiment.sh NAME [--seeds K] [--jobs J] [--flights N] [--runs DIR] [--publish]
+Usage: launch/experiment.sh NAME [--seeds K] [--jobs J] [--episodes N] [--runs DIR] [--publish]
        launch/experiment.sh NAME --report [...]
        launch/experiment.sh --list
 
@@ -19,7 +19,7 @@ Options:
   --list       print the experiments, how many runs each is, and what it is to find out
   --seeds K    runs of each arm, with seeds 1 to K [default: what the experiment's file says]
   --jobs J     runs at a time [default: number of cores]
-  --flights N  shorten every run to N training flights, in a place of their own: runs/experiments/NAME_N_flights
+  --episodes N  shorten every run to N training episodes, in a place of their own: runs/experiments/NAME_N_episodes
   --runs DIR   where the runs of all experiments go [default: runs/experiments]
   --report     run nothing: tell again what is there
   --publish    put the report into RESULTS.md, between <!-- experiment: NAME --> and <!-- end -->, and its pictures and the

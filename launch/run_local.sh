@@ -20,7 +20,7 @@ Options:
                            its own configuration, and as many actors as you like; it comes to the same as if nothing had happened
   -h, --help               this text
 
-Ctrl-C stops in order: flights in the air are abandoned, the updates of the epoch are finished, everything learned is saved. A
+Ctrl-C stops in order: episodes in the air are abandoned, the updates of the epoch are finished, everything learned is saved. A
 second Ctrl-C stops at once.
 RUST_LOG=debug makes the logs in DIR/logs say more; SKEIN_LOG_FORMAT=json writes them as one JSON object a line.
 

@@ -10,7 +10,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use serde_json::json;
-use skein_protocol::ids::{ActorId, Incarnation, PolicyVersion};
+use skein_protocol::ids::{ActorId, ActorIncarnation, PolicyVersion};
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::ticket::{ControlRecord, Ticket};
 use skein_protocol::transition::{RecordKind, TransitionRecord};
@@ -19,8 +19,8 @@ use common::{Learner, ticket};
 
 /// Longer than any machine takes for a step.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Flights after which memory is looked at, each with a snapshot of its own: the actor then holds as many as it ever does, and has let go of others.
-const FLIGHTS: u64 = 12;
+/// Episodes after which memory is looked at, each with a snapshot of its own: the actor then holds as many as it ever does, and has let go of others.
+const EPISODES: u64 = 12;
 const ACTOR: ActorId = ActorId(0);
 
 fn main() {
@@ -68,19 +68,19 @@ impl Learner {
         self.fly(0, *version, incarnation);
         self.until(|| self.record(incarnation));
         let secs = started.elapsed().as_secs_f64();
-        for flight in 1..FLIGHTS {
+        for episode in 1..EPISODES {
             self.until(|| Some(self.record(incarnation)?.kind == RecordKind::Closing.code()).filter(|closed| *closed));
             *version += 1;
             self.publish(*version);
-            self.fly(flight, *version, incarnation);
+            self.fly(episode, *version, incarnation);
         }
         (secs, actor.resident_bytes())
     }
 
-    fn fly(&self, flight: u64, version: u64, incarnation: Incarnation) {
+    fn fly(&self, episode: u64, version: u64, incarnation: ActorIncarnation) {
         let ticket = Ticket {
             policy_version: PolicyVersion(version),
-            ..ticket(self.identity.run, flight, 1)
+            ..ticket(self.identity.run, episode, 1)
         };
         self.ports.maintain().expect("the actor's memory can be mapped");
         self.ports
@@ -89,7 +89,7 @@ impl Learner {
         self.ports.wake_actors().expect("the event can be raised");
     }
 
-    fn record(&self, incarnation: Incarnation) -> Option<TransitionRecord> {
+    fn record(&self, incarnation: ActorIncarnation) -> Option<TransitionRecord> {
         let record = self
             .ports
             .receive_transition()

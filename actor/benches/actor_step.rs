@@ -1,8 +1,8 @@
 //! One actor's whole step, from the camera to the record sent, against the sum of its stages.
 //!
-//! An iteration is a training flight through real shared memory, no longer than it must be: the shorter, the more of them nobody disturbs. Every stage is
+//! An iteration is a training episode through real shared memory, no longer than it must be: the shorter, the more of them nobody disturbs. Every stage is
 //! given exactly what it was made of, so that whatever the whole takes beyond the sum of the stages is the loop's own. The learner's end is emptied after
-//! each flight, outside the time taken. What an actor does for the learner's sake between two steps, to listen and to give signs of life (`control` in the table
+//! each episode, outside the time taken. What an actor does for the learner's sake between two steps, to listen and to give heartbeats (`control` in the table
 //! of a run), is in neither: it depends on what the learner says.
 
 mod common;
@@ -17,10 +17,10 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_actor::agent::Agent;
 use skein_actor::courses::{Courses, Simulators};
-use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
+use skein_actor::environment_loop::{Directive, EnvironmentLoop, RecordLink};
 use skein_inference::{Network, Scratch};
 use skein_protocol::config::View;
-use skein_protocol::ids::{ActorId, Incarnation};
+use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
 use skein_protocol::snapshot::SnapshotLayout;
@@ -31,7 +31,7 @@ use skein_protocol::{ACTION, IMAGE_PIXELS};
 use common::{Learner, ticket};
 
 const ACTOR: ActorId = ActorId(0);
-const INCARNATION: Incarnation = Incarnation(0);
+const INCARNATION: ActorIncarnation = ActorIncarnation(0);
 
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
@@ -44,53 +44,53 @@ fn main() {
     );
     let courses = Arc::new(Courses::of_run(config).expect("shipped courses can be flown"));
     let tickets = [ticket(transport.learner.identity.run, 1, 1)];
-    let mut pilot = Pilot::new(
+    let mut environment_loop = EnvironmentLoop::new(
         ACTOR,
         INCARNATION,
         Simulators::new(Arc::clone(&courses)),
         Agent::new(config.view()),
     );
-    let flights: Vec<Vec<TransitionRecord>> = tickets
+    let episodes: Vec<Vec<TransitionRecord>> = tickets
         .iter()
         .map(|ticket| {
-            fly(&mut pilot, ticket, &network, &transport);
+            fly(&mut environment_loop, ticket, &network, &transport);
             transport.received()
         })
         .collect();
-    let steps = flights.iter().map(|records| records.len() - 1).sum::<usize>();
+    let steps = episodes.iter().map(|records| records.len() - 1).sum::<usize>();
 
     let mut group = criterion.benchmark_group("actor_step");
     group.throughput(Throughput::Elements(steps as u64));
     group.bench_function("whole", |bencher| {
         bencher.iter_custom(|iterations| {
-            timed(iterations, flights.len(), &transport, |flight| {
-                fly(&mut pilot, &tickets[flight], &network, &transport);
+            timed(iterations, episodes.len(), &transport, |episode| {
+                fly(&mut environment_loop, &tickets[episode], &network, &transport);
             })
         });
     });
-    environment(&mut group, &tickets, &flights, &mut Simulators::new(courses));
-    inference(&mut group, &flights, &network, &config.view());
-    sending(&mut group, &tickets, &flights, &transport);
+    environment(&mut group, &tickets, &episodes, &mut Simulators::new(courses));
+    inference(&mut group, &episodes, &network, &config.view());
+    sending(&mut group, &tickets, &episodes, &transport);
     group.finish();
     criterion.final_summary();
 }
 
-fn fly(pilot: &mut Pilot, ticket: &Ticket, network: &Network, transport: &Transport) {
-    let flown = pilot.fly(ticket, network, &mut Link(&transport.actor));
+fn fly(environment_loop: &mut EnvironmentLoop, ticket: &Ticket, network: &Network, transport: &Transport) {
+    let flown = environment_loop.fly(ticket, network, &mut Link(&transport.actor));
     black_box(flown.expect("memory is free, as all records were taken in"));
 }
 
-/// Take-off, physics and camera: the same starts and actions.
+/// Reset, physics and camera: the same starts and actions.
 fn environment(
     group: &mut BenchmarkGroup<'_, WallTime>,
     tickets: &[Ticket],
-    flights: &[Vec<TransitionRecord>],
+    episodes: &[Vec<TransitionRecord>],
     simulators: &mut Simulators,
 ) {
     let mut image = [0; IMAGE_PIXELS];
     group.bench_function("environment", |bencher| {
         bencher.iter(|| {
-            for (ticket, records) in tickets.iter().zip(flights) {
+            for (ticket, records) in tickets.iter().zip(episodes) {
                 let simulator = simulators.of(ticket).expect("the course is loaded");
                 let [mut start, mut disturbances] = [Purpose::StartPosition, Purpose::Disturbances]
                     .map(|purpose| Pcg64Mcg::seed_from_u64(derive(ticket.seed, purpose, 0)));
@@ -99,7 +99,7 @@ fn environment(
                     .expect("it has this level");
                 simulator.render(&mut image);
                 for record in steps_of(records) {
-                    black_box(simulator.step(record.action).expect("the flight was flown before"));
+                    black_box(simulator.step(record.action).expect("the episode was flown before"));
                     simulator.render(&mut image);
                     black_box(&image);
                 }
@@ -111,14 +111,14 @@ fn environment(
 /// Encoder and policy: the same images and observations.
 fn inference(
     group: &mut BenchmarkGroup<'_, WallTime>,
-    flights: &[Vec<TransitionRecord>],
+    episodes: &[Vec<TransitionRecord>],
     network: &Network,
     view: &View,
 ) {
     let mut scratch = Scratch::default();
     group.bench_function("encoder", |bencher| {
         bencher.iter(|| {
-            for record in flights.iter().flatten() {
+            for record in episodes.iter().flatten() {
                 black_box(network.encode(black_box(&record.depth), &mut scratch));
             }
         });
@@ -127,7 +127,7 @@ fn inference(
     let mut observed = vec![0.0; view.len()];
     group.bench_function("policy", |bencher| {
         bencher.iter(|| {
-            for record in flights.iter().flat_map(|records| steps_of(records)) {
+            for record in episodes.iter().flat_map(|records| steps_of(records)) {
                 view.write_moment(&record.latent, &record.velocity_mps, &[0.0; ACTION], &mut observed);
                 black_box(network.distribution(&observed, &mut scratch).sample(&mut noise));
             }
@@ -139,7 +139,7 @@ fn inference(
 fn sending(
     group: &mut BenchmarkGroup<'_, WallTime>,
     tickets: &[Ticket],
-    flights: &[Vec<TransitionRecord>],
+    episodes: &[Vec<TransitionRecord>],
     transport: &Transport,
 ) {
     let begin = |ticket: &Ticket, step| {
@@ -150,10 +150,10 @@ fn sending(
     let send = |record| transport.actor.send_transition(record).expect("the learner is there");
     group.bench_function("sending", |bencher| {
         bencher.iter_custom(|iterations| {
-            timed(iterations, flights.len(), transport, |flight| {
-                let mut record = begin(&tickets[flight], 0);
-                for step in 1..flights[flight].len() as u32 {
-                    let next = begin(&tickets[flight], step);
+            timed(iterations, episodes.len(), transport, |episode| {
+                let mut record = begin(&tickets[episode], 0);
+                for step in 1..episodes[episode].len() as u32 {
+                    let next = begin(&tickets[episode], step);
                     send(std::mem::replace(&mut record, next));
                 }
                 send(record);
@@ -162,13 +162,13 @@ fn sending(
     });
 }
 
-/// Time that `work` takes on all of so many flights, `iterations` times; the learner's end is emptied after each, at nobody's cost.
-fn timed(iterations: u64, flights: usize, transport: &Transport, mut work: impl FnMut(usize)) -> Duration {
+/// Time that `work` takes on all of so many episodes, `iterations` times; the learner's end is emptied after each, at nobody's cost.
+fn timed(iterations: u64, episodes: usize, transport: &Transport, mut work: impl FnMut(usize)) -> Duration {
     let mut spent = Duration::ZERO;
     for _ in 0..iterations {
-        for flight in 0..flights {
+        for episode in 0..episodes {
             let start = Instant::now();
-            work(flight);
+            work(episode);
             spent += start.elapsed();
             transport.empty();
         }

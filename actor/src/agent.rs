@@ -14,7 +14,7 @@ use skein_inference::{Network, Scratch};
 #[derive(Debug)]
 pub struct Agent {
     view: View,
-    /// What was seen of each moment of the flight so far, `[steps, View::moment_len]`.
+    /// What was seen of each moment of the episode so far, `[steps, View::moment_len]`.
     moments: Vec<f32>,
     /// The policy's input, `[View::len]`.
     observed: Vec<f32>,
@@ -52,7 +52,7 @@ impl Agent {
     }
 
     /// Chooses an action on the observation in `record`, each command in [-1, 1]. `noise` is drawn from unless the policy's mode is asked for. Called for each step
-    /// of a flight, in order; the record of step 0 begins another one.
+    /// of an episode, in order; the record of step 0 begins another one.
     pub fn act(
         &mut self,
         exploration: Exploration,
@@ -82,7 +82,7 @@ impl Agent {
         }
     }
 
-    /// Keeps what is seen of the moment in `record`, and forgets what was seen in an earlier flight.
+    /// Keeps what is seen of the moment in `record`, and forgets what was seen in an earlier episode.
     fn remember(&mut self, record: &TransitionRecord, previous_action: &[f32; ACTION]) {
         let len = self.view.moment_len();
         let first = record.step as usize * len;

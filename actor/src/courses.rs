@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use skein_protocol::config::{Config, CoursesSection};
-use skein_protocol::ids::FlightId;
+use skein_protocol::ids::EpisodeId;
 use skein_protocol::ticket::{CourseChoice, Ticket};
 use skein_simulator::course::{Course, CourseError, RangesError};
 use skein_simulator::disturbances::DisturbanceFault;
@@ -21,7 +21,7 @@ pub struct Courses {
     evaluation: Vec<EvaluationEntry>,
 }
 
-/// What a ticket of [`CourseChoice::Evaluation`] names: a course, or several that its flights fly in turn.
+/// What a ticket of [`CourseChoice::Evaluation`] names: a course, or several that its episodes fly in turn.
 #[derive(Debug)]
 pub struct EvaluationEntry {
     /// Courses, and what reports call them.
@@ -34,7 +34,7 @@ pub struct EvaluationEntry {
 pub struct Simulators {
     courses: Arc<Courses>,
     fixed: HashMap<CourseChoice, Simulator>,
-    /// Where every flight has a course of its own, only the last is kept: a ticket issued again may come back to it.
+    /// Where every episode has a course of its own, only the last is kept: a ticket issued again may come back to it.
     passing: Option<(Passing, Simulator)>,
 }
 
@@ -62,7 +62,7 @@ impl Courses {
         let entry = |path: &P| {
             let entry = SuiteEntry {
                 name: CoursesSection::name_of(path.as_ref()),
-                flights: config.evaluation.flights,
+                episodes: config.evaluation.episodes,
                 courses: EntryCourses::Listed(vec![load(path.as_ref())?]),
                 disturbances: settings.disturbances.clone(),
             };
@@ -111,11 +111,11 @@ impl Courses {
         })
     }
 
-    /// The same with `flights` evaluation flights of each entry.
+    /// The same with `episodes` evaluation episodes of each entry.
     #[must_use]
-    pub fn with_flights(mut self, flights: u64) -> Self {
+    pub fn with_episodes(mut self, episodes: u64) -> Self {
         for evaluated in &mut self.evaluation {
-            evaluated.entry.flights = flights;
+            evaluated.entry.episodes = episodes;
         }
         self
     }
@@ -146,7 +146,7 @@ impl Courses {
             }
             CourseChoice::Evaluation(index) => {
                 let EvaluationEntry { entry, settings } = self.entry(choice, index)?;
-                (entry.courses.of_flight(evaluation_flight(ticket))?, settings)
+                (entry.courses.of_episode(evaluation_episode(ticket))?, settings)
             }
             CourseChoice::Generated(seed) => (
                 Arc::new(Course::generate(seed, &self.settings.generator)?),
@@ -164,15 +164,15 @@ impl Courses {
             CourseChoice::Generated(_) => Some((choice, 0)),
             CourseChoice::Evaluation(index) => match &self.entry(choice, index)?.entry.courses {
                 EntryCourses::Listed(courses) if courses.len() == 1 => None,
-                several => Some((choice, several.number_of(evaluation_flight(ticket)))),
+                several => Some((choice, several.number_of(evaluation_episode(ticket)))),
             },
         })
     }
 }
 
-/// The flight's number within its evaluation, from 0: the one that says which of several courses it flies.
-fn evaluation_flight(ticket: &Ticket) -> u64 {
-    ticket.flight.0.saturating_sub(FlightId::FIRST_EVALUATION.0)
+/// The episode's number within its evaluation, from 0: the one that says which of several courses it flies.
+fn evaluation_episode(ticket: &Ticket) -> u64 {
+    ticket.episode.0.saturating_sub(EpisodeId::FIRST_EVALUATION.0)
 }
 
 impl Simulators {
@@ -269,18 +269,18 @@ mod tests {
     use super::*;
     use crate::testing::config;
 
-    /// The ticket of flight `flight` of an evaluation, or of a training flight on `course`.
-    fn ticket(course: CourseChoice, flight: u64) -> Ticket {
+    /// The ticket of episode `episode` of an evaluation, or of a training episode on `course`.
+    fn ticket(course: CourseChoice, episode: u64) -> Ticket {
         Ticket {
             run: RunId(0),
-            flight: FlightId(FlightId::FIRST_EVALUATION.0 + flight),
+            episode: EpisodeId(EpisodeId::FIRST_EVALUATION.0 + episode),
             attempt: Attempt(0),
             policy_version: PolicyVersion(0),
             course,
             start_level: 1,
             exploration: Exploration::Mode,
             seed: 1,
-            leg: None,
+            segment: None,
         }
     }
 
@@ -325,10 +325,10 @@ mod tests {
     }
 
     #[test]
-    fn flights_of_an_entry_fly_its_courses_in_turn_with_its_disturbances() {
+    fn episodes_of_an_entry_fly_its_courses_in_turn_with_its_disturbances() {
         let text = r#"
             name = "two orders and what is generated"
-            flights = 4
+            episodes = 4
             [[entry]]
             name = "orders"
             orders_of = "training.toml"
@@ -344,8 +344,10 @@ mod tests {
         let suite = Suite::parse(text, &path).unwrap();
         let courses = Arc::new(Courses::of_suite(&config("disturbances.mass_spread = 0.1"), suite).unwrap());
         let mut simulators = Simulators::new(Arc::clone(&courses));
-        let mut order = |entry, flight| {
-            let simulator = simulators.of(&ticket(CourseChoice::Evaluation(entry), flight)).unwrap();
+        let mut order = |entry, episode| {
+            let simulator = simulators
+                .of(&ticket(CourseChoice::Evaluation(entry), episode))
+                .unwrap();
             let walls = simulator.course().walls().iter();
             walls.map(|wall| wall.safe_point()).collect::<Vec<_>>()
         };

@@ -1,18 +1,18 @@
-//! The environment loop: one ticket in, one flight out, or one leg of a flight.
+//! The environment loop: one ticket in, one episode out, or one segment of an episode.
 //!
-//! [`Pilot::fly`] is the whole of it, and the only one: training, evaluation during training and evaluation of a file differ in the ticket and in where
-//! the records go. A flight is a function of its ticket and of the snapshot the ticket names, so nothing is remembered from one flight to the next, and
-//! start, exploration noise and disturbances are drawn from generators of their own. What is remembered from one leg to the next saves time alone.
+//! [`EnvironmentLoop::fly`] is the whole of it, and the only one: training, evaluation during training and evaluation of a file differ in the ticket and in where
+//! the records go. An episode is a function of its ticket and of the snapshot the ticket names, so nothing is remembered from one episode to the next, and
+//! start, exploration noise and disturbances are drawn from generators of their own. What is remembered from one segment to the next saves time alone.
 
 use std::ops::DerefMut;
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::ACTION;
-use skein_protocol::evaluation::FlightScore;
-use skein_protocol::ids::{ActorId, Incarnation};
-use skein_protocol::leg::Leg;
+use skein_protocol::evaluation::EpisodeScore;
+use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::seeds::{Purpose, derive};
+use skein_protocol::segment::Segment;
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
@@ -25,19 +25,19 @@ use crate::courses::{NoCourse, Simulators};
 use skein_inference::Network;
 
 /// Flies tickets.
-pub struct Pilot {
+pub struct EnvironmentLoop {
     actor: ActorId,
-    incarnation: Incarnation,
+    incarnation: ActorIncarnation,
     simulators: Simulators,
     reward: RewardSettings,
     agent: Agent,
-    /// What the last ticket left in the air, if it was for a leg.
+    /// What the last ticket left in the air, if it was for a segment.
     under_way: Option<UnderWay>,
 }
 
-impl Pilot {
-    /// A pilot who signs records as `incarnation` of `actor`.
-    pub fn new(actor: ActorId, incarnation: Incarnation, simulators: Simulators, agent: Agent) -> Self {
+impl EnvironmentLoop {
+    /// A environment_loop who signs records as `incarnation` of `actor`.
+    pub fn new(actor: ActorId, incarnation: ActorIncarnation, simulators: Simulators, agent: Agent) -> Self {
         let reward = simulators.settings().reward.clone();
         Self {
             actor,
@@ -50,25 +50,25 @@ impl Pilot {
     }
 
     /// Signs records as `incarnation` from now on.
-    pub fn begin_life(&mut self, incarnation: Incarnation) {
+    pub fn begin_incarnation(&mut self, incarnation: ActorIncarnation) {
         self.incarnation = incarnation;
     }
 
-    /// Flies `ticket` with `network` to the end of its flight or its leg: each step a record into `link`, and a closing one at last. `None` when the flight
-    /// goes on after the leg.
+    /// Flies `ticket` with `network` to the end of its episode or its segment: each step a record into `link`, and a closing one at last. `None` when the episode
+    /// goes on after the segment.
     ///
     /// # Errors
-    /// [`FlightError`]; what was sent on this ticket is void then.
+    /// [`EpisodeError`]; what was sent on this ticket is void then.
     pub fn fly<L: RecordLink>(
         &mut self,
         ticket: &Ticket,
         network: &Network,
         link: &mut L,
-    ) -> Result<Option<FlightScore>, FlightError<L::Error>> {
-        // Each leg draws from a generator of its own: who flies a later one need not know how often the earlier ones drew.
+    ) -> Result<Option<EpisodeScore>, EpisodeError<L::Error>> {
+        // Each segment draws from a generator of its own: who flies a later one need not know how often the earlier ones drew.
         let mut noise = generator(ticket, Purpose::ActionNoise, ticket.first_step());
         let begin = |link: &mut L, step| {
-            let mut record = link.loan().map_err(FlightError::Link)?;
+            let mut record = link.loan().map_err(EpisodeError::Link)?;
             record.begin(ticket, self.actor, self.incarnation, step);
             Ok(record)
         };
@@ -78,14 +78,14 @@ impl Pilot {
             Ok(taken_up) => taken_up,
             Err(fault) => return Err(give_up(fault, record, link)),
         };
-        link.lap(Stage::TakeOff);
+        link.lap(Stage::Reset);
         self.agent
             .observe(simulator, network, &mut record, |stage| link.lap(stage));
 
-        let mut flight_return = 0.0;
+        let mut episode_return = 0.0;
         for step in ticket.first_step() + 1.. {
-            if link.directive().map_err(FlightError::Link)? == Directive::Abandon {
-                return Err(FlightError::Abandoned);
+            if link.directive().map_err(EpisodeError::Link)? == Directive::Abandon {
+                return Err(EpisodeError::Abandoned);
             }
             let previous_action = flown.last().copied().unwrap_or_default();
             let action = self
@@ -104,29 +104,29 @@ impl Pilot {
                 .observe(simulator, network, &mut next, |stage| link.lap(stage));
             let reward = RewardTerms::of(&self.reward, &report, &next.depth);
             complete(&mut record, action, &report, &reward);
-            link.send(record).map_err(FlightError::Link)?;
+            link.send(record).map_err(EpisodeError::Link)?;
 
-            flight_return += f64::from(reward.total());
+            episode_return += f64::from(reward.total());
             flown.push(action);
             record = next;
             if let Some(ended) = report.outcome {
-                let score = close(&mut record, outcome(ended), &report, simulator.course(), flight_return);
-                link.send(record).map_err(FlightError::Link)?;
+                let score = close(&mut record, outcome(ended), &report, simulator.course(), episode_return);
+                link.send(record).map_err(EpisodeError::Link)?;
                 return Ok(Some(score));
             }
-            if is_last_of_leg(ticket, step) {
-                record.kind = RecordKind::LegEnd.code();
+            if is_last_of_segment(ticket, step) {
+                record.kind = RecordKind::SegmentEnd.code();
                 record.walls_passed = report.walls_passed;
-                link.send(record).map_err(FlightError::Link)?;
+                link.send(record).map_err(EpisodeError::Link)?;
                 self.under_way = Some(UnderWay::after(ticket, flown));
                 return Ok(None);
             }
         }
-        unreachable!("the simulator's step limit ends every flight before the step numbers run out")
+        unreachable!("the simulator's step limit ends every episode before the step numbers run out")
     }
 }
 
-/// Where a flight's records go: shared memory in a run, plain memory in a stand-alone evaluation.
+/// Where an episode's records go: shared memory in a run, plain memory in a stand-alone evaluation.
 pub trait RecordLink {
     /// A record being written.
     type Loan: DerefMut<Target = TransitionRecord>;
@@ -160,27 +160,27 @@ pub trait RecordLink {
 pub enum Directive {
     /// Fly on.
     Continue,
-    /// Break the flight off: nobody wants it any more.
+    /// Break the episode off: nobody wants it any more.
     Abandon,
 }
 
-/// Why a flight was not flown to its end.
+/// Why an episode was not flown to its end.
 #[derive(Debug, thiserror::Error)]
-pub enum FlightError<E: std::error::Error + 'static> {
+pub enum EpisodeError<E: std::error::Error + 'static> {
     /// It was told to stop.
-    #[error("the flight was abandoned")]
+    #[error("the episode was abandoned")]
     Abandoned,
     /// The ticket or the physics is at fault; the link has been told by a record of kind [`RecordKind::Failed`].
-    #[error("the flight failed: {0}")]
-    Fault(#[source] FlightFault),
+    #[error("the episode failed: {0}")]
+    Fault(#[source] EpisodeFault),
     /// Records cannot be sent.
-    #[error("the flight's records cannot be sent: {0}")]
+    #[error("the episode's records cannot be sent: {0}")]
     Link(#[source] E),
 }
 
-/// What is wrong with a flight itself: whoever flies it again meets it again.
+/// What is wrong with an episode itself: whoever flies it again meets it again.
 #[derive(Debug, thiserror::Error)]
-pub enum FlightFault {
+pub enum EpisodeFault {
     /// The ticket names a course that is not there.
     #[error(transparent)]
     Course(#[from] NoCourse),
@@ -190,8 +190,8 @@ pub enum FlightFault {
     /// The simulation broke down.
     #[error(transparent)]
     Simulation(#[from] SimulationError),
-    /// The actions before a leg do not lead to it.
-    #[error("the flight ends in step {step} of the {flown} that are said to have been flown before the leg")]
+    /// The actions before a segment do not lead to it.
+    #[error("the episode ends in step {step} of the {flown} that are said to have been flown before the segment")]
     EndedBefore {
         /// The step, from 1.
         step: usize,
@@ -200,10 +200,10 @@ pub enum FlightFault {
     },
 }
 
-/// A flight in the middle, in the simulator that has flown the last of it.
+/// An episode in the middle, in the simulator that has flown the last of it.
 struct UnderWay {
     ticket: Ticket,
-    /// From take-off on.
+    /// From reset on.
     flown: Vec<[f32; ACTION]>,
 }
 
@@ -213,53 +213,53 @@ impl UnderWay {
         Self { ticket, flown }
     }
 
-    /// Whether `leg` of the flight of `ticket` begins here, to the last bit.
-    fn is_before(&self, ticket: &Ticket, leg: &Leg) -> bool {
-        let flight = |ticket: &Ticket| {
+    /// Whether `segment` of the episode of `ticket` begins here, to the last bit.
+    fn is_before(&self, ticket: &Ticket, segment: &Segment) -> bool {
+        let episode = |ticket: &Ticket| {
             (
                 ticket.run,
-                ticket.flight,
+                ticket.episode,
                 ticket.course,
                 ticket.start_level,
                 ticket.seed,
             )
         };
         let bits = |actions: &[[f32; ACTION]]| -> Vec<_> { actions.iter().flatten().map(|x| x.to_bits()).collect() };
-        flight(&self.ticket) == flight(ticket) && bits(&self.flown) == bits(&leg.flown)
+        episode(&self.ticket) == episode(ticket) && bits(&self.flown) == bits(&segment.flown)
     }
 }
 
-/// The simulator where `ticket` begins, and the actions that led there: at take-off or, of a later leg, where the one before ended. If that was not flown here,
+/// The simulator where `ticket` begins, and the actions that led there: at reset or, of a later segment, where the one before ended. If that was not flown here,
 /// or something else was since, the actions are repeated, which leads to the same place.
 fn take_up<'a>(
     simulators: &'a mut Simulators,
     under_way: Option<UnderWay>,
     ticket: &Ticket,
-) -> Result<(&'a mut Simulator, Vec<[f32; ACTION]>), FlightFault> {
-    let Some(leg) = &ticket.leg else {
-        return Ok((take_off(simulators, ticket)?, Vec::new()));
+) -> Result<(&'a mut Simulator, Vec<[f32; ACTION]>), EpisodeFault> {
+    let Some(segment) = &ticket.segment else {
+        return Ok((reset(simulators, ticket)?, Vec::new()));
     };
-    if let Some(under_way) = under_way.filter(|under_way| under_way.is_before(ticket, leg)) {
+    if let Some(under_way) = under_way.filter(|under_way| under_way.is_before(ticket, segment)) {
         return Ok((simulators.of(ticket)?, under_way.flown));
     }
-    let simulator = take_off(simulators, ticket)?;
-    for (number, action) in (1..).zip(leg.flown.iter()) {
+    let simulator = reset(simulators, ticket)?;
+    for (number, action) in (1..).zip(segment.flown.iter()) {
         if simulator.step(*action)?.outcome.is_some() {
-            return Err(FlightFault::EndedBefore {
+            return Err(EpisodeFault::EndedBefore {
                 step: number,
-                flown: leg.flown.len(),
+                flown: segment.flown.len(),
             });
         }
     }
-    Ok((simulator, leg.flown.to_vec()))
+    Ok((simulator, segment.flown.to_vec()))
 }
 
-fn is_last_of_leg(ticket: &Ticket, step: u32) -> bool {
-    let leg = ticket.leg.as_ref();
-    leg.is_some_and(|leg| step == ticket.first_step() + leg.steps)
+fn is_last_of_segment(ticket: &Ticket, step: u32) -> bool {
+    let segment = ticket.segment.as_ref();
+    segment.is_some_and(|segment| step == ticket.first_step() + segment.steps)
 }
 
-fn take_off<'a>(simulators: &'a mut Simulators, ticket: &Ticket) -> Result<&'a mut Simulator, FlightFault> {
+fn reset<'a>(simulators: &'a mut Simulators, ticket: &Ticket) -> Result<&'a mut Simulator, EpisodeFault> {
     let simulator = simulators.of(ticket)?;
     simulator.reset(
         ticket.start_level,
@@ -269,7 +269,7 @@ fn take_off<'a>(simulators: &'a mut Simulators, ticket: &Ticket) -> Result<&'a m
     Ok(simulator)
 }
 
-/// What draws for one purpose in the flight of `ticket`, from `step` on.
+/// What draws for one purpose in the episode of `ticket`, from `step` on.
 fn generator(ticket: &Ticket, purpose: Purpose, step: u32) -> Pcg64Mcg {
     Pcg64Mcg::seed_from_u64(derive(ticket.seed, purpose, step.into()))
 }
@@ -286,30 +286,30 @@ fn complete(record: &mut TransitionRecord, action: [f32; ACTION], report: &StepR
     record.truncated = u8::from(report.outcome == Some(simulator::Outcome::TimedOut));
 }
 
-/// Makes a record with an observation the flight's last; returns what the flight came to.
+/// Makes a record with an observation the episode's last; returns what the episode came to.
 fn close(
     record: &mut TransitionRecord,
     outcome: Outcome,
     report: &StepReport,
     course: &Course,
-    flight_return: f64,
-) -> FlightScore {
+    episode_return: f64,
+) -> EpisodeScore {
     let hit_wall = hit_wall(report);
     record.kind = RecordKind::Closing.code();
     record.walls_passed = report.walls_passed;
     record.course_walls = course.levels();
     record.outcome = outcome.code();
     record.hit_wall = hit_wall.unwrap_or(0);
-    FlightScore {
+    EpisodeScore {
         walls_passed: report.walls_passed.into(),
-        // As in `flights.csv`; of a leg, what was earned in it.
-        flight_return: f64::from(flight_return as f32),
+        // As in `episodes.csv`; of a segment, what was earned in it.
+        episode_return: f64::from(episode_return as f32),
         outcome,
         hit_wall,
     }
 }
 
-/// The wall that was hit, from 1 in flight order.
+/// The wall that was hit, from 1 in episode order.
 fn hit_wall(report: &StepReport) -> Option<u8> {
     match report.hit {
         Some(Obstacle::Wall(place)) => Some(place),
@@ -317,12 +317,12 @@ fn hit_wall(report: &StepReport) -> Option<u8> {
     }
 }
 
-/// Sends `record` as the word that the flight has failed.
-fn give_up<L: RecordLink>(fault: FlightFault, mut record: L::Loan, link: &mut L) -> FlightError<L::Error> {
+/// Sends `record` as the word that the episode has failed.
+fn give_up<L: RecordLink>(fault: EpisodeFault, mut record: L::Loan, link: &mut L) -> EpisodeError<L::Error> {
     record.kind = RecordKind::Failed.code();
     match link.send(record) {
-        Ok(()) => FlightError::Fault(fault),
-        Err(error) => FlightError::Link(error),
+        Ok(()) => EpisodeError::Fault(fault),
+        Err(error) => EpisodeError::Link(error),
     }
 }
 
@@ -336,6 +336,6 @@ fn outcome(ended: simulator::Outcome) -> Outcome {
 }
 
 #[cfg(test)]
-mod leg_tests;
+mod segment_tests;
 #[cfg(test)]
 mod tests;

@@ -1,6 +1,6 @@
 //! Evaluation without a learner: how a snapshot flies, entry by entry: a course, or a suite's several.
 //!
-//! The flights are those of the environment loop, with tickets written here: mode action, start of level 1, seeds from the run's. They are spread over all
+//! The episodes are those of the environment loop, with tickets written here: mode action, start of level 1, seeds from the run's. They are spread over all
 //! cores; which thread flies which changes nothing.
 
 use std::convert::Infallible;
@@ -11,8 +11,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytemuck::Zeroable;
 use skein_protocol::config::Config;
-use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
-use skein_protocol::ids::{ActorId, Attempt, FlightId, Incarnation, RunId};
+use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
+use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, RunId};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
@@ -20,7 +20,7 @@ use skein_protocol::transition::TransitionRecord;
 
 use crate::agent::Agent;
 use crate::courses::{Courses, Simulators};
-use crate::environment_loop::{Directive, FlightError, FlightFault, Pilot, RecordLink};
+use crate::environment_loop::{Directive, EnvironmentLoop, EpisodeError, EpisodeFault, RecordLink};
 use skein_inference::Network;
 
 /// Most threads of an evaluation: more cores than any machine we know of has, few enough for every system's limits.
@@ -37,11 +37,11 @@ pub struct Evaluation<'a> {
     pub courses: Arc<Courses>,
     /// Most threads to fly on; without influence on the result. See [`Evaluation::threads`].
     pub threads: NonZeroUsize,
-    /// What to keep of the flights.
+    /// What to keep of the episodes.
     pub keep: Keep,
 }
 
-/// What to keep of the flights.
+/// What to keep of the episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Keep {
     /// Their scores.
@@ -55,15 +55,15 @@ pub enum Keep {
 pub struct Evaluated {
     /// Entry by entry.
     pub report: EvaluationReport,
-    /// Entry by entry, flight by flight.
-    pub flights: Vec<Vec<EvaluatedFlight>>,
+    /// Entry by entry, episode by episode.
+    pub episodes: Vec<Vec<EvaluatedEpisode>>,
 }
 
-/// One flight of an evaluation.
+/// One episode of an evaluation.
 #[derive(Debug, Clone)]
-pub struct EvaluatedFlight {
+pub struct EvaluatedEpisode {
     /// What it came to.
-    pub score: FlightScore,
+    pub score: EpisodeScore,
     /// Walls of the course.
     pub walls: usize,
     /// Its steps and its closing record, if they were to be kept.
@@ -73,16 +73,16 @@ pub struct EvaluatedFlight {
 /// Why an evaluation came to nothing.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
-    /// A flight cannot be flown.
-    #[error("course \"{course}\", flight {flight}: {fault}")]
-    Flight {
+    /// An episode cannot be flown.
+    #[error("course \"{course}\", episode {episode}: {fault}")]
+    Episode {
         /// The course or entry.
         course: String,
-        /// The flight's number in that entry, from 0.
-        flight: u64,
+        /// The episode's number in that entry, from 0.
+        episode: u64,
         /// What went wrong.
         #[source]
-        fault: FlightFault,
+        fault: EpisodeFault,
     },
     /// The system has no room for so many threads.
     #[error("cannot start thread {thread} of {threads}: {source}; ask for fewer")]
@@ -97,29 +97,32 @@ pub enum EvaluationError {
 }
 
 impl Evaluation<'_> {
-    /// Threads that are flown on: not more than there are flights, nor than [`MAX_THREADS`].
+    /// Threads that are flown on: not more than there are episodes, nor than [`MAX_THREADS`].
     pub fn threads(&self) -> usize {
-        let flights = usize::try_from(self.total()).unwrap_or(usize::MAX);
-        self.threads.get().min(flights).min(MAX_THREADS)
+        let episodes = usize::try_from(self.total()).unwrap_or(usize::MAX);
+        self.threads.get().min(episodes).min(MAX_THREADS)
     }
 
-    /// Flies all flights.
+    /// Flies all episodes.
     ///
     /// # Errors
-    /// [`EvaluationError`] names the first flight, in entry and flight order, that cannot be flown, or the thread that cannot be had.
+    /// [`EvaluationError`] names the first episode, in entry and episode order, that cannot be flown, or the thread that cannot be had.
     pub fn run(&self) -> Result<Evaluated, EvaluationError> {
-        let mut flights = self.fly_all()?.into_iter();
+        let mut episodes = self.fly_all()?.into_iter();
         let mut courses = Vec::new();
         let mut by_course = Vec::new();
         for entry in self.courses.evaluation() {
-            let flights: Vec<_> = flights
+            let episodes: Vec<_> = episodes
                 .by_ref()
-                .take(entry.flights as usize)
+                .take(entry.episodes as usize)
                 .collect::<Result<_, _>>()?;
-            let scores: Vec<_> = flights.iter().map(|flight: &EvaluatedFlight| flight.score).collect();
-            let walls = flights.iter().map(|flight| flight.walls).max().unwrap_or(0);
+            let scores: Vec<_> = episodes
+                .iter()
+                .map(|episode: &EvaluatedEpisode| episode.score)
+                .collect();
+            let walls = episodes.iter().map(|episode| episode.walls).max().unwrap_or(0);
             courses.push(CourseEvaluation::of(&entry.name, walls, &scores));
-            by_course.push(flights);
+            by_course.push(episodes);
         }
         let report = EvaluationReport {
             policy_version: self.snapshot.version,
@@ -128,12 +131,12 @@ impl Evaluation<'_> {
         };
         Ok(Evaluated {
             report,
-            flights: by_course,
+            episodes: by_course,
         })
     }
 
-    /// Every flight's end, in entry and flight order.
-    fn fly_all(&self) -> Result<Vec<Result<EvaluatedFlight, EvaluationError>>, EvaluationError> {
+    /// Every episode's end, in entry and episode order.
+    fn fly_all(&self) -> Result<Vec<Result<EvaluatedEpisode, EvaluationError>>, EvaluationError> {
         let network = Network::new(
             self.snapshot,
             &SnapshotLayout::of(self.config),
@@ -163,61 +166,61 @@ impl Evaluation<'_> {
                 .collect())
         })?;
         flown.sort_by_key(|(index, _)| *index);
-        Ok(flown.into_iter().map(|(_, flight)| flight).collect())
+        Ok(flown.into_iter().map(|(_, episode)| episode).collect())
     }
 
-    /// Flights of all entries together.
+    /// Episodes of all entries together.
     fn total(&self) -> u64 {
-        self.courses.evaluation().map(|entry| entry.flights).sum()
+        self.courses.evaluation().map(|entry| entry.episodes).sum()
     }
 
-    /// Entry and flight of the flight `index` of all, from 0.
+    /// Entry and episode of the episode `index` of all, from 0.
     fn place(&self, mut index: u64) -> Option<(u32, u64)> {
         for (entry, number) in self.courses.evaluation().zip(0..) {
-            if index < entry.flights {
+            if index < entry.episodes {
                 return Some((number, index));
             }
-            index -= entry.flights;
+            index -= entry.episodes;
         }
         None
     }
 
-    /// One thread's share: whatever flight is next. The number counts flights through all entries.
+    /// One thread's share: whatever episode is next. The number counts episodes through all entries.
     fn fly_next_until_done(
         &self,
         network: &Network,
         next: &AtomicU64,
-    ) -> Vec<(u64, Result<EvaluatedFlight, EvaluationError>)> {
+    ) -> Vec<(u64, Result<EvaluatedEpisode, EvaluationError>)> {
         let simulators = Simulators::new(Arc::clone(&self.courses));
         let agent = Agent::new(self.config.view());
-        let mut pilot = Pilot::new(ActorId(0), Incarnation(0), simulators, agent);
+        let mut environment_loop = EnvironmentLoop::new(ActorId(0), ActorIncarnation(0), simulators, agent);
         let mut flown = Vec::new();
         loop {
             let index = next.fetch_add(1, Ordering::Relaxed);
-            let Some((entry, flight)) = self.place(index) else {
+            let Some((entry, episode)) = self.place(index) else {
                 return flown;
             };
-            flown.push((index, self.fly(&mut pilot, network, entry, flight)));
+            flown.push((index, self.fly(&mut environment_loop, network, entry, episode)));
         }
     }
 
     fn fly(
         &self,
-        pilot: &mut Pilot,
+        environment_loop: &mut EnvironmentLoop,
         network: &Network,
         entry: u32,
-        flight: u64,
-    ) -> Result<EvaluatedFlight, EvaluationError> {
+        episode: u64,
+    ) -> Result<EvaluatedEpisode, EvaluationError> {
         let ticket = Ticket {
             run: RunId(0),
-            flight: FlightId(FlightId::FIRST_EVALUATION.0 + flight),
+            episode: EpisodeId(EpisodeId::FIRST_EVALUATION.0 + episode),
             attempt: Attempt(0),
             policy_version: self.snapshot.version,
             course: CourseChoice::Evaluation(entry),
             start_level: 1,
             exploration: Exploration::Mode,
-            seed: derive(self.config.run.seed, Purpose::EvaluationFlight, flight),
-            leg: None,
+            seed: derive(self.config.run.seed, Purpose::EvaluationEpisode, episode),
+            segment: None,
         };
         let mut memory = Memory {
             keep: self.keep,
@@ -225,20 +228,20 @@ impl Evaluation<'_> {
             spare: Vec::new(),
             sent: Vec::new(),
         };
-        match pilot.fly(&ticket, network, &mut memory) {
-            Ok(Some(score)) => Ok(EvaluatedFlight {
+        match environment_loop.fly(&ticket, network, &mut memory) {
+            Ok(Some(score)) => Ok(EvaluatedEpisode {
                 score,
                 walls: memory.walls,
                 records: memory.sent,
             }),
-            Err(FlightError::Fault(fault)) => {
+            Err(EpisodeError::Fault(fault)) => {
                 let names = self.courses.evaluation().map(|entry| entry.name.clone());
                 let course = names.into_iter().nth(entry as usize).unwrap_or_default();
-                Err(EvaluationError::Flight { course, flight, fault })
+                Err(EvaluationError::Episode { course, episode, fault })
             }
-            Err(FlightError::Link(never)) => match never {},
-            Ok(None) => unreachable!("its ticket is for a whole flight"),
-            Err(FlightError::Abandoned) => unreachable!("nobody tells an evaluation to stop"),
+            Err(EpisodeError::Link(never)) => match never {},
+            Ok(None) => unreachable!("its ticket is for a whole episode"),
+            Err(EpisodeError::Abandoned) => unreachable!("nobody tells an evaluation to stop"),
         }
     }
 }
@@ -280,7 +283,7 @@ mod tests {
     use crate::testing::{config, random_snapshot};
 
     /// What `look` sees of an evaluation on two courses.
-    fn look_at<T>(flights: u64, threads: usize, keep: Keep, look: impl Fn(&Evaluation<'_>) -> T) -> T {
+    fn look_at<T>(episodes: u64, threads: usize, keep: Keep, look: impl Fn(&Evaluation<'_>) -> T) -> T {
         let mut config = config("");
         config.courses.evaluation.truncate(2);
         look(&Evaluation {
@@ -289,7 +292,7 @@ mod tests {
             courses: Arc::new(
                 Courses::of_files(&config, &config.courses.evaluation)
                     .unwrap()
-                    .with_flights(flights),
+                    .with_episodes(episodes),
             ),
             threads: NonZeroUsize::new(threads).unwrap(),
             keep,
@@ -301,8 +304,8 @@ mod tests {
     }
 
     #[test]
-    fn threads_are_limited_by_flights_and_absolutely() {
-        let threads = |flights, threads| look_at(flights, threads, Keep::Scores, |evaluation| evaluation.threads());
+    fn threads_are_limited_by_episodes_and_absolutely() {
+        let threads = |episodes, threads| look_at(episodes, threads, Keep::Scores, |evaluation| evaluation.threads());
         assert_eq!(threads(5, 3), 3);
         assert_eq!(threads(5, 100_000), 10);
         assert_eq!(threads(1_000_000, 100_000), MAX_THREADS);
@@ -312,7 +315,7 @@ mod tests {
     fn the_number_of_threads_changes_nothing() {
         let one = evaluated(1, Keep::Records);
         let bytes = |evaluated: &Evaluated| {
-            let records = evaluated.flights.iter().flatten().flat_map(|flight| &flight.records);
+            let records = evaluated.episodes.iter().flatten().flat_map(|episode| &episode.records);
             records
                 .flat_map(|record| bytemuck::bytes_of(&**record).to_vec())
                 .collect::<Vec<u8>>()
@@ -325,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn keeping_records_changes_no_score_and_every_course_has_its_flights() {
+    fn keeping_records_changes_no_score_and_every_course_has_its_episodes() {
         let (scores, records) = (evaluated(2, Keep::Scores), evaluated(2, Keep::Records));
         assert_eq!(scores.report, records.report);
         assert_eq!(
@@ -333,19 +336,25 @@ mod tests {
                 .report
                 .courses
                 .iter()
-                .map(|course| course.flights)
+                .map(|course| course.episodes)
                 .collect::<Vec<_>>(),
             [5, 5]
         );
         assert_ne!(scores.report.courses[0].course, scores.report.courses[1].course);
-        assert!(scores.flights.iter().flatten().all(|flight| flight.records.is_empty()));
-        let starts: Vec<_> = records.flights[0]
+        assert!(
+            scores
+                .episodes
+                .iter()
+                .flatten()
+                .all(|episode| episode.records.is_empty())
+        );
+        let starts: Vec<_> = records.episodes[0]
             .iter()
-            .map(|flight| flight.records[0].position_m)
+            .map(|episode| episode.records[0].position_m)
             .collect();
         assert!(
             starts.windows(2).all(|pair| pair[0] != pair[1]),
-            "a hundred flights are a hundred different ones"
+            "a hundred episodes are a hundred different ones"
         );
     }
 }

@@ -10,12 +10,12 @@ use clap::Parser;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use skein_actor::agent::Agent;
 use skein_actor::courses::{Courses, Simulators};
-use skein_actor::environment_loop::Pilot;
+use skein_actor::environment_loop::EnvironmentLoop;
 use skein_actor::service::{Ending, Service};
 use skein_kernels::Isa;
 use skein_protocol::allocation::return_large_blocks;
 use skein_protocol::failure::{EXIT_LEARNER_GONE, with_causes};
-use skein_protocol::ids::{ActorId, Incarnation};
+use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::logging::{LogFormat, log_to_file};
 use skein_protocol::run::{Presence, RunDirectory};
 use skein_simulator::camera::Instructions;
@@ -23,9 +23,9 @@ use tracing::{error, info};
 
 /// Flies for a run, beside its learner and other actors, until the run is over.
 ///
-/// Actors come and go as they like: what is learned does not depend on them. One whose learner dies waits for the learner's next life. The log goes to
+/// Actors come and go as they like: what is learned does not depend on them. One whose learner dies waits for the learner's next incarnation. The log goes to
 /// logs/actor-ID.log in the run's directory (RUST_LOG says what is logged, SKEIN_LOG_FORMAT=json how). Exit status: 0 when the run is over or on SIGTERM
-/// or SIGINT, 1 on an error, 3 when no learner gave a sign of life for transport.learner_silence_secs.
+/// or SIGINT, 1 on an error, 3 when no learner sent a heartbeat for transport.learner_silence_secs.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
@@ -43,7 +43,7 @@ fn main() -> ExitCode {
         Ok(Ending::Stopped | Ending::Signalled) => ExitCode::SUCCESS,
         Ok(Ending::LearnerSilent) => {
             eprintln!(
-                "skein-actor: no learner of this run gave a sign of life for transport.learner_silence_secs; leaving"
+                "skein-actor: no learner of this run sent a heartbeat for transport.learner_silence_secs; leaving"
             );
             ExitCode::from(EXIT_LEARNER_GONE)
         }
@@ -77,8 +77,8 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
     let _presence = Presence::enter(&identity)?;
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config)?));
     // Each learner that is joined gives it an incarnation.
-    let mut pilot = Pilot::new(actor, Incarnation(0), simulators, Agent::new(config.view()));
-    Ok(Service::new(&identity, &config, actor, &told_to_end).serve(&mut pilot)?)
+    let mut environment_loop = EnvironmentLoop::new(actor, ActorIncarnation(0), simulators, Agent::new(config.view()));
+    Ok(Service::new(&identity, &config, actor, &told_to_end).serve(&mut environment_loop)?)
 }
 
 /// A flag that the first SIGTERM or SIGINT sets; a second one ends the process on the spot.

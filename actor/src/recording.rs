@@ -1,6 +1,6 @@
-//! Recordings of evaluation flights: a `.npz` file, which NumPy alone reads (`numpy.load(FILE)`).
+//! Recordings of evaluation episodes: a `.npz` file, which NumPy alone reads (`numpy.load(FILE)`).
 //!
-//! One row for every observation: the steps of a flight in order, its closing observation last; flights in order, courses in order. [`COLUMNS`] lists the
+//! One row for every observation: the steps of an episode in order, its closing observation last; episodes in order, courses in order. [`COLUMNS`] lists the
 //! arrays. The format is a zip file with one `.npy` file an array; rows are written as they lie in memory, so nothing is held twice.
 
 use std::fmt;
@@ -13,7 +13,7 @@ use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_WIDTH};
 use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
 
-use crate::evaluation::EvaluatedFlight;
+use crate::evaluation::EvaluatedEpisode;
 use Axis::{Latent, Of};
 
 // The arrays' types below say little-endian, and rows are copied from memory.
@@ -62,7 +62,7 @@ impl fmt::Display for Axis {
 /// One observation of a recording.
 struct Row<'a> {
     course: i32,
-    flight: i32,
+    episode: i32,
     /// Length of the latent code.
     latent: usize,
     record: &'a TransitionRecord,
@@ -73,17 +73,17 @@ pub const COLUMNS: [Column; 15] = [
     Column::new("course", "<i4", &[], "index into course_names", |row, out| {
         put(out, &[row.course])
     }),
-    Column::new("flight", "<i4", &[], "flight on that course, from 0", |row, out| {
-        put(out, &[row.flight])
+    Column::new("episode", "<i4", &[], "episode on that course, from 0", |row, out| {
+        put(out, &[row.episode])
     }),
-    Column::new("step", "<i4", &[], "step of the flight, from 0", |row, out| {
+    Column::new("step", "<i4", &[], "step of the episode, from 0", |row, out| {
         put(out, &[row.record.step])
     }),
     Column::new(
         "closing",
         "|u1",
         &[],
-        "1 in the last row of a flight, on which no action follows",
+        "1 in the last row of an episode, on which no action follows",
         |row, out| {
             out.push(u8::from(row.record.kind == RecordKind::Closing.code()));
         },
@@ -156,7 +156,7 @@ pub const COLUMNS: [Column; 15] = [
         "walls_passed",
         "|u1",
         &[],
-        "in this flight, after the step",
+        "in this episode, after the step",
         |row, out| {
             out.push(row.record.walls_passed);
         },
@@ -174,7 +174,7 @@ pub const COLUMNS: [Column; 15] = [
         "truncated",
         "|u1",
         &[],
-        "1 where the step limit ended the flight",
+        "1 where the step limit ended the episode",
         |row, out| {
             out.push(row.record.truncated);
         },
@@ -210,7 +210,7 @@ pub struct RecordingError {
     pub source: io::Error,
 }
 
-/// Writes the records of `flights`, course by course, to `path`; in place at once, or not at all. Their codes have `latent` numbers.
+/// Writes the records of `episodes`, course by course, to `path`; in place at once, or not at all. Their codes have `latent` numbers.
 ///
 /// # Errors
 /// [`RecordingError`] names the file.
@@ -218,10 +218,10 @@ pub fn write_recording(
     path: &Path,
     courses: &[&str],
     latent: usize,
-    flights: &[Vec<EvaluatedFlight>],
+    episodes: &[Vec<EvaluatedEpisode>],
 ) -> Result<(), RecordingError> {
     let aside = aside(path);
-    write_npz(&aside, courses, latent, flights)
+    write_npz(&aside, courses, latent, episodes)
         .and_then(|()| fs::rename(&aside, path))
         .map_err(|source| {
             // Half a recording is of no use; where there is none to remove, nothing remains either.
@@ -257,10 +257,10 @@ fn failed(path: &Path, source: io::Error) -> RecordingError {
     }
 }
 
-fn write_npz(path: &Path, courses: &[&str], latent: usize, flights: &[Vec<EvaluatedFlight>]) -> io::Result<()> {
+fn write_npz(path: &Path, courses: &[&str], latent: usize, episodes: &[Vec<EvaluatedEpisode>]) -> io::Result<()> {
     let rows: Vec<Row<'_>> = (0i32..)
-        .zip(flights)
-        .flat_map(|(course, flights)| rows_of(course, latent, flights))
+        .zip(episodes)
+        .flat_map(|(course, episodes)| rows_of(course, latent, episodes))
         .collect();
     let mut zip = ZipWriter::new(BufWriter::new(File::create(path)?));
     for column in &COLUMNS {
@@ -288,11 +288,11 @@ fn write_npz(path: &Path, courses: &[&str], latent: usize, flights: &[Vec<Evalua
     zip.finish().map_err(io::Error::from)?.into_inner()?.sync_all()
 }
 
-fn rows_of(course: i32, latent: usize, flights: &[EvaluatedFlight]) -> impl Iterator<Item = Row<'_>> {
-    (0i32..).zip(flights).flat_map(move |(flight, flown)| {
+fn rows_of(course: i32, latent: usize, episodes: &[EvaluatedEpisode]) -> impl Iterator<Item = Row<'_>> {
+    (0i32..).zip(episodes).flat_map(move |(episode, flown)| {
         flown.records.iter().map(move |record| Row {
             course,
-            flight,
+            episode,
             latent,
             record,
         })
@@ -331,12 +331,12 @@ mod tests {
     use std::io::Read;
 
     use bytemuck::Zeroable;
-    use skein_protocol::evaluation::FlightScore;
+    use skein_protocol::evaluation::EpisodeScore;
     use skein_protocol::transition::Outcome;
 
     use super::*;
 
-    fn flight(first: u8, records: u8) -> EvaluatedFlight {
+    fn episode(first: u8, records: u8) -> EvaluatedEpisode {
         let record = |number: u8| {
             let mut record = Box::new(TransitionRecord::zeroed());
             record.depth.fill(number);
@@ -344,13 +344,13 @@ mod tests {
             record.position_m = [f32::from(number), 0.5, -1.0];
             record
         };
-        let score = FlightScore {
+        let score = EpisodeScore {
             walls_passed: 0,
-            flight_return: 0.0,
+            episode_return: 0.0,
             outcome: Outcome::Collided,
             hit_wall: None,
         };
-        EvaluatedFlight {
+        EvaluatedEpisode {
             score,
             walls: 5,
             records: (first..first + records).map(record).collect(),
@@ -383,11 +383,11 @@ mod tests {
     }
 
     #[test]
-    fn rows_are_all_observations_in_course_and_flight_order() {
+    fn rows_are_all_observations_in_course_and_episode_order() {
         let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("flights.npz");
-        let flights = [vec![flight(1, 2), flight(3, 1)], vec![flight(4, 1)]];
-        write_recording(&file, &["near", "far \u{e4}"], 8, &flights).unwrap();
+        let file = folder.path().join("episodes.npz");
+        let episodes = [vec![episode(1, 2), episode(3, 1)], vec![episode(4, 1)]];
+        write_recording(&file, &["near", "far \u{e4}"], 8, &episodes).unwrap();
 
         let (header, depth) = array(&file, "depth");
         assert!(
@@ -400,7 +400,7 @@ mod tests {
         );
         let integers = |name| values::<i32>(&array(&file, name).1);
         assert_eq!(integers("course"), [0, 0, 0, 1]);
-        assert_eq!(integers("flight"), [0, 0, 1, 0]);
+        assert_eq!(integers("episode"), [0, 0, 1, 0]);
         let (header, position) = array(&file, "position_m");
         assert!(header.contains("'<f4'") && header.contains("(4, 3,)"), "{header}");
         assert_eq!(values::<f32>(&position)[3..6], [2.0, 0.5, -1.0]);
@@ -415,8 +415,8 @@ mod tests {
     #[test]
     fn every_array_has_as_many_values_as_its_header_says() {
         let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("flights.npz");
-        write_recording(&file, &["near"], 8, &[vec![flight(0, 3)]]).unwrap();
+        let file = folder.path().join("episodes.npz");
+        write_recording(&file, &["near"], 8, &[vec![episode(0, 3)]]).unwrap();
         for column in &COLUMNS {
             let value_bytes: usize = column.kind[2..].parse().unwrap();
             let expected = 3 * column.shape.iter().map(|axis| axis.len(8)).product::<usize>() * value_bytes;
@@ -426,9 +426,9 @@ mod tests {
 
     #[test]
     fn a_file_that_cannot_be_written_is_named() {
-        let file = Path::new("/nonexistent/flights.npz");
+        let file = Path::new("/nonexistent/episodes.npz");
         for error in [write_recording(file, &[], 32, &[]), check_recordable(file)] {
-            assert!(error.unwrap_err().to_string().contains("/nonexistent/flights.npz"));
+            assert!(error.unwrap_err().to_string().contains("/nonexistent/episodes.npz"));
         }
     }
 
@@ -448,7 +448,7 @@ mod tests {
         fs::write(at("earlier.npz"), b"earlier").unwrap();
         assert!(check_recordable(&at("folder")).is_err());
         assert!(check_recordable(Path::new("/dev/null")).is_err());
-        write_recording(&at("folder"), &["near"], 32, &[vec![flight(0, 1)]]).unwrap_err();
+        write_recording(&at("folder"), &["near"], 32, &[vec![episode(0, 1)]]).unwrap_err();
         check_recordable(&at("earlier.npz")).unwrap();
         check_recordable(&at("new.npz")).unwrap();
         assert_eq!(names(), ["earlier.npz", "folder"]);

@@ -1,7 +1,7 @@
-//! The life of an actor process: join the learner, take a ticket, fly it, until the run is over.
+//! The incarnation of an actor process: join the learner, take a ticket, fly it, until the run is over.
 //!
-//! Whatever happens on the way is survived by doing nothing about it: a flight that is lost is flown again on a new ticket, by this actor or another; a
-//! learner that is lost is looked for until it lives again. Only the end of the run, a signal, or no sign of life from any learner for too long end the
+//! Whatever happens on the way is survived by doing nothing about it: an episode that is lost is flown again on a new ticket, by this actor or another; a
+//! learner that is lost is looked for until it lives again. Only the end of the run, a signal, or no heartbeat from any learner for too long end the
 //! process.
 
 mod line;
@@ -14,21 +14,21 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use skein_protocol::config::Config;
 use skein_protocol::fault::{FaultPoint, pass};
-use skein_protocol::ids::{ActorId, Incarnation};
-use skein_protocol::run::{Life, RunIdentity};
+use skein_protocol::ids::{ActorId, ActorIncarnation};
+use skein_protocol::run::{LearnerIncarnation, RunIdentity};
 use skein_protocol::services::{ActorPorts, JoinError, ServiceError};
 use skein_protocol::status::ActorState;
 use skein_protocol::ticket::Ticket;
 use tracing::{debug, info, info_span, warn};
 
 use self::line::LearnerLine;
-use crate::environment_loop::{FlightError, Pilot};
+use crate::environment_loop::{EnvironmentLoop, EpisodeError};
 use skein_inference::Network;
 
 /// Longest time between two looks for a learner, and between two looks whether to end meanwhile.
 const SEEK_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Serves the learners of a run, one life after the other.
+/// Serves the learners of a run, one incarnation after the other.
 #[derive(Debug)]
 pub struct Service<'a> {
     identity: &'a RunIdentity,
@@ -36,10 +36,10 @@ pub struct Service<'a> {
     actor: ActorId,
     /// Looked at between two steps and between two looks for a learner.
     told_to_end: &'a AtomicBool,
-    incarnation: Incarnation,
-    /// When a learner last gave a sign of life; at first, when this service began.
+    incarnation: ActorIncarnation,
+    /// When a learner last sent a heartbeat; at first, when this service began.
     last_sign: Instant,
-    newest_life: Option<Life>,
+    newest_learner: Option<LearnerIncarnation>,
 }
 
 /// Why an actor leaves.
@@ -49,7 +49,7 @@ pub enum Ending {
     Stopped,
     /// This process was told to end.
     Signalled,
-    /// No learner of this run gave a sign of life for `transport.learner_silence_secs`.
+    /// No learner of this run sent a heartbeat for `transport.learner_silence_secs`.
     LearnerSilent,
 }
 
@@ -58,7 +58,7 @@ pub enum Ending {
 enum Parting {
     /// The actor leaves.
     Leave(Ending),
-    /// That learner is dead, or another life of it has begun.
+    /// That learner is dead, or another incarnation of it has begun.
     LearnerGone,
     /// This process was stopped for so long that the learner has given it up: its tickets are others' now.
     Overslept,
@@ -74,9 +74,9 @@ impl<'a> Service<'a> {
             config,
             actor,
             told_to_end,
-            incarnation: Incarnation(0),
+            incarnation: ActorIncarnation(0),
             last_sign: Instant::now(),
-            newest_life: None,
+            newest_learner: None,
         }
     }
 
@@ -84,23 +84,23 @@ impl<'a> Service<'a> {
     ///
     /// # Errors
     /// [`JoinError`] when no learner of this run can be joined by this process, now or later, or one that is there could not for
-    /// `transport.learner_silence_secs`. A lost flight or learner is none.
-    pub fn serve(mut self, pilot: &mut Pilot) -> Result<Ending, JoinError> {
+    /// `transport.learner_silence_secs`. A lost episode or learner is none.
+    pub fn serve(mut self, environment_loop: &mut EnvironmentLoop) -> Result<Ending, JoinError> {
         loop {
             let ports = match self.seek()? {
                 Ok(ports) => ports,
                 Err(ending) => return Ok(ending),
             };
             self.incarnation = next_incarnation(self.incarnation);
-            info!(actor = %self.actor, incarnation = %self.incarnation, life = %ports.life(), "learner joined");
+            info!(actor = %self.actor, incarnation = %self.incarnation, learner_incarnation = %ports.incarnation(), "learner joined");
             pass(FaultPoint::ActorJoined);
-            pilot.begin_life(self.incarnation);
+            environment_loop.begin_incarnation(self.incarnation);
             let mut line = LearnerLine::new(&self, ports);
-            let parting = serve_life(pilot, &mut line);
+            let parting = serve_incarnation(environment_loop, &mut line);
             self.last_sign = line.last_sign();
             match parting {
                 Ok(Parting::Leave(ending)) => return Ok(ending),
-                Ok(Parting::LearnerGone) => warn!("the learner is gone; looking for its next life"),
+                Ok(Parting::LearnerGone) => warn!("the learner is gone; looking for its next incarnation"),
                 Ok(Parting::Overslept) => warn!("this process was stopped for too long; joining anew"),
                 Ok(Parting::AskedToRejoin) => warn!("nothing that was flown has arrived; joining anew"),
                 Err(error) => {
@@ -121,9 +121,9 @@ impl<'a> Service<'a> {
             }
             match ActorPorts::join(self.identity, self.config) {
                 Ok(ports) => {
-                    // A life that was not there before shows that a learner lives. To join the same one again shows nothing.
-                    if self.newest_life.is_none_or(|newest| newest < ports.life()) {
-                        self.newest_life = Some(ports.life());
+                    // An incarnation that was not there before shows that a learner incarnations. To join the same one again shows nothing.
+                    if self.newest_learner.is_none_or(|newest| newest < ports.incarnation()) {
+                        self.newest_learner = Some(ports.incarnation());
                         self.last_sign = Instant::now();
                     }
                     return Ok(Ok(ports));
@@ -148,15 +148,18 @@ impl<'a> Service<'a> {
     }
 }
 
-/// A number that no earlier life of this actor had, as far as the clock tells, and none of this process.
-fn next_incarnation(last: Incarnation) -> Incarnation {
+/// A number that no earlier incarnation of this actor had, as far as the clock tells, and none of this process.
+fn next_incarnation(last: ActorIncarnation) -> ActorIncarnation {
     let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH);
     let nanos = since_1970.map_or(0, |elapsed| elapsed.as_nanos() as u64);
-    Incarnation(nanos.max(last.0 + 1))
+    ActorIncarnation(nanos.max(last.0 + 1))
 }
 
 /// Serves the learner that was joined.
-fn serve_life(pilot: &mut Pilot, line: &mut LearnerLine<'_>) -> Result<Parting, ServiceError> {
+fn serve_incarnation(
+    environment_loop: &mut EnvironmentLoop,
+    line: &mut LearnerLine<'_>,
+) -> Result<Parting, ServiceError> {
     line.report(ActorState::Serving)?;
     let parting = loop {
         line.listen()?;
@@ -164,37 +167,42 @@ fn serve_life(pilot: &mut Pilot, line: &mut LearnerLine<'_>) -> Result<Parting, 
             break parting;
         }
         match line.take_ticket() {
-            Some((ticket, network)) => fly(pilot, &ticket, &network, line)?,
+            Some((ticket, network)) => fly(environment_loop, &ticket, &network, line)?,
             None => line.wait()?,
         }
     };
-    info!(?parting, flights = line.flights_flown, "leaving");
+    info!(?parting, episodes = line.episodes_flown, "leaving");
     if parting != Parting::LearnerGone {
         line.report(ActorState::Leaving)?;
     }
     Ok(parting)
 }
 
-fn fly(pilot: &mut Pilot, ticket: &Ticket, network: &Network, line: &mut LearnerLine<'_>) -> Result<(), ServiceError> {
+fn fly(
+    environment_loop: &mut EnvironmentLoop,
+    ticket: &Ticket,
+    network: &Network,
+    line: &mut LearnerLine<'_>,
+) -> Result<(), ServiceError> {
     let span =
-        info_span!("flight", flight = %ticket.flight, attempt = %ticket.attempt, policy = %ticket.policy_version);
+        info_span!("episode", episode = %ticket.episode, attempt = %ticket.attempt, policy = %ticket.policy_version);
     let _entered = span.enter();
-    match pilot.fly(ticket, network, line) {
-        Ok(None) => debug!(steps = ticket.first_step(), "leg flown"),
+    match environment_loop.fly(ticket, network, line) {
+        Ok(None) => debug!(steps = ticket.first_step(), "segment flown"),
         Ok(Some(score)) => {
-            line.flights_flown += 1;
+            line.episodes_flown += 1;
             debug!(
                 walls = score.walls_passed,
                 outcome = score.outcome.name(),
-                reward = score.flight_return,
+                reward = score.episode_return,
                 "flown"
             );
         }
-        Err(FlightError::Abandoned) => info!("flight abandoned"),
-        Err(FlightError::Fault(fault)) => warn!(%fault, "flight failed"),
+        Err(EpisodeError::Abandoned) => info!("episode abandoned"),
+        Err(EpisodeError::Fault(fault)) => warn!(%fault, "episode failed"),
         // The ticket's deadline makes good for it.
-        Err(FlightError::Link(error)) => warn!(%error, "flight lost"),
+        Err(EpisodeError::Link(error)) => warn!(%error, "episode lost"),
     }
-    // Here, so that the times of a flight that is taken in are known too.
+    // Here, so that the times of an episode that is taken in are known too.
     line.wake_learner()
 }

@@ -1,4 +1,4 @@
-//! The snapshots an actor holds: the newest few, so that a flight may use the one its ticket names while the learner goes on.
+//! The snapshots an actor holds: the newest few, so that an episode may use the one its ticket names while the learner goes on.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -48,7 +48,7 @@ impl Weights {
     }
 
     /// For a run. Tickets name the newest snapshot, an evaluation's too, and with policy lag 1 the one before it: no other is published
-    /// before their flights are committed. One more is there for what comes before its ticket.
+    /// before their episodes are committed. One more is there for what comes before its ticket.
     pub fn of_run(config: &Config) -> Self {
         let most = config.learning.policy_lag as usize + 2;
         Self::new(SnapshotLayout::of(config), config.vae.encoder_precision, most)

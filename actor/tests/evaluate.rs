@@ -70,7 +70,7 @@ fn a_run_is_evaluated_on_its_own_courses_alike_on_any_number_of_threads() {
         let json = format!("{threads}.json");
         let output = evaluate(
             folder.path(),
-            &["--run", ".", "--flights", "4", "--threads", threads, "--json", &json],
+            &["--run", ".", "--episodes", "4", "--threads", threads, "--json", &json],
         );
         assert!(output.status.success(), "{output:?}");
         let table = String::from_utf8(output.stdout).unwrap();
@@ -84,7 +84,7 @@ fn a_run_is_evaluated_on_its_own_courses_alike_on_any_number_of_threads() {
     let report: EvaluationReport = serde_json::from_str(&read("1.json")).unwrap();
     assert_eq!(report.policy_version, PolicyVersion(17));
     assert_eq!(
-        report.courses.iter().map(|course| course.flights).collect::<Vec<_>>(),
+        report.courses.iter().map(|course| course.episodes).collect::<Vec<_>>(),
         [4, 4]
     );
 }
@@ -96,10 +96,10 @@ fn a_snapshot_file_alone_is_flown_and_recorded() {
     let arguments = [
         "--snapshot",
         "snapshots/latest.safetensors",
-        "--flights",
+        "--episodes",
         "2",
         "--record",
-        "flights.npz",
+        "episodes.npz",
         "--course",
     ];
     let output = evaluate(
@@ -107,7 +107,7 @@ fn a_snapshot_file_alone_is_flown_and_recorded() {
         &[arguments.as_slice(), &[course.to_str().unwrap()]].concat(),
     );
     assert!(output.status.success(), "{output:?}");
-    let recording = std::fs::File::open(folder.path().join("flights.npz")).unwrap();
+    let recording = std::fs::File::open(folder.path().join("episodes.npz")).unwrap();
     let mut arrays = zip::ZipArchive::new(recording).unwrap();
     assert!(arrays.by_name("depth.npy").is_ok());
 }
@@ -117,14 +117,14 @@ fn a_suite_is_flown_entry_by_entry_alike_on_any_number_of_threads() {
     let folder = run_folder();
     let text = r#"
         name = "three ways"
-        flights = 3
+        episodes = 3
         [[entry]]
         name = "as it is"
         course = "courses/training.toml"
         [[entry]]
         name = "in any order"
         orders_of = "courses/training.toml"
-        flights = 5
+        episodes = 5
         [entry.disturbances]
         latency_periods = 1
         gust.force_rms_n = 0.15
@@ -153,7 +153,7 @@ fn a_suite_is_flown_entry_by_entry_alike_on_any_number_of_threads() {
         );
         assert!(output.status.success(), "{output:?}");
         let announced = String::from_utf8(output.stderr).unwrap();
-        assert!(announced.contains("11 flights in 3 entries"), "{announced}");
+        assert!(announced.contains("11 episodes in 3 entries"), "{announced}");
     }
     let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
     assert_eq!(read("1.json"), read("3.json"));
@@ -161,13 +161,13 @@ fn a_suite_is_flown_entry_by_entry_alike_on_any_number_of_threads() {
     let flown: Vec<_> = report
         .courses
         .iter()
-        .map(|entry| (entry.course.as_str(), entry.flights))
+        .map(|entry| (entry.course.as_str(), entry.episodes))
         .collect();
     assert_eq!(flown, [("as it is", 3), ("in any order", 5), ("new courses", 3)]);
     for entry in &report.courses {
         let failed = |failures: &Failures| failures.hit_wall + failures.hit_corridor + failures.timed_out;
         let failures: u64 = entry.failures.iter().map(failed).sum();
-        assert_eq!(failures + entry.reached_end, entry.flights, "{entry:?}");
+        assert_eq!(failures + entry.reached_end, entry.episodes, "{entry:?}");
         assert_eq!(entry.failures.len(), 6);
     }
     // The first entry is the course as a file, flown undisturbed.
@@ -178,7 +178,7 @@ fn a_suite_is_flown_entry_by_entry_alike_on_any_number_of_threads() {
             ".",
             "--course",
             "courses/training.toml",
-            "--flights",
+            "--episodes",
             "3",
             "--json",
             "file.json",
@@ -201,7 +201,7 @@ fn a_suite_that_cannot_be_flown_is_refused_by_file_and_entry() {
         std::fs::write(at.join("suite.toml"), text).unwrap();
         error_of(at, &["--run", ".", "--suite", "suite.toml"])
     };
-    let head = "name = \"x\"\nflights = 1\n[[entry]]\nname = \"one\"\n";
+    let head = "name = \"x\"\nepisodes = 1\n[[entry]]\nname = \"one\"\n";
     let no_course = refused(head);
     assert!(
         no_course.contains("suite.toml: entry \"one\": names its courses by 0"),
@@ -225,7 +225,7 @@ fn files_that_cannot_be_written_are_refused_before_anything_is_flown() {
         for file in ["/proc/result", "none/result", "courses"] {
             let error = error_of(at, &["--run", ".", option, file]);
             assert!(error.contains(&format!("{file}: ")), "{error}");
-            assert!(!error.contains("flights on each of"), "{error}");
+            assert!(!error.contains("episodes on each of"), "{error}");
         }
     }
 }
@@ -252,9 +252,9 @@ fn an_evaluation_that_fails_leaves_no_file_and_changes_none() {
 }
 
 #[test]
-fn more_threads_than_flights_are_not_started() {
+fn more_threads_than_episodes_are_not_started() {
     let folder = run_folder();
-    let arguments = ["--run", ".", "--flights", "3", "--threads", "100000"];
+    let arguments = ["--run", ".", "--episodes", "3", "--threads", "100000"];
     let output = evaluate(folder.path(), &arguments);
     assert!(output.status.success(), "{output:?}");
     let announced = String::from_utf8(output.stderr).unwrap();
@@ -270,7 +270,7 @@ fn a_thread_that_cannot_be_started_is_an_error() {
     let folder = run_folder();
     let output = Command::new(env!("CARGO_BIN_EXE_skein-evaluate"))
         .current_dir(folder.path())
-        .args(["--run", ".", "--flights", "2", "--threads", "2"])
+        .args(["--run", ".", "--episodes", "2", "--threads", "2"])
         // A stack larger than the address space.
         .env("RUST_MIN_STACK", (1u64 << 60).to_string())
         .output()

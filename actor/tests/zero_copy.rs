@@ -6,11 +6,11 @@ use std::sync::Arc;
 
 use skein_actor::agent::Agent;
 use skein_actor::courses::{Courses, Simulators};
-use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
+use skein_actor::environment_loop::{Directive, EnvironmentLoop, RecordLink};
 use skein_inference::Network;
 use skein_protocol::config::{Config, Precision};
-use skein_protocol::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion};
-use skein_protocol::run::{LearnerSeat, RunDirectory};
+use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion};
+use skein_protocol::run::{LearnerLock, RunDirectory};
 use skein_protocol::services::{ActorPorts, LearnerPorts, LoanedTransition, ServiceError};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
@@ -81,8 +81,8 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
     config.courses.evaluation = vec![configs.into()];
     run.create(&config).unwrap();
     let (identity, config) = run.open().unwrap();
-    let seat = LearnerSeat::take(&run, &identity).unwrap();
-    let learner = LearnerPorts::open(&identity, seat.life(), &config).unwrap();
+    let lock = LearnerLock::take(&run, &identity).unwrap();
+    let learner = LearnerPorts::open(&identity, lock.incarnation(), &config).unwrap();
     let actor = ActorPorts::join(&identity, &config).unwrap();
     learner.maintain().unwrap();
 
@@ -93,23 +93,24 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
     };
     let ticket = Ticket {
         run: identity.run,
-        flight: FlightId(0),
+        episode: EpisodeId(0),
         attempt: Attempt(0),
         policy_version: PolicyVersion(0),
         course: CourseChoice::Training,
         start_level: 1,
         exploration: Exploration::Uniform,
         seed: 5,
-        leg: None,
+        segment: None,
     };
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config).unwrap()));
-    let mut pilot = Pilot::new(ActorId(0), Incarnation(0), simulators, Agent::new(config.view()));
+    let mut environment_loop =
+        EnvironmentLoop::new(ActorId(0), ActorIncarnation(0), simulators, Agent::new(config.view()));
     let mut watched = Watched {
         ports: &actor,
         loaned: Vec::new(),
         sent: Vec::new(),
     };
-    let flown = pilot.fly(&ticket, &Network::new(&snapshot, &layout, Precision::F32), &mut watched);
+    let flown = environment_loop.fly(&ticket, &Network::new(&snapshot, &layout, Precision::F32), &mut watched);
 
     let mut received = Vec::new();
     while let Some(record) = learner.receive_transition().unwrap() {

@@ -1,6 +1,6 @@
-//! What it costs to bring flights home in epochs: microseconds of a run for each environment step, as epochs grow longer.
+//! What it costs to bring episodes home in epochs: microseconds of a run for each environment step, as epochs grow longer.
 //!
-//! Whole runs of the real programs with two actors, which fly at random and learn nothing, so that every run flies the same flights and only the number of
+//! Whole runs of the real programs with two actors, which fly at random and learn nothing, so that every run flies the same episodes and only the number of
 //! epochs differs: what is left beside flying is ordering, waiting for the last of an epoch, and publishing a snapshot after it. Each figure is a line of
 //! JSON; `--quick` flies little.
 
@@ -18,22 +18,22 @@ const SETTINGS: [&str; 10] = [
     "vae.train_steps=1",
     "vae.updates_per_step=1e-9",
     "sac.hidden_width=256",
-    "evaluation.flights=1",
-    "evaluation.confirm_flights=1",
-    "evaluation.every_flights=1000000",
-    "checkpoints.every_flights=1000000",
+    "evaluation.episodes=1",
+    "evaluation.confirm_episodes=1",
+    "evaluation.every_episodes=1000000",
+    "checkpoints.every_episodes=1000000",
     "run.learner_threads=1",
 ];
 
 fn main() {
     let quick = std::env::args().any(|argument| argument == "--quick");
-    let (flights, lengths) = if quick {
+    let (episodes, lengths) = if quick {
         (20, &[10][..])
     } else {
         (800, &[1, 2, 5, 10, 20, 50, 100, 200][..])
     };
     for length in lengths {
-        let summary = run(flights, *length);
+        let summary = run(episodes, *length);
         println!(
             "{}",
             json!({
@@ -45,8 +45,8 @@ fn main() {
     }
 }
 
-/// Runs so many flights in epochs of `length`.
-fn run(flights: u64, length: u64) -> Summary {
+/// Runs so many episodes in epochs of `length`.
+fn run(episodes: u64, length: u64) -> Summary {
     let folder = tempfile::tempdir().expect("there is room for a run");
     let directory = folder.path().join("run");
     let mut command = Command::new(env!("CARGO_BIN_EXE_skein"));
@@ -54,8 +54,8 @@ fn run(flights: u64, length: u64) -> Summary {
     command.arg("--config").arg(smoke());
     let settings = SETTINGS.map(str::to_owned).into_iter();
     for setting in settings.chain([
-        format!("run.flights={flights}"),
-        format!("learning.flights_per_epoch={length}"),
+        format!("run.episodes={episodes}"),
+        format!("learning.episodes_per_epoch={length}"),
     ]) {
         command.args(["--set", &setting]);
     }

@@ -50,10 +50,10 @@ fn read<T: DeserializeOwned>(path: &Path) -> Option<T> {
 
 fn trained_sentence(trained: &Trained) -> String {
     format!(
-        "Trained after {}: R {:.3} in evaluation flights after {} flights, {} steps, {} updates.",
+        "Trained after {}: R {:.3} in evaluation episodes after {} episodes, {} steps, {} updates.",
         Clock(trained.wall_secs),
         trained.rate,
-        trained.flights,
+        trained.episodes,
         trained.steps,
         trained.updates
     )
@@ -65,9 +65,9 @@ fn sentence(summary: &Summary) -> String {
         Ending::Interrupted => "Interrupted",
     };
     format!(
-        "{ending} after {}: {} flights, {} steps, {} updates, {} VAE updates. Final policy (version {}): {}.\n",
+        "{ending} after {}: {} episodes, {} steps, {} updates, {} VAE updates. Final policy (version {}): {}.\n",
         Clock(summary.wall_secs),
-        summary.flights,
+        summary.episodes,
         summary.steps,
         summary.updates,
         summary.vae_updates,
@@ -82,17 +82,17 @@ fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
     [
         (run.config(), "the resolved configuration"),
         (run.courses(), "the courses flown"),
-        (run.flights_csv(), "one row per training flight"),
+        (run.episodes_csv(), "one row per training episode"),
         (run.evaluation_json(), "the evaluation above"),
-        (run.evaluation_paths_csv(), "where its flights flew"),
+        (run.evaluation_trajectories_csv(), "where its episodes flew"),
         (run.summary_json(), "counts, times above, policy_sha256"),
-        (plot("return.png"), "return over the training flights"),
-        (plot("walls_passed.png"), "walls passed over the training flights"),
+        (plot("return.png"), "return over the training episodes"),
+        (plot("walls_passed.png"), "walls passed over the training episodes"),
         (
             plot("reconstructions.png"),
             "depth images and what the VAE makes of them",
         ),
-        (plot("flight_paths.png"), "evaluation flights through the walls"),
+        (plot("trajectories.png"), "evaluation episodes through the walls"),
         (run.best_snapshot(), "the best snapshot: launch/evaluate.sh --run DIR"),
         (run.latest_snapshot(), "the last snapshot"),
         (run.checkpoints(), "everything the learner knew"),
@@ -138,16 +138,16 @@ mod tests {
             best_confirmed_walls_passed: None,
             trained: Some(Trained {
                 rate: 0.93,
-                flights: 90,
+                episodes: 90,
                 steps: 1800,
                 updates: 270,
                 wall_secs: 61.0,
             }),
-            flights: 100,
+            episodes: 100,
             steps: 2000,
             updates: 300,
             vae_updates: 40,
-            evaluation_flights: 0,
+            evaluation_episodes: 0,
             tickets_reissued: 0,
             records_refused: 0,
             reissued_by_reason: Default::default(),
@@ -163,15 +163,15 @@ mod tests {
         for part in [
             "version 42",
             "training",
-            "Trained after 1:01: R 0.930 in evaluation flights after 90 flights, 1800 steps",
-            "Completed after 1:15: 100 flights, 2000 steps",
+            "Trained after 1:01: R 0.930 in evaluation episodes after 90 episodes, 1800 steps",
+            "Completed after 1:15: 100 episodes, 2000 steps",
             "│ actors, together    ┆ encoder ┆  2000 ┆ 1.50 s ┆ 750.00 µs ┆ 100.0 % │",
             "summary.json",
         ] {
             assert!(text.contains(part), "`{part}` is missing in\n{text}");
         }
         assert!(
-            !text.contains("flights.csv"),
+            !text.contains("episodes.csv"),
             "what is not there is not listed:\n{text}"
         );
     }

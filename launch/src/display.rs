@@ -75,8 +75,8 @@ impl Watcher for Display {
         match &mut self.surface {
             Surface::Terminal(bar) => {
                 let (position, length) = match progress.phase {
-                    Phase::Evaluating => progress.evaluation_flights,
-                    Phase::Flying | Phase::Learning | Phase::Finishing => (progress.flights, progress.total_flights),
+                    Phase::Evaluating => progress.evaluation_episodes,
+                    Phase::Flying | Phase::Learning | Phase::Finishing => (progress.episodes, progress.total_episodes),
                 };
                 bar.set_length(length);
                 bar.set_position(position);
@@ -112,23 +112,26 @@ struct Head<'a> {
 impl fmt::Display for Head<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Progress {
-            flights,
-            total_flights,
+            episodes,
+            total_episodes,
             elapsed_secs,
             ..
         } = *self.progress;
         match self.progress.phase {
             Phase::Evaluating => {
-                let (flown, total) = self.progress.evaluation_flights;
-                let what = if flights < total_flights {
+                let (flown, total) = self.progress.evaluation_episodes;
+                let what = if episodes < total_episodes {
                     " the newest snapshot"
                 } else {
                     ""
                 };
-                write!(f, "evaluating{what} {flown}/{total} · flight {flights}/{total_flights}")?;
+                write!(
+                    f,
+                    "evaluating{what} {flown}/{total} · episode {episodes}/{total_episodes}"
+                )?;
             }
-            Phase::Finishing => write!(f, "finishing · flight {flights}/{total_flights}")?,
-            Phase::Flying | Phase::Learning => write!(f, "flight {flights}/{total_flights}")?,
+            Phase::Finishing => write!(f, "finishing · episode {episodes}/{total_episodes}")?,
+            Phase::Flying | Phase::Learning => write!(f, "episode {episodes}/{total_episodes}")?,
         }
         write!(f, " · {}", Clock(elapsed_secs))?;
         match self.left_secs {
@@ -214,33 +217,33 @@ impl fmt::Display for Clock {
     }
 }
 
-/// The pace of the training flights over the last [`PACE_SECS`].
+/// The pace of the training episodes over the last [`PACE_SECS`].
 #[derive(Debug, Default)]
 struct Pace {
-    /// Elapsed seconds and flights, oldest first.
+    /// Elapsed seconds and episodes, oldest first.
     reports: VecDeque<(f64, u64)>,
 }
 
 impl Pace {
-    /// Seconds until all training flights are flown at the present pace; `None` before there is a pace.
+    /// Seconds until all training episodes are flown at the present pace; `None` before there is a pace.
     fn secs_left(&mut self, progress: &Progress) -> Option<f64> {
-        let (now_secs, flights) = (progress.elapsed_secs, progress.flights);
+        let (now_secs, episodes) = (progress.elapsed_secs, progress.episodes);
         // A learner that was started again does some work anew, and is ahead of nobody by it.
         if self
             .reports
             .back()
-            .is_some_and(|&(secs, flown)| now_secs < secs || flights < flown)
+            .is_some_and(|&(secs, flown)| now_secs < secs || episodes < flown)
         {
             self.reports.clear();
         }
-        self.reports.push_back((now_secs, flights));
+        self.reports.push_back((now_secs, episodes));
         while self.reports.len() > 2 && self.reports[1].0 < now_secs - PACE_SECS {
             self.reports.pop_front();
         }
         let &(then_secs, flown) = self.reports.front()?;
-        let flights_per_sec = flights.checked_sub(flown)? as f64 / (now_secs - then_secs);
-        let left = progress.total_flights.saturating_sub(flights) as f64;
-        (flights_per_sec > 0.0 && flights_per_sec.is_finite()).then(|| left / flights_per_sec)
+        let episodes_per_sec = episodes.checked_sub(flown)? as f64 / (now_secs - then_secs);
+        let left = progress.total_episodes.saturating_sub(episodes) as f64;
+        (episodes_per_sec > 0.0 && episodes_per_sec.is_finite()).then(|| left / episodes_per_sec)
     }
 }
 
@@ -248,9 +251,9 @@ impl Pace {
 mod tests {
     use super::*;
 
-    fn progress(elapsed_secs: f64, flights: u64) -> Progress {
+    fn progress(elapsed_secs: f64, episodes: u64) -> Progress {
         Progress {
-            flights,
+            episodes,
             steps: 10_000,
             updates: 4000,
             vae_updates: 100,
@@ -279,7 +282,7 @@ mod tests {
                 restarts: Restarts { learner: 2, actors: 0 },
             }
         );
-        let expected = "flight 512/2000 · 1:02:05, 1:01 left · 152 steps/s · 63 updates/s · walls passed 1.23 · temperature 0.051 · 1 actor · learner restarted 2×";
+        let expected = "episode 512/2000 · 1:02:05, 1:01 left · 152 steps/s · 63 updates/s · walls passed 1.23 · temperature 0.051 · 1 actor · learner restarted 2×";
         assert_eq!(line, expected);
     }
 

@@ -20,7 +20,7 @@ use skein_launch::resume::resume;
 use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, SupervisorError};
 use skein_protocol::claims::ActorClaim;
 use skein_protocol::failure::with_causes;
-use skein_protocol::run::{RunDirectory, RunError, SupervisorSeat, sweep_leftovers};
+use skein_protocol::run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
 use skein_protocol::summary::{Ending, Summary};
 
 /// What the system may refuse.
@@ -133,11 +133,11 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         None => thread::available_parallelism().map_or(1, Into::into),
     };
     sweep();
-    let (prepared, seat) = match arguments.task() {
+    let (prepared, lock) = match arguments.task() {
         Task::New { config, run_dir } => {
             let prepared = prepare(config, &arguments.overrides, run_dir, actors)?;
-            let seat = SupervisorSeat::take(&prepared.run, &prepared.identity)?;
-            (prepared, seat)
+            let lock = SupervisorLock::take(&prepared.run, &prepared.identity)?;
+            (prepared, lock)
         }
         Task::Resume(directory) => resume(directory, actors, PATIENCE)?,
     };
@@ -167,7 +167,7 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         anyhow::Ok(supervisor::run(&plan, &mut interrupts, &mut display).await)
     });
     display.finish();
-    drop(seat);
+    drop(lock);
     sweep();
 
     let outcome = outcome?;
@@ -183,7 +183,7 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     }
 
     // Plots are a service: a run that failed may have left something worth looking at, and one that succeeded has, plots or not.
-    let window = config.evaluation.window_flights as usize;
+    let window = config.evaluation.window_episodes as usize;
     if let Err(error) = reports::draw_all(run, courses, window, ideal_walls_passed(config)?) {
         eprintln!("skein: not all plots could be drawn: {error}");
     }
@@ -201,8 +201,8 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     if ended == Ended::Interrupted {
         if Summary::of(run).is_none() {
             let newest = run.newest_checkpoint();
-            let kept = newest.map_or("there is no checkpoint yet".to_owned(), |flights| {
-                format!("the newest checkpoint is of flight {flights}")
+            let kept = newest.map_or("there is no checkpoint yet".to_owned(), |episodes| {
+                format!("the newest checkpoint is of episode {episodes}")
             });
             eprintln!("skein: stopped at once: {kept}");
         }
@@ -237,9 +237,9 @@ impl RunArguments {
 fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
     let config = &prepared.config;
     eprintln!(
-        "skein: {actors} {}, {} training flights, seed {}",
+        "skein: {actors} {}, {} training episodes, seed {}",
         if actors == 1 { "actor" } else { "actors" },
-        config.run.flights,
+        config.run.episodes,
         config.run.seed
     );
     let root = prepared.run.root().display();
@@ -271,7 +271,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let programs = Programs::beside_this()?;
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
-    // Between two lives of its learner, a run is under way as long as somebody sees to it that there will be another.
+    // Between two incarnations of its learner, a run is under way as long as somebody sees to it that there will be another.
     if !run.is_under_way()? {
         let root = run.root().display();
         bail!(
@@ -313,7 +313,7 @@ fn report(arguments: &ReportArguments) -> anyhow::Result<Ended> {
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
     let courses = load_courses(&config)?;
-    let window = config.evaluation.window_flights as usize;
+    let window = config.evaluation.window_episodes as usize;
     for picture in reports::draw_all(&run, &courses, window, ideal_walls_passed(&config)?)? {
         println!("{}", picture.display());
     }

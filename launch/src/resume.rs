@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use skein_protocol::run::{PlaceError, RunDirectory, RunError, SeatError, SupervisorSeat};
+use skein_protocol::run::{LockError, PlaceError, RunDirectory, RunError, SupervisorLock};
 use skein_protocol::summary::{Ending, Summary};
 
 use crate::prepare::room::{check_folders, check_shared_memory};
@@ -30,7 +30,7 @@ pub enum ResumeError {
     },
     /// All of it is done.
     #[error(
-        "the run in {} is complete, all {flights} flights of it: there is nothing to go on with; start a new one for more. target/release/skein report --run {} draws its plots again, launch/evaluate.sh --run {} flies its best snapshot again",
+        "the run in {} is complete, all {episodes} episodes of it: there is nothing to go on with; start a new one for more. target/release/skein report --run {} draws its plots again, launch/evaluate.sh --run {} flies its best snapshot again",
         directory.display(),
         directory.display(),
         directory.display()
@@ -38,8 +38,8 @@ pub enum ResumeError {
     Complete {
         /// Its directory.
         directory: PathBuf,
-        /// Its training flights.
-        flights: u64,
+        /// Its training episodes.
+        episodes: u64,
     },
     /// Somebody is at it.
     #[error(
@@ -64,7 +64,7 @@ pub enum ResumeError {
         directory: PathBuf,
         /// Who is at it.
         #[source]
-        source: SeatError,
+        source: LockError,
     },
 }
 
@@ -73,7 +73,7 @@ pub enum ResumeError {
 ///
 /// # Errors
 /// [`ResumeError`]; nothing was changed then.
-pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Prepared, SupervisorSeat), ResumeError> {
+pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Prepared, SupervisorLock), ResumeError> {
     let not_a_run = |missing: &Path| ResumeError::NotARun {
         directory: directory.to_owned(),
         missing: missing.to_owned(),
@@ -85,9 +85,9 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
     let (identity, config) = run.open()?;
     let under_way = || ResumeError::UnderWay(run.root().to_owned());
     // Whoever only looks whether it is taken holds it for a moment.
-    let seat = in_time(LOOK * 5, || match SupervisorSeat::take(&run, &identity) {
-        Err(SeatError::Taken { lock, .. }) if lock == run.root() => Ok(None),
-        Err(SeatError::Place(error)) => Err(error.into()),
+    let lock = in_time(LOOK * 5, || match SupervisorLock::take(&run, &identity) {
+        Err(LockError::Taken { lock, .. }) if lock == run.root() => Ok(None),
+        Err(LockError::Place(error)) => Err(error.into()),
         taken => taken.map(Some).map_err(|source| ResumeError::Copy {
             directory: run.root().to_owned(),
             source,
@@ -103,7 +103,7 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
     {
         return Err(ResumeError::Complete {
             directory: run.root().to_owned(),
-            flights: summary.flights,
+            episodes: summary.episodes,
         });
     }
     run.make_folders()?;
@@ -119,7 +119,7 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
             courses,
             new: None,
         },
-        seat,
+        lock,
     ))
 }
 
@@ -151,13 +151,13 @@ mod tests {
     fn an_unfinished_run_can_be_gone_on_with_by_one_supervisor() {
         let directory = tempfile::tempdir().unwrap();
         let prepared = prepared_run(directory.path());
-        let (resumed, seat) = resume(prepared.run.root(), 3, Duration::ZERO).unwrap();
+        let (resumed, lock) = resume(prepared.run.root(), 3, Duration::ZERO).unwrap();
         assert_eq!(
             (&resumed.identity, &resumed.config, &resumed.courses),
             (&prepared.identity, &prepared.config, &prepared.courses)
         );
         assert!(refusal(prepared.run.root()).contains("is under way"));
-        drop(seat);
+        drop(lock);
         assert!(resume(prepared.run.root(), 1, Duration::ZERO).is_ok());
     }
 

@@ -5,16 +5,16 @@
 use criterion::{BenchmarkId, Criterion, Throughput};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use skein_learner::flight::{CommittedFlight, StepObservation};
+use skein_learner::episode::{CommittedEpisode, StepObservation};
 use skein_learner::replay::{Minibatch, Replay};
 use skein_protocol::config::{Config, Observation};
-use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
+use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{ACTION, GROUND_TRUTH, LONGEST_LATENT};
 
 /// Transitions a minibatch.
 const BATCH: usize = 256;
-/// Steps of each flight that fills the buffer.
+/// Steps of each episode that fills the buffer.
 const STEPS: usize = 64;
 /// Every so many steps pass a wall: more than the success part's share, so that it fills no later than the other.
 const STEPS_PER_WALL: usize = 4;
@@ -45,21 +45,21 @@ fn full(capacity: usize) -> Replay {
     let mut replay = Replay::new(&config);
     replay.freeze();
     let mut rng = Pcg64Mcg::seed_from_u64(2);
-    for flight in 0.. {
+    for episode in 0.. {
         if replay.len() == capacity {
             break;
         }
         replay
-            .insert(flown(flight, &mut rng))
-            .expect("the flight's parts have one length");
+            .insert(flown(episode, &mut rng))
+            .expect("the episode's parts have one length");
     }
     replay
 }
 
-fn flown(number: u64, rng: &mut impl Rng) -> CommittedFlight {
+fn flown(number: u64, rng: &mut impl Rng) -> CommittedEpisode {
     let mut draw = || (rng.next_u32() as f32 / u32::MAX as f32) * 2.0 - 1.0;
-    CommittedFlight {
-        flight: FlightId(number),
+    CommittedEpisode {
+        episode: EpisodeId(number),
         epoch: Epoch(number),
         policy_version: PolicyVersion(0),
         actor: ActorId(0),

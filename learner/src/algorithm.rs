@@ -113,13 +113,13 @@ pub struct Columns<'a> {
     pub actions: &'a [f32],
     /// `[n]`.
     pub rewards: &'a [f32],
-    /// `[n, observation]`: what was seen after the action, also where the flight ended there.
+    /// `[n, observation]`: what was seen after the action, also where the episode ended there.
     pub next_observations: &'a [f32],
     /// What the critic sees, `[n, critic's input]`: the observations again, unless it is told more.
     pub states: &'a [f32],
     /// The same after the action.
     pub next_states: &'a [f32],
-    /// `[n]`: 1 where the state after the action ends the task (a crash, the end wall), 0 elsewhere. A flight cut off by its step limit is not terminated.
+    /// `[n]`: 1 where the state after the action ends the task (a crash, the end wall), 0 elsewhere. An episode cut off by its step limit is not terminated.
     pub terminated: &'a [f32],
     /// Depth images of the observations and of the next ones, `[n, 72, 128]` each; where the encoder is trained end to end, whose codes no row of the replay can hold.
     pub images: Option<[&'a [u8]; 2]>,

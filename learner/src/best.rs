@@ -1,6 +1,6 @@
-//! The best snapshot: candidates by training flights, confirmed by evaluation flights.
+//! The best snapshot: candidates by training episodes, confirmed by evaluation episodes.
 //!
-//! Training flights are flown with exploration noise from all levels, so their average only says when it is worth looking. What counts is flown as the
+//! Training episodes are flown with exploration noise from all levels, so their average only says when it is worth looking. What counts is flown as the
 //! final evaluation will be: without noise, from the start of level 1.
 
 use skein_protocol::config::EvaluationSection;
@@ -8,16 +8,16 @@ use skein_protocol::config::EvaluationSection;
 use crate::checkpoint::BestSnapshot;
 use crate::metrics::MovingAverage;
 
-/// Whether the snapshot after `flights` training flights is worth confirming: enough flights since the last candidate at `latest`, a full window, and an
+/// Whether the snapshot after `episodes` training episodes is worth confirming: enough episodes since the last candidate at `latest`, a full window, and an
 /// average not far below that of the best so far.
 pub fn is_candidate(
     section: &EvaluationSection,
-    flights: u64,
+    episodes: u64,
     latest: Option<u64>,
     walls_passed: &MovingAverage,
     best: Option<&BestSnapshot>,
 ) -> bool {
-    let due = latest.is_none_or(|latest| flights >= latest + section.every_flights);
+    let due = latest.is_none_or(|latest| episodes >= latest + section.every_episodes);
     let threshold = best.map_or(0.0, |best| best.window_walls_passed - section.candidate_margin);
     due && walls_passed.is_full() && walls_passed.mean().is_some_and(|mean| mean > 0.0 && mean >= threshold)
 }
@@ -37,7 +37,7 @@ mod tests {
     fn best(window: f64, confirmed: f64) -> BestSnapshot {
         BestSnapshot {
             policy_version: 1,
-            flights: 50,
+            episodes: 50,
             window_walls_passed: window,
             confirmed_walls_passed: confirmed,
         }
@@ -52,8 +52,8 @@ mod tests {
     #[test]
     fn a_candidate_needs_a_full_window_and_an_average_near_the_best() {
         let section = EvaluationSection::default();
-        let is = |flights, latest, window: &MovingAverage, best: Option<BestSnapshot>| {
-            is_candidate(&section, flights, latest, window, best.as_ref())
+        let is = |episodes, latest, window: &MovingAverage, best: Option<BestSnapshot>| {
+            is_candidate(&section, episodes, latest, window, best.as_ref())
         };
         assert!(is(50, None, &window(1.0, 50), None));
         assert!(!is(49, None, &window(1.0, 49), None));
@@ -64,7 +64,7 @@ mod tests {
     }
 
     #[test]
-    fn evaluation_flights_decide_and_training_flights_break_ties() {
+    fn evaluation_episodes_decide_and_training_episodes_break_ties() {
         assert!(is_better(&best(1.0, 3.0), None));
         assert!(is_better(&best(1.0, 3.5), Some(&best(2.0, 3.0))));
         assert!(!is_better(&best(2.0, 3.0), Some(&best(1.0, 3.5))));

@@ -1,23 +1,23 @@
-//! Which flight is flown where: tickets as a function of configuration, seed and flight number.
+//! Which episode is flown where: tickets as a function of configuration, seed and episode number.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::ACTION;
 use skein_protocol::config::{Config, ConfirmOn};
-use skein_protocol::ids::{Attempt, Epoch, FlightId, PolicyVersion, RunId};
-use skein_protocol::leg::Leg;
+use skein_protocol::ids::{Attempt, EpisodeId, Epoch, PolicyVersion, RunId};
 use skein_protocol::seeds::{Purpose, derive};
+use skein_protocol::segment::Segment;
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 
-/// Evaluations are numbered this far apart, so that no two of their flights share a number.
+/// Evaluations are numbered this far apart, so that no two of their episodes share a number.
 const EVALUATION_STRIDE: u64 = 1 << 24;
 
 /// Epochs of the whole run; the last may be shorter.
 pub fn epochs(config: &Config) -> u64 {
-    config.run.flights.div_ceil(config.learning.flights_per_epoch)
+    config.run.episodes.div_ceil(config.learning.episodes_per_epoch)
 }
 
-/// Tickets of `epoch`, in flight order. Where flights are flown in legs, there is one flight, and `flown` are the actions of its legs so far, from take-off on.
+/// Tickets of `epoch`, in episode order. Where episodes are flown in segments, there is one episode, and `flown` are the actions of its segments so far, from reset on.
 pub fn training(
     config: &Config,
     run: RunId,
@@ -26,28 +26,28 @@ pub fn training(
     exploration: Exploration,
     flown: &[[f32; ACTION]],
 ) -> Vec<Ticket> {
-    let first = epoch.0 * config.learning.flights_per_epoch;
-    let end = (first + config.learning.flights_per_epoch).min(config.run.flights);
-    let ticket = |flight| Ticket {
+    let first = epoch.0 * config.learning.episodes_per_epoch;
+    let end = (first + config.learning.episodes_per_epoch).min(config.run.episodes);
+    let ticket = |episode| Ticket {
         run,
-        flight: FlightId(flight),
+        episode: EpisodeId(episode),
         attempt: Attempt(0),
         policy_version: version,
-        course: training_course(config, flight),
-        start_level: start_level(config, flight),
+        course: training_course(config, episode),
+        start_level: start_level(config, episode),
         exploration,
-        seed: derive(config.run.seed, Purpose::Flight, flight),
-        leg: config.learning.in_legs().then(|| Leg {
-            steps: config.learning.leg_steps as u32,
+        seed: derive(config.run.seed, Purpose::Episode, episode),
+        segment: config.learning.in_segments().then(|| Segment {
+            steps: config.learning.segment_steps as u32,
             flown: flown.into(),
         }),
     };
     (first..end).map(ticket).collect()
 }
 
-/// Tickets of `flights` evaluation flights on each of `courses`, course by course.
+/// Tickets of `episodes` evaluation episodes on each of `courses`, course by course.
 ///
-/// Flight i has the same seed on every course and in every evaluation, so that snapshots are compared on the same starts. `evaluation` numbers the
+/// Episode i has the same seed on every course and in every evaluation, so that snapshots are compared on the same starts. `evaluation` numbers the
 /// evaluations of a run.
 pub fn evaluation(
     config: &Config,
@@ -55,45 +55,45 @@ pub fn evaluation(
     evaluation: u64,
     version: PolicyVersion,
     courses: std::ops::Range<u32>,
-    flights: u64,
+    episodes: u64,
 ) -> Vec<Ticket> {
-    let first = FlightId::FIRST_EVALUATION.0 + evaluation * EVALUATION_STRIDE;
-    let ticket = |(number, (course, flight))| Ticket {
+    let first = EpisodeId::FIRST_EVALUATION.0 + evaluation * EVALUATION_STRIDE;
+    let ticket = |(number, (course, episode))| Ticket {
         run,
-        flight: FlightId(first + number),
+        episode: EpisodeId(first + number),
         attempt: Attempt(0),
         policy_version: version,
         course: CourseChoice::Evaluation(course),
         start_level: 1,
         exploration: Exploration::Mode,
-        seed: derive(config.run.seed, Purpose::EvaluationFlight, flight),
-        leg: None,
+        seed: derive(config.run.seed, Purpose::EvaluationEpisode, episode),
+        segment: None,
     };
-    let flown = courses.flat_map(|course| (0..flights).map(move |flight| (course, flight)));
+    let flown = courses.flat_map(|course| (0..episodes).map(move |episode| (course, episode)));
     (0..).zip(flown).map(ticket).collect()
 }
 
-/// Tickets of the flights that confirm a candidate for the best snapshot. Generated courses are the same ones for each candidate, and none of them is trained on.
+/// Tickets of the episodes that confirm a candidate for the best snapshot. Generated courses are the same ones for each candidate, and none of them is trained on.
 pub fn confirmation(config: &Config, run: RunId, number: u64, version: PolicyVersion) -> Vec<Ticket> {
-    let mut tickets = evaluation(config, run, number, version, 0..1, config.evaluation.confirm_flights);
+    let mut tickets = evaluation(config, run, number, version, 0..1, config.evaluation.confirm_episodes);
     if config.evaluation.confirm_on == ConfirmOn::Generated {
-        for (flight, ticket) in (0..).zip(&mut tickets) {
-            let course = derive(config.run.seed, Purpose::ConfirmationCourse, flight);
+        for (episode, ticket) in (0..).zip(&mut tickets) {
+            let course = derive(config.run.seed, Purpose::ConfirmationCourse, episode);
             ticket.course = CourseChoice::Generated(course);
         }
     }
     tickets
 }
 
-/// The level training flight `flight` starts at: the next one every few flights, then the first again (paper, section 4.2).
-fn start_level(config: &Config, flight: u64) -> u8 {
-    let step = flight / config.learning.flights_per_level;
+/// The level training episode `episode` starts at: the next one every few episodes, then the first again (paper, section 4.2).
+fn start_level(config: &Config, episode: u64) -> u8 {
+    let step = episode / config.learning.episodes_per_level;
     (step % u64::from(config.learning.levels)) as u8 + 1
 }
 
-/// Where training flight `flight` is flown.
-fn training_course(config: &Config, flight: u64) -> CourseChoice {
-    let mut rng = Pcg64Mcg::seed_from_u64(derive(config.run.seed, Purpose::Course, flight));
+/// Where training episode `episode` is flown.
+fn training_course(config: &Config, episode: u64) -> CourseChoice {
+    let mut rng = Pcg64Mcg::seed_from_u64(derive(config.run.seed, Purpose::Course, episode));
     if rng.random::<f64>() < config.courses.generated_share {
         CourseChoice::Generated(rng.random())
     } else {
@@ -123,17 +123,17 @@ mod tests {
     }
 
     #[test]
-    fn every_flight_is_in_exactly_one_epoch() {
+    fn every_episode_is_in_exactly_one_epoch() {
         let mut config = Config::default();
-        (config.run.flights, config.learning.flights_per_epoch) = (23, 10);
-        let flights: Vec<u64> = tickets(&config).iter().map(|ticket| ticket.flight.0).collect();
-        assert_eq!(flights, (0..23).collect::<Vec<_>>());
+        (config.run.episodes, config.learning.episodes_per_epoch) = (23, 10);
+        let episodes: Vec<u64> = tickets(&config).iter().map(|ticket| ticket.episode.0).collect();
+        assert_eq!(episodes, (0..23).collect::<Vec<_>>());
     }
 
     #[test]
-    fn the_start_level_rises_every_ten_flights_and_returns() {
+    fn the_start_level_rises_every_ten_episodes_and_returns() {
         let mut config = Config::default();
-        config.run.flights = 60;
+        config.run.episodes = 60;
         let levels: Vec<u8> = tickets(&config).iter().map(|ticket| ticket.start_level).collect();
         assert_eq!(
             levels.chunks(10).map(|chunk| chunk[0]).collect::<Vec<_>>(),
@@ -149,7 +149,7 @@ mod tests {
     #[test]
     fn the_generated_share_is_about_the_configured_one_and_courses_differ() {
         let mut config = Config::default();
-        (config.run.flights, config.courses.generated_share) = (1000, 0.25);
+        (config.run.episodes, config.courses.generated_share) = (1000, 0.25);
         let generated: std::collections::BTreeSet<u64> = tickets(&config)
             .iter()
             .filter_map(|ticket| match ticket.course {
@@ -167,7 +167,7 @@ mod tests {
     #[test]
     fn candidates_are_confirmed_on_the_same_generated_courses_which_are_not_trained_on() {
         let mut config = Config::default();
-        (config.run.flights, config.courses.generated_share) = (1000, 1.0);
+        (config.run.episodes, config.courses.generated_share) = (1000, 1.0);
         let courses = |tickets: &[Ticket]| tickets.iter().map(|ticket| ticket.course).collect::<HashSet<_>>();
         let confirmed = |config: &Config, number| confirmation(config, RunId(1), number, PolicyVersion(number));
         assert_eq!(
@@ -195,7 +195,7 @@ mod tests {
         assert!(
             first
                 .iter()
-                .all(|ticket| second.iter().all(|other| other.flight != ticket.flight))
+                .all(|ticket| second.iter().all(|other| other.episode != ticket.episode))
         );
         assert!(
             first

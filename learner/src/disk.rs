@@ -169,7 +169,7 @@ mod tests {
             written: Vec::new(),
             refusals: 4,
         };
-        let mut writer = io::BufWriter::with_capacity(4, disk.patient(Path::new("flights.csv"), small));
+        let mut writer = io::BufWriter::with_capacity(4, disk.patient(Path::new("episodes.csv"), small));
         for text in ["one,", "two,", "three,", "four"] {
             writer.write_all(text.as_bytes()).unwrap();
         }
@@ -184,7 +184,7 @@ mod tests {
         let disk = disk();
         let for_thread = disk.clone();
         let waiting = thread::spawn(move || {
-            for_thread.with_room(Path::new("/somewhere/flight-3"), || {
+            for_thread.with_room(Path::new("/somewhere/episode-3"), || {
                 Err::<(), _>(io::Error::from(ErrorKind::QuotaExceeded))
             })
         });
@@ -192,7 +192,7 @@ mod tests {
         while disk.waiting().is_none() && Instant::now() < end {
             thread::sleep(Duration::from_millis(1));
         }
-        assert!(disk.waiting().unwrap().contains("/somewhere/flight-3"));
+        assert!(disk.waiting().unwrap().contains("/somewhere/episode-3"));
         disk.stop.store(true, Ordering::Relaxed);
         assert_eq!(waiting.join().unwrap().unwrap_err().kind(), ErrorKind::QuotaExceeded);
     }

@@ -1,7 +1,7 @@
-//! The learner: hands out tickets, commits the flights flown for them, trains VAE and policy on them, and publishes snapshots.
+//! The learner: hands out tickets, commits the episodes flown for them, trains VAE and policy on them, and publishes snapshots.
 //!
-//! Training is a function of configuration and seed: flights are taken in flight order, every random draw has a seed of its own, and nothing here
-//! depends on who flew a flight, or when.
+//! Training is a function of configuration and seed: episodes are taken in episode order, every random draw has a seed of its own, and nothing here
+//! depends on who flew an episode, or when.
 
 pub mod algorithm;
 pub mod average;
@@ -11,11 +11,11 @@ pub mod checkpoint;
 pub mod curriculum;
 pub mod device;
 pub mod disk;
+pub mod episode;
+pub mod episodes;
 mod error;
 pub mod evaluation;
-pub mod flight;
-pub mod flights;
-pub mod lives;
+pub mod incarnations;
 pub mod metrics;
 mod mirror;
 pub mod networks;

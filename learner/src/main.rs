@@ -11,11 +11,11 @@ use skein_learner::training::{self, TrainingError};
 use skein_protocol::allocation::keep_freed_memory;
 use skein_protocol::failure::{EXIT_START_AGAIN, with_causes};
 use skein_protocol::logging::{LogFormat, log_to_file};
-use skein_protocol::run::{LearnerSeat, RunDirectory};
+use skein_protocol::run::{LearnerLock, RunDirectory};
 use skein_protocol::summary::{Ending, Summary};
 use tokio::signal::unix::{SignalKind, signal};
 
-/// The learner of a run: hands out tickets, trains on the flights that come back, publishes snapshots. Started by run_local.sh.
+/// The learner of a run: hands out tickets, trains on the episodes that come back, publishes snapshots. Started by run_local.sh.
 ///
 /// It goes on from the newest undamaged checkpoint in the directory, if there is one. Progress goes to standard output, one JSON object a line. SIGTERM or SIGINT ends the training in order: what was learned is saved.
 #[derive(Parser)]
@@ -52,10 +52,10 @@ fn run(arguments: &Arguments) -> Result<()> {
     let directory = RunDirectory::new(&arguments.run);
     let (identity, config) = directory.open()?;
     // Before anything of the run is touched, the log included: there may be another learner.
-    let seat = LearnerSeat::take(&directory, &identity)?;
+    let lock = LearnerLock::take(&directory, &identity)?;
     let log = directory.learner_log();
     log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
-    tracing::info!(run = %identity.run, life = %seat.life(), seed = config.run.seed, device = %config.run.device, "learner starts");
+    tracing::info!(run = %identity.run, incarnation = %lock.incarnation(), seed = config.run.seed, device = %config.run.device, "learner starts");
     let stop = stop_on_signals().context("cannot listen to signals")?;
     // A summary that cannot be read is made again, from the last checkpoint.
     if Summary::of(&directory).is_some_and(|summary| summary.ending == Ending::Completed) {
@@ -64,7 +64,7 @@ fn run(arguments: &Arguments) -> Result<()> {
         eprintln!("skein-learner: the run in {root} is complete: nothing is left to do");
         return Ok(());
     }
-    let summary = training::run(&directory, &identity, seat.life(), &config, &stop)?;
+    let summary = training::run(&directory, &identity, lock.incarnation(), &config, &stop)?;
     tracing::info!(ending = ?summary.ending, policy_sha256 = summary.policy_sha256, "learner ends");
     Ok(())
 }

@@ -1,17 +1,17 @@
-//! A flight seen in a mirror: left and right change places.
+//! An episode seen in a mirror: left and right change places.
 //!
-//! Corridor, drone and reward are the same on both sides, so what is seen in the mirror is a flight, too, through another course that nobody had to fly. Only a stereo camera has sides: its shadows
+//! Corridor, drone and reward are the same on both sides, so what is seen in the mirror is an episode, too, through another course that nobody had to fly. Only a stereo camera has sides: its shadows
 //! lie to the left of what is near, and in the mirror to the right, as if its second lens were on the other side.
 
 use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_WIDTH};
 
-use crate::flight::{CommittedFlight, StepObservation};
+use crate::episode::{CommittedEpisode, StepObservation};
 
 /// Places in the ground truth of what points to the left: both openings' offsets, the distance from the middle, the gust.
 const TO_THE_LEFT: [usize; 4] = [1, 5, 8, 14];
 
-impl CommittedFlight {
-    /// The flight in the mirror. Latent codes are the unmirrored flight's: whoever needs them encodes the mirrored images.
+impl CommittedEpisode {
+    /// The episode in the mirror. Latent codes are the unmirrored episode's: whoever needs them encodes the mirrored images.
     #[must_use]
     pub fn mirrored(&self) -> Self {
         let mut mirrored = self.without_images();
@@ -52,11 +52,11 @@ mod tests {
     use skein_protocol::IMAGE_PIXELS;
     use skein_protocol::transition::Outcome;
 
-    use crate::flight::samples::{flight, with_images};
+    use crate::episode::samples::{episode, with_images};
 
     #[test]
-    fn a_flight_in_two_mirrors_is_the_flight() {
-        let mut flown = with_images(flight(3, 5, Outcome::Collided));
+    fn an_episode_in_two_mirrors_is_the_episode() {
+        let mut flown = with_images(episode(3, 5, Outcome::Collided));
         flown.depth.as_mut().unwrap()[IMAGE_PIXELS..][..3].copy_from_slice(&[1, 2, 3]);
         let mirrored = flown.mirrored();
         assert_eq!(mirrored.check(), Ok(()));

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use skein_protocol::progress::Progress;
 
 use crate::disk::Disk;
-use crate::flights::reception::Shared;
+use crate::episodes::receiver::Shared;
 use crate::watchdog::Watchdog;
 
 /// Time between two lines.
@@ -36,17 +36,17 @@ pub fn tell(line: &str) {
 }
 
 impl Reporter {
-    /// Starts reporting, with `progress` as the first line: in it `elapsed_secs` are those of earlier lives, to which this one's are added.
+    /// Starts reporting, with `progress` as the first line: in it `elapsed_secs` are those of earlier incarnations, to which this one's are added.
     ///
     /// # Errors
     /// When the system grants no thread.
-    pub fn start(progress: Progress, reception: Arc<Shared>, disk: Disk) -> std::io::Result<Self> {
+    pub fn start(progress: Progress, receiver: Arc<Shared>, disk: Disk) -> std::io::Result<Self> {
         let progress = Arc::new(Mutex::new(progress));
         let ended = Arc::new(AtomicBool::new(false));
         let (of_thread, end_of_thread) = (progress.clone(), ended.clone());
         let thread = thread::Builder::new()
             .name("progress".to_owned())
-            .spawn(move || report(&of_thread, &end_of_thread, &reception, &disk))?;
+            .spawn(move || report(&of_thread, &end_of_thread, &receiver, &disk))?;
         Ok(Self {
             progress,
             ended,
@@ -76,7 +76,7 @@ impl Drop for Reporter {
     }
 }
 
-fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared, disk: &Disk) {
+fn report(progress: &Mutex<Progress>, ended: &AtomicBool, receiver: &Shared, disk: &Disk) {
     let started = Instant::now();
     let mut watchdog = Watchdog::new(started);
     let mut marks: VecDeque<(f64, u64, u64)> = VecDeque::new();
@@ -84,11 +84,11 @@ fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared, di
         let last = ended.load(Ordering::Relaxed);
         let mut line = progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
         line.elapsed_secs += started.elapsed().as_secs_f64();
-        line.stalled = watchdog.look(Instant::now(), &line, disk.waiting(), reception.situation());
-        let faults = reception.faults();
+        line.stalled = watchdog.look(Instant::now(), &line, disk.waiting(), receiver.situation());
+        let faults = receiver.faults();
         line.reissued = faults.reissued_by_reason();
         line.refused = faults.refused_by_reason();
-        line.live_actors = reception.live_actors();
+        line.live_actors = receiver.live_actors();
         line.actors = line.live_actors.len();
         if marks.len() > RATE_INTERVALS {
             marks.pop_front();

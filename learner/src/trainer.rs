@@ -18,9 +18,9 @@ use crate::algorithm::{self, Algorithm, Columns};
 use crate::average::Average;
 use crate::checkpoint::Progress;
 use crate::device::{self, DeviceError};
+use crate::episode::CommittedEpisode;
+use crate::episodes::assembly::Keep;
 use crate::error::UpdateError;
-use crate::flight::CommittedFlight;
-use crate::flights::assembly::Keep;
 use crate::metrics::Scalar;
 use crate::noise::Noise;
 use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
@@ -166,7 +166,7 @@ impl Trainer {
         &self.replay
     }
 
-    /// How the next flights to be ordered choose their actions.
+    /// How the next episodes to be ordered choose their actions.
     pub fn exploration(&self) -> Exploration {
         if self.steps < self.config.learning.warmup_steps as u64 {
             Exploration::Uniform
@@ -175,7 +175,7 @@ impl Trainer {
         }
     }
 
-    /// What is needed of the next flights to be ordered.
+    /// What is needed of the next episodes to be ordered.
     pub fn keep(&self) -> Keep {
         match self.has_images() || self.config.learning.mirror {
             true => Keep::Depth,
@@ -188,19 +188,19 @@ impl Trainer {
         self.replay.image_count().is_some()
     }
 
-    /// Stores a flight's transitions, and if asked for those of its mirror image.
+    /// Stores an episode's transitions, and if asked for those of its mirror image.
     ///
     /// # Errors
     /// [`InsertError`] when its parts do not belong together.
-    pub fn take_in(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
+    pub fn take_in(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
         let learning = &self.config.learning;
-        let mirrored = learning.mirror.then(|| flight.mirrored());
-        // With policy lag, flights still come in that were flown with an encoder older than the frozen one: their codes are made anew. Without, images come for the mirror alone.
+        let mirrored = learning.mirror.then(|| episode.mirrored());
+        // With policy lag, episodes still come in that were flown with an encoder older than the frozen one: their codes are made anew. Without, images come for the mirror alone.
         if !self.has_images() && (learning.policy_lag > 0 || !learning.mirror) {
-            self.encode(&mut flight);
+            self.encode(&mut episode);
         }
-        self.steps += flight.steps() as u64;
-        self.insert(flight)?;
+        self.steps += episode.steps() as u64;
+        self.insert(episode)?;
         if let Some(mut mirrored) = mirrored {
             self.encode(&mut mirrored);
             self.insert(mirrored)?;
@@ -208,21 +208,21 @@ impl Trainer {
         Ok(())
     }
 
-    fn insert(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
+    fn insert(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
         if !self.has_images() {
-            flight.depth = None;
+            episode.depth = None;
         }
-        self.replay.insert(flight)
+        self.replay.insert(episode)
     }
 
-    /// Makes a flight's codes anew with the encoder as it is, if there are images to make them from, and if it is learned from codes at all.
-    fn encode(&mut self, flight: &mut CommittedFlight) {
-        let (Some(depth), Some(_)) = (&flight.depth, &self.vae) else {
+    /// Makes an episode's codes anew with the encoder as it is, if there are images to make them from, and if it is learned from codes at all.
+    fn encode(&mut self, episode: &mut CommittedEpisode) {
+        let (Some(depth), Some(_)) = (&episode.depth, &self.vae) else {
             return;
         };
         let (encoder, team, _) = self.encoder();
         let codes = encoder.encode_all(team, depth);
-        for (observation, latent) in flight.observations.iter_mut().zip(codes) {
+        for (observation, latent) in episode.observations.iter_mut().zip(codes) {
             observation.latent = latent;
         }
     }

@@ -1,8 +1,8 @@
 //! The training loop: delayed learning, in reading order.
 //!
-//! An epoch is a fixed number of flights, all flown with one frozen snapshot. When the last of them is committed, the learner takes them in, in flight
-//! order, updates the networks and publishes the next snapshot. With direct updates an epoch is one flight, flown in legs, and the same is done after each of
-//! them. Everything it does follows from configuration, seed and committed flights; a learner that died goes on from a checkpoint as if nothing had been (`saving`).
+//! An epoch is a fixed number of episodes, all flown with one frozen snapshot. When the last of them is committed, the learner takes them in, in episode
+//! order, updates the networks and publishes the next snapshot. With direct updates an epoch is one episode, flown in segments, and the same is done after each of
+//! them. Everything it does follows from configuration, seed and committed episodes; a learner that died goes on from a checkpoint as if nothing had been (`saving`).
 
 mod candidates;
 mod curves;
@@ -19,7 +19,7 @@ use skein_protocol::config::Config;
 use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::Phase;
-use skein_protocol::run::{Life, RunDirectory, RunIdentity};
+use skein_protocol::run::{LearnerIncarnation, RunDirectory, RunIdentity};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{Ending, Summary};
@@ -27,8 +27,8 @@ use skein_protocol::summary::{Ending, Summary};
 use crate::checkpoint::{CheckpointWriter, EpochOrder, Progress};
 use crate::curriculum;
 use crate::disk::Disk;
-use crate::flight::CommittedFlight;
-use crate::flights::reception::{Batch, Reception, ReceptionError};
+use crate::episode::CommittedEpisode;
+use crate::episodes::receiver::{Batch, EpisodeReceiver, ReceiverError};
 use crate::metrics::{Metrics, Scalar};
 use crate::report::Reporter;
 use crate::trainer::Trainer;
@@ -47,7 +47,7 @@ struct Training<'a> {
     disk: Disk,
     layout: SnapshotLayout,
     trainer: Trainer,
-    reception: Reception,
+    receiver: EpisodeReceiver,
     reporter: Reporter,
     metrics: Metrics,
     checkpoints: CheckpointWriter,
@@ -64,21 +64,21 @@ struct Training<'a> {
     resumes: u64,
     /// Ordered and not learned from.
     in_the_air: VecDeque<InTheAir>,
-    /// The flight whose first legs are learned from, and whose next leg is not, as far as it was flown; without images.
-    under_way: Option<CommittedFlight>,
-    /// The newest snapshot, those of the flights in the air, and the best.
+    /// The episode whose first segments are learned from, and whose next segment is not, as far as it was flown; without images.
+    under_way: Option<CommittedEpisode>,
+    /// The newest snapshot, those of the episodes in the air, and the best.
     snapshots: BTreeMap<PolicyVersion, Snapshot>,
 }
 
-/// Flights of an epoch that are under way, or the leg of one.
+/// Episodes of an epoch that are under way, or the segment of one.
 struct InTheAir {
     order: EpochOrder,
     batch: Batch,
     /// Those that have come in.
-    flights: Vec<CommittedFlight>,
+    episodes: Vec<CommittedEpisode>,
 }
 
-/// Trains the run in `directory` to its end, in this `life` of its learner, or until `stop` is set; writes and returns what it came to. It goes on from
+/// Trains the run in `directory` to its end, in this `incarnation` of its learner, or until `stop` is set; writes and returns what it came to. It goes on from
 /// the newest undamaged checkpoint, if there is one.
 ///
 /// # Errors
@@ -86,14 +86,14 @@ struct InTheAir {
 pub fn run(
     directory: &RunDirectory,
     identity: &RunIdentity,
-    life: Life,
+    incarnation: LearnerIncarnation,
     config: &Config,
     stop: &Arc<AtomicBool>,
 ) -> Result<Summary, TrainingError> {
-    let mut training = Training::begin(directory, identity, life, config, stop)?;
+    let mut training = Training::begin(directory, identity, incarnation, config, stop)?;
     let end = match training.train() {
         Ok(()) => training.save().map(|progress| (Ending::Completed, progress)),
-        Err(TrainingError::Reception(ReceptionError::Stopped)) => {
+        Err(TrainingError::EpisodeReceiver(ReceiverError::Stopped)) => {
             training.save().map(|progress| (Ending::Interrupted, progress))
         }
         Err(TrainingError::Abandoned) => training.go_back().map(|progress| (Ending::Interrupted, progress)),
@@ -110,10 +110,10 @@ impl Training<'_> {
         self.evaluate_best()
     }
 
-    /// All epochs, those that an earlier life has learned from apart.
+    /// All epochs, those that an earlier incarnation has learned from apart.
     fn learn(&mut self) -> Result<(), TrainingError> {
         let epochs = curriculum::epochs(self.config);
-        // An earlier life may have been stopped while it looked.
+        // An earlier incarnation may have been stopped while it looked.
         self.look_for_best()?;
         while self.progress.epochs < epochs {
             let epoch = self.progress.epochs;
@@ -121,12 +121,12 @@ impl Training<'_> {
             self.order_until(epochs.min(epoch + 1 + self.config.learning.policy_lag))?;
             self.learn_from_flown()?;
             while self.under_way.is_some() {
-                // The rest of the flight is flown with what its last leg has taught.
+                // The rest of the episode is flown with what its last segment has taught.
                 self.order(self.next_order(epoch))?;
                 self.learn_from_flown()?;
             }
             self.progress.epochs += 1;
-            tracing::debug!(epoch, flights = self.progress.flights, "epoch learned from");
+            tracing::debug!(epoch, episodes = self.progress.episodes, "epoch learned from");
             self.draw_curves()?;
             self.look_for_best()?;
             self.checkpoint_if_due()?;
@@ -134,14 +134,14 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Waits for the flights or the leg ordered first, learns from them, and publishes what was learned.
+    /// Waits for the episodes or the segment ordered first, learns from them, and publishes what was learned.
     fn learn_from_flown(&mut self) -> Result<(), TrainingError> {
         let flown = self.collect()?;
         self.take_in(flown)?;
         let before = self.trainer.all_updates();
         self.train_vae()?;
         self.train_policy()?;
-        // A leg that brings no update goes on with the snapshot there is.
+        // A segment that brings no update goes on with the snapshot there is.
         if self.under_way.is_none() || self.trainer.all_updates() > before {
             self.progress.version += 1;
             self.publish()?;
@@ -153,7 +153,7 @@ impl Training<'_> {
     fn publish(&mut self) -> Result<(), TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         let snapshot = self.trainer.snapshot(self.progress.version());
-        self.reception.publish(snapshot.clone())?;
+        self.receiver.publish(snapshot.clone())?;
         self.snapshots.insert(snapshot.version, snapshot);
         self.forget_snapshots();
         self.timer.lap(Stage::Publish, 1);
@@ -168,7 +168,7 @@ impl Training<'_> {
         self.snapshots.retain(|version, _| needed.contains(&version.0));
     }
 
-    /// Orders the flights of all epochs before `end` that are not ordered yet, to be flown with the newest snapshot.
+    /// Orders the episodes of all epochs before `end` that are not ordered yet, to be flown with the newest snapshot.
     fn order_until(&mut self, end: u64) -> Result<(), TrainingError> {
         let first = self
             .in_the_air
@@ -190,9 +190,9 @@ impl Training<'_> {
         }
     }
 
-    /// Orders the flights of an epoch, or the next leg of the one that is under way.
+    /// Orders the episodes of an epoch, or the next segment of the one that is under way.
     fn order(&mut self, order: EpochOrder) -> Result<(), TrainingError> {
-        let flown = self.under_way.as_ref().map_or(&[][..], |flight| &flight.actions);
+        let flown = self.under_way.as_ref().map_or(&[][..], |episode| &episode.actions);
         let tickets = curriculum::training(
             self.config,
             self.identity.run,
@@ -201,29 +201,29 @@ impl Training<'_> {
             order.exploration,
             flown,
         );
-        let batch = self.reception.fly(Epoch(order.epoch), order.keep, tickets)?;
-        let flights = Vec::with_capacity(batch.remaining());
-        self.in_the_air.push_back(InTheAir { order, batch, flights });
+        let batch = self.receiver.fly(Epoch(order.epoch), order.keep, tickets)?;
+        let episodes = Vec::with_capacity(batch.remaining());
+        self.in_the_air.push_back(InTheAir { order, batch, episodes });
         Ok(())
     }
 
-    /// Waits for all flights of the epoch that was ordered first, or for its leg. Until they are there, it counts as in the air.
-    fn collect(&mut self) -> Result<Vec<CommittedFlight>, TrainingError> {
+    /// Waits for all episodes of the epoch that was ordered first, or for its segment. Until they are there, it counts as in the air.
+    fn collect(&mut self) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         self.reporter.update(|progress| progress.phase = Phase::Flying);
-        let (is_amid_flight, shared) = (self.under_way.is_some(), self.reception.shared());
-        if let Some(InTheAir { batch, flights, .. }) = self.in_the_air.front_mut() {
+        let (is_amid_episode, shared) = (self.under_way.is_some(), self.receiver.shared());
+        if let Some(InTheAir { batch, episodes, .. }) = self.in_the_air.front_mut() {
             let watch = &mut self.stop_watch;
-            let mut next = || match is_amid_flight {
-                true => batch.next_unless(|| watch.amid_flight(&shared)),
+            let mut next = || match is_amid_episode {
+                true => batch.next_unless(|| watch.amid_episode(&shared)),
                 false => Ok(batch.next(self.stop)?),
             };
-            while let Some(flight) = next()? {
+            while let Some(episode) = next()? {
                 self.reporter.update(|progress| {
-                    progress.flights += u64::from(flight.outcome.is_some());
-                    progress.steps += flight.steps() as u64;
+                    progress.episodes += u64::from(episode.outcome.is_some());
+                    progress.steps += episode.steps() as u64;
                 });
-                flights.push(flight);
+                episodes.push(episode);
             }
         }
         self.timer.lap(Stage::TrainingIdle, 1);
@@ -231,17 +231,17 @@ impl Training<'_> {
         Ok(self
             .in_the_air
             .pop_front()
-            .map(|epoch| epoch.flights)
+            .map(|epoch| epoch.episodes)
             .unwrap_or_default())
     }
 
-    /// Takes what was flown into metrics and replay buffer, in flight order.
-    fn take_in(&mut self, flown: Vec<CommittedFlight>) -> Result<(), TrainingError> {
+    /// Takes what was flown into metrics and replay buffer, in episode order.
+    fn take_in(&mut self, flown: Vec<CommittedEpisode>) -> Result<(), TrainingError> {
         let count = flown.len() as u64;
-        for flight in flown {
-            self.curves.steps += flight.steps();
-            self.tell(&flight)?;
-            self.trainer.take_in(flight)?;
+        for episode in flown {
+            self.curves.steps += episode.steps();
+            self.tell(&episode)?;
+            self.trainer.take_in(episode)?;
         }
         let windows = self.metrics.windows();
         self.reporter.update(|progress| {
@@ -253,34 +253,34 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Tells the metrics of a flight that has ended, and keeps one that goes on.
-    fn tell(&mut self, flown: &CommittedFlight) -> Result<(), TrainingError> {
-        let joined = self.under_way.take().map(|mut flight| {
-            flight.extend(flown);
-            flight
+    /// Tells the metrics of an episode that has ended, and keeps one that goes on.
+    fn tell(&mut self, flown: &CommittedEpisode) -> Result<(), TrainingError> {
+        let joined = self.under_way.take().map(|mut episode| {
+            episode.extend(flown);
+            episode
         });
         if flown.outcome.is_none() {
             self.under_way = joined.or_else(|| Some(flown.without_images()));
             return Ok(());
         }
-        self.metrics.flight(joined.as_ref().unwrap_or(flown))?;
-        self.progress.flights += 1;
+        self.metrics.episode(joined.as_ref().unwrap_or(flown))?;
+        self.progress.episodes += 1;
         Ok(())
     }
 
     /// Tells what the epoch that has just been learned from brought.
     fn draw_curves(&mut self) -> Result<(), TrainingError> {
         let curves = std::mem::take(&mut self.curves);
-        let shared = self.reception.shared();
+        let shared = self.receiver.shared();
         let points = curves.points(self.epoch_started.elapsed(), self.trainer.replay(), &shared);
         self.epoch_started = Instant::now();
-        self.metrics.scalars(self.last_flight(), &points)?;
+        self.metrics.scalars(self.last_episode(), &points)?;
         Ok(self.metrics.flush()?)
     }
 
-    /// The number of the newest flight: what curves are keyed by.
-    fn last_flight(&self) -> u64 {
-        self.progress.flights.saturating_sub(1)
+    /// The number of the newest episode: what curves are keyed by.
+    fn last_episode(&self) -> u64 {
+        self.progress.episodes.saturating_sub(1)
     }
 
     fn train_vae(&mut self) -> Result<(), TrainingError> {

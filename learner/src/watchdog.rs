@@ -4,14 +4,14 @@ use std::time::{Duration, Instant};
 
 use skein_protocol::progress::{Phase, Progress};
 
-use crate::flights::situation::Situation;
+use crate::episodes::situation::Situation;
 
 /// Time without any progress after which it is told why.
 const PATIENCE: Duration = Duration::from_secs(20);
 /// Time between two warnings about one stall.
 const WARN_INTERVAL: Duration = Duration::from_secs(60);
 /// Time without a heartbeat of the receiving thread after which it is the one that is waited for.
-const RECEPTION_PATIENCE: Duration = Duration::from_secs(20);
+const RECEIVER_PATIENCE: Duration = Duration::from_secs(20);
 
 /// Looks at each report.
 #[derive(Debug)]
@@ -27,11 +27,11 @@ pub struct Watchdog {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Done {
     phase: Phase,
-    flights: u64,
+    episodes: u64,
     steps: u64,
     updates: u64,
     vae_updates: u64,
-    evaluation_flights: (u64, u64),
+    evaluation_episodes: (u64, u64),
 }
 
 impl Watchdog {
@@ -44,22 +44,22 @@ impl Watchdog {
         }
     }
 
-    /// Who waits for whom, if nothing has moved for a while. `obstacle`: what is known to stop the training thread. `reception`: how long ago the
-    /// receiving thread last told where the flights are, and what it told.
+    /// Who waits for whom, if nothing has moved for a while. `obstacle`: what is known to stop the training thread. `receiver`: how long ago the
+    /// receiving thread last told where the episodes are, and what it told.
     pub fn look(
         &mut self,
         now: Instant,
         progress: &Progress,
         obstacle: Option<String>,
-        reception: Option<(Duration, Situation)>,
+        receiver: Option<(Duration, Situation)>,
     ) -> Option<String> {
         let done = Done {
             phase: progress.phase,
-            flights: progress.flights,
+            episodes: progress.episodes,
             steps: progress.steps,
             updates: progress.updates,
             vae_updates: progress.vae_updates,
-            evaluation_flights: progress.evaluation_flights,
+            evaluation_episodes: progress.evaluation_episodes,
         };
         if self.done != Some(done) {
             self.done = Some(done);
@@ -71,7 +71,7 @@ impl Watchdog {
         if still < PATIENCE && obstacle.is_none() {
             return None;
         }
-        let waits = obstacle.unwrap_or_else(|| who_waits(progress.phase, still, reception));
+        let waits = obstacle.unwrap_or_else(|| who_waits(progress.phase, still, receiver));
         if still >= PATIENCE
             && self
                 .told
@@ -84,18 +84,18 @@ impl Watchdog {
     }
 }
 
-fn who_waits(phase: Phase, still: Duration, reception: Option<(Duration, Situation)>) -> String {
+fn who_waits(phase: Phase, still: Duration, receiver: Option<(Duration, Situation)>) -> String {
     let still = still.as_secs();
-    let flights = match phase {
-        Phase::Flying => "flights",
-        Phase::Evaluating => "evaluation flights",
+    let episodes = match phase {
+        Phase::Flying => "episodes",
+        Phase::Evaluating => "evaluation episodes",
         Phase::Learning => return format!("the training thread has been at one step of its updates for {still} s"),
         Phase::Finishing => return format!("the training thread has been writing what remains for {still} s"),
     };
-    let waits = format!("the training thread has waited for {flights} for {still} s");
-    match reception {
+    let waits = format!("the training thread has waited for {episodes} for {still} s");
+    match receiver {
         None => format!("{waits}; the receiving thread has not begun"),
-        Some((ago, _)) if ago > RECEPTION_PATIENCE => {
+        Some((ago, _)) if ago > RECEIVER_PATIENCE => {
             format!(
                 "{waits}; the receiving thread has not come round for {} s",
                 ago.as_secs()
@@ -128,7 +128,7 @@ mod tests {
         let told = watchdog.look(at(22), &progress, None, nobody()).unwrap();
         assert_eq!(
             told,
-            "the training thread has waited for flights for 21 s; no actor is attached; flights that wait for one: 3"
+            "the training thread has waited for episodes for 21 s; no actor is attached; episodes that wait for one: 3"
         );
         progress.steps += 1;
         assert_eq!(watchdog.look(at(23), &progress, None, nobody()), None);

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::ids::PolicyVersion;
 use crate::transition::Outcome;
 
-/// How a snapshot flies: flights in mode action from the start of level 1.
+/// How a snapshot flies: episodes in mode action from the start of level 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EvaluationReport {
     /// The snapshot.
@@ -25,28 +25,28 @@ pub struct EvaluationReport {
 pub struct CourseEvaluation {
     /// The course's name.
     pub course: String,
-    /// Flights flown.
-    pub flights: u64,
-    /// R = (t_1 + … + t_n) / (n · flights): the average rate of obstacles avoided (paper, section 4.4).
+    /// Episodes flown.
+    pub episodes: u64,
+    /// R = (t_1 + … + t_n) / (n · episodes): the average rate of obstacles avoided (paper, section 4.4).
     pub r: f64,
-    /// Share of flights that reached the end wall.
+    /// Share of episodes that reached the end wall.
     pub completed: f64,
     /// How many they are.
     pub reached_end: u64,
-    /// t_n: flights that passed wall n, in flight order.
+    /// t_n: episodes that passed wall n, in course order.
     pub walls_passed: Vec<u64>,
     /// Mean sum of rewards.
     pub mean_return: f64,
-    /// Flights that collided.
+    /// Episodes that collided.
     pub collided: u64,
-    /// Flights cut off by the step limit.
+    /// Episodes cut off by the step limit.
     pub timed_out: u64,
-    /// Where and by what flights failed: an entry for each wall in flight order, and one for the way from the last wall to the end wall. Their sum is that of
+    /// Where and by what episodes failed: an entry for each wall in course order, and one for the way from the last wall to the end wall. Their sum is that of
     /// `collided` and `timed_out`.
     pub failures: Vec<Failures>,
 }
 
-/// Flights that failed at a wall or on the way to it.
+/// Episodes that failed at a wall or on the way to it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Failures {
     /// Hit this wall or the edge of its opening, from before or from behind.
@@ -57,55 +57,56 @@ pub struct Failures {
     pub timed_out: u64,
 }
 
-/// What an evaluation counts of one flight.
+/// What an evaluation counts of one episode.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FlightScore {
+pub struct EpisodeScore {
     /// Walls passed, from the start of level 1.
     pub walls_passed: u32,
     /// Sum of rewards.
-    pub flight_return: f64,
+    pub episode_return: f64,
     /// How it ended.
     pub outcome: Outcome,
-    /// The wall that it hit, from 1 in flight order, if it collided with one and not with the corridor.
+    /// The wall that it hit, from 1 in course order, if it collided with one and not with the corridor.
     pub hit_wall: Option<u8>,
 }
 
 impl CourseEvaluation {
-    /// Counts `flights` of a course of `walls` walls.
-    pub fn of(course: &str, walls: usize, flights: &[FlightScore]) -> Self {
-        let count = |holds: &dyn Fn(&FlightScore) -> bool| flights.iter().filter(|flight| holds(flight)).count() as u64;
+    /// Counts `episodes` of a course of `walls` walls.
+    pub fn of(course: &str, walls: usize, episodes: &[EpisodeScore]) -> Self {
+        let count =
+            |holds: &dyn Fn(&EpisodeScore) -> bool| episodes.iter().filter(|episode| holds(episode)).count() as u64;
         let share = |part: u64, whole: usize| if whole == 0 { 0.0 } else { part as f64 / whole as f64 };
         let walls_passed: Vec<u64> = (1..=walls)
-            .map(|wall| count(&|flight| flight.walls_passed as usize >= wall))
+            .map(|wall| count(&|episode| episode.walls_passed as usize >= wall))
             .collect();
-        let reached_end = count(&|flight| flight.outcome == Outcome::ReachedEnd);
-        let returns: f64 = flights.iter().map(|flight| flight.flight_return).sum();
+        let reached_end = count(&|episode| episode.outcome == Outcome::ReachedEnd);
+        let returns: f64 = episodes.iter().map(|episode| episode.episode_return).sum();
         Self {
             course: course.to_owned(),
-            flights: flights.len() as u64,
-            r: share(walls_passed.iter().sum(), walls * flights.len()),
-            completed: share(reached_end, flights.len()),
+            episodes: episodes.len() as u64,
+            r: share(walls_passed.iter().sum(), walls * episodes.len()),
+            completed: share(reached_end, episodes.len()),
             reached_end,
             walls_passed,
-            mean_return: if flights.is_empty() {
+            mean_return: if episodes.is_empty() {
                 0.0
             } else {
-                returns / flights.len() as f64
+                returns / episodes.len() as f64
             },
-            collided: count(&|flight| flight.outcome == Outcome::Collided),
-            timed_out: count(&|flight| flight.outcome == Outcome::TimedOut),
-            failures: Failures::of(walls, flights),
+            collided: count(&|episode| episode.outcome == Outcome::Collided),
+            timed_out: count(&|episode| episode.outcome == Outcome::TimedOut),
+            failures: Failures::of(walls, episodes),
         }
     }
 }
 
 impl Failures {
-    /// Counts the failures of `flights` from the start of level 1, `[walls + 1]`.
-    fn of(walls: usize, flights: &[FlightScore]) -> Vec<Self> {
+    /// Counts the failures of `episodes` from the start of level 1, `[walls + 1]`.
+    fn of(walls: usize, episodes: &[EpisodeScore]) -> Vec<Self> {
         let mut failures = vec![Self::default(); walls + 1];
-        for flight in flights {
-            let next = (flight.walls_passed as usize).min(walls);
-            match (flight.outcome, flight.hit_wall) {
+        for episode in episodes {
+            let next = (episode.walls_passed as usize).min(walls);
+            match (episode.outcome, episode.hit_wall) {
                 (Outcome::ReachedEnd, _) => {}
                 (Outcome::TimedOut, _) => failures[next].timed_out += 1,
                 (Outcome::Collided, None) => failures[next].hit_corridor += 1,
@@ -133,7 +134,7 @@ impl fmt::Display for EvaluationReport {
         table.load_preset(UTF8_FULL_CONDENSED);
         table.set_header([
             "course",
-            "flights",
+            "episodes",
             "R",
             "completed",
             "passed wall\n1, 2, …",
@@ -150,7 +151,7 @@ impl fmt::Display for EvaluationReport {
             hit_wall.truncate(walls.len());
             table.add_row([
                 course.course.clone(),
-                course.flights.to_string(),
+                course.episodes.to_string(),
                 format!("{:.3}", course.r),
                 format!("{:.1} %", 100.0 * course.completed),
                 walls.join(" "),
@@ -173,19 +174,19 @@ mod tests {
 
     #[test]
     fn r_counts_walls_and_completed_counts_courses() {
-        let score = |walls_passed, outcome| FlightScore {
+        let score = |walls_passed, outcome| EpisodeScore {
             walls_passed,
-            flight_return: 2.0,
+            episode_return: 2.0,
             outcome,
             hit_wall: None,
         };
-        let flights = [
+        let episodes = [
             score(5, Outcome::ReachedEnd),
             score(5, Outcome::Collided),
             score(2, Outcome::Collided),
             score(0, Outcome::TimedOut),
         ];
-        let evaluation = CourseEvaluation::of("training", 5, &flights);
+        let evaluation = CourseEvaluation::of("training", 5, &episodes);
         assert_eq!(evaluation.walls_passed, [3, 3, 2, 2, 2]);
         assert_eq!(evaluation.r, 12.0 / 20.0);
         assert_eq!((evaluation.completed, evaluation.reached_end), (0.25, 1));
@@ -195,13 +196,13 @@ mod tests {
 
     #[test]
     fn every_failure_is_counted_once_where_it_happened() {
-        let score = |walls_passed, outcome, hit_wall| FlightScore {
+        let score = |walls_passed, outcome, hit_wall| EpisodeScore {
             walls_passed,
-            flight_return: 0.0,
+            episode_return: 0.0,
             outcome,
             hit_wall,
         };
-        let flights = [
+        let episodes = [
             score(3, Outcome::ReachedEnd, None),
             score(1, Outcome::Collided, Some(2)),
             // Its centre had left the wall behind when its tail hit it.
@@ -210,7 +211,7 @@ mod tests {
             score(0, Outcome::TimedOut, None),
             score(3, Outcome::Collided, None),
         ];
-        let evaluation = CourseEvaluation::of("training", 3, &flights);
+        let evaluation = CourseEvaluation::of("training", 3, &episodes);
         let failures = |hit_wall, hit_corridor, timed_out| Failures {
             hit_wall,
             hit_corridor,
@@ -235,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn no_flights_are_no_rate() {
+    fn no_episodes_are_no_rate() {
         assert_eq!(CourseEvaluation::of("training", 5, &[]).r, 0.0);
     }
 }

@@ -36,15 +36,15 @@ points! {
     ActorJoined => "actor.joined",
     /// An actor has rendered a record and not yet sent it.
     ActorBeforeSend => "actor.before-send",
-    /// An actor has sent the third record of a flight.
-    ActorMidFlight => "actor.mid-flight",
-    /// An actor has sent the last record of a flight and not yet woken the learner.
+    /// An actor has sent the third record of an episode.
+    ActorMidEpisode => "actor.mid-episode",
+    /// An actor has sent the last record of an episode and not yet woken the learner.
     ActorAfterLastRecord => "actor.after-last-record",
     /// The learner has opened its services, and nobody could join yet.
     LearnerStarted => "learner.started",
-    /// The learner's receiving thread has committed a flight that the training thread has not seen.
-    LearnerFlightCommitted => "learner.flight-committed",
-    /// All flights of an epoch are there, none is learned from.
+    /// The learner's receiving thread has committed an episode that the training thread has not seen.
+    LearnerEpisodeCommitted => "learner.episode-committed",
+    /// All episodes of an epoch are there, none is learned from.
     LearnerEpochCollected => "learner.epoch-collected",
     /// An update of an epoch is done.
     LearnerMidUpdates => "learner.mid-updates",
@@ -106,10 +106,10 @@ mod tests {
     #[test]
     fn an_armed_point_fires_once_and_no_other_does() {
         let directory = tempfile::tempdir().unwrap();
-        fs::write(directory.path().join("actor.mid-flight"), "").unwrap();
+        fs::write(directory.path().join("actor.mid-episode"), "").unwrap();
         assert!(!disarm(directory.path(), FaultPoint::LearnerUpdated));
-        assert!(disarm(directory.path(), FaultPoint::ActorMidFlight));
-        assert!(!disarm(directory.path(), FaultPoint::ActorMidFlight));
+        assert!(disarm(directory.path(), FaultPoint::ActorMidEpisode));
+        assert!(!disarm(directory.path(), FaultPoint::ActorMidEpisode));
     }
 
     #[test]

@@ -24,11 +24,11 @@ id! {
     RunId(u64)
 }
 id! {
-    /// A flight (episode). Training flights count from 0 in the order of their commit; evaluation flights lie above [`FlightId::FIRST_EVALUATION`].
-    FlightId(u64)
+    /// An episode (episode). Training episodes count from 0 in the order of their commit; evaluation episodes lie above [`EpisodeId::FIRST_EVALUATION`].
+    EpisodeId(u64)
 }
 id! {
-    /// A set of flights flown with one frozen policy.
+    /// A set of episodes flown with one frozen policy.
     Epoch(u64)
 }
 id! {
@@ -40,15 +40,15 @@ id! {
     ActorId(u32)
 }
 id! {
-    /// One life of an actor process: a restarted actor keeps its id and gets a new incarnation.
-    Incarnation(u64)
+    /// One incarnation of an actor process: a restarted actor keeps its id and gets a new incarnation.
+    ActorIncarnation(u64)
 }
 id! {
-    /// How often a flight's ticket had been issued before: tells a flight flown again from its late twin.
+    /// How often an episode's ticket had been issued before: tells an episode flown again from its late twin.
     Attempt(u32)
 }
 
-impl FlightId {
-    /// Evaluation flights are numbered from here, so that they never collide with training flights.
+impl EpisodeId {
+    /// Evaluation episodes are numbered from here, so that they never collide with training episodes.
     pub const FIRST_EVALUATION: Self = Self(1 << 63);
 }

@@ -1,6 +1,6 @@
 //! The contract between Skein's processes.
 //!
-//! Everything that two processes must agree on is defined here, and nothing else: who flies what ([`ticket`], [`leg`]), what a flown step looks like on the
+//! Everything that two processes must agree on is defined here, and nothing else: who flies what ([`ticket`], [`segment`]), what a flown step looks like on the
 //! wire ([`transition`]), what a policy snapshot contains ([`snapshot`]), the iceoryx2 services that carry them ([`services`]), the configuration of a
 //! run ([`config`]) and the files it leaves ([`run`], [`evaluation`], [`summary`]), and what their time is counted by ([`stages`]); and what all of our programs do alike
 //! ([`allocation`], [`logging`]). It knows neither libtorch nor the physics engine, so that every
@@ -14,11 +14,11 @@ pub mod evaluation;
 pub mod failure;
 pub mod fault;
 pub mod ids;
-pub mod leg;
 pub mod logging;
 pub mod progress;
 pub mod run;
 pub mod seeds;
+pub mod segment;
 pub mod services;
 pub mod snapshot;
 pub mod stages;

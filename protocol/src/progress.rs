@@ -9,12 +9,12 @@ use serde::{Deserialize, Serialize};
 pub struct Progress {
     /// What the learner is about.
     pub phase: Phase,
-    /// Training flights committed.
-    pub flights: u64,
-    /// Training flights in the whole run.
-    pub total_flights: u64,
-    /// Evaluation flights committed and to be flown in the present evaluation.
-    pub evaluation_flights: (u64, u64),
+    /// Training episodes committed.
+    pub episodes: u64,
+    /// Training episodes in the whole run.
+    pub total_episodes: u64,
+    /// Evaluation episodes committed and to be flown in the present evaluation.
+    pub evaluation_episodes: (u64, u64),
     /// Environment steps committed.
     pub steps: u64,
     /// SAC updates done.
@@ -25,15 +25,15 @@ pub struct Progress {
     pub steps_per_sec: f64,
     /// SAC updates per second, over the last few seconds.
     pub updates_per_sec: f64,
-    /// Walls passed per flight, over the last 50 flights.
+    /// Walls passed per episode, over the last 50 episodes.
     pub walls_passed: Option<f64>,
-    /// Sum of rewards per flight, over the last 50 flights.
+    /// Sum of rewards per episode, over the last 50 episodes.
     pub mean_return: Option<f64>,
     /// Temperature α, once there were updates.
     pub temperature: Option<f64>,
     /// VAE loss of the last epoch that trained it.
     pub vae_loss: Option<f64>,
-    /// Actors that gave a sign of life.
+    /// Actors that sent a heartbeat.
     pub actors: usize,
     /// Their numbers, in ascending order.
     #[serde(default)]
@@ -47,18 +47,18 @@ pub struct Progress {
     /// Who waits for whom, when nothing has moved for a while.
     #[serde(default)]
     pub stalled: Option<String>,
-    /// Seconds that the learner has run, earlier lives included as far as checkpoints tell.
+    /// Seconds that the learner has run, earlier incarnations included as far as checkpoints tell.
     pub elapsed_secs: f64,
 }
 
 impl Progress {
-    /// Of a run of `total_flights` training flights that has not begun.
-    pub fn start(total_flights: u64) -> Self {
+    /// Of a run of `total_episodes` training episodes that has not begun.
+    pub fn start(total_episodes: u64) -> Self {
         Self {
             phase: Phase::Flying,
-            flights: 0,
-            total_flights,
-            evaluation_flights: (0, 0),
+            episodes: 0,
+            total_episodes,
+            evaluation_episodes: (0, 0),
             steps: 0,
             updates: 0,
             vae_updates: 0,
@@ -82,7 +82,7 @@ impl Progress {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Phase {
-    /// Waits for flights.
+    /// Waits for episodes.
     Flying,
     /// Updates the networks.
     Learning,

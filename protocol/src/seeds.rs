@@ -9,17 +9,17 @@ use xxhash_rust::xxh3::xxh3_64_with_seed;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u64)]
 pub enum Purpose {
-    /// Start position and exploration noise of one training flight; indexed by flight.
-    Flight = 1,
-    /// Start position of one evaluation flight; indexed by its number within the evaluation.
-    EvaluationFlight = 2,
-    /// Whether a training flight is flown on a generated course, and which; indexed by flight.
+    /// Start position and exploration noise of one training episode; indexed by episode.
+    Episode = 1,
+    /// Start position of one evaluation episode; indexed by its number within the evaluation.
+    EvaluationEpisode = 2,
+    /// Whether a training episode is flown on a generated course, and which; indexed by episode.
     Course = 3,
     /// Initial parameters of the VAE.
     VaeParameters = 4,
     /// Initial parameters of policy and critic.
     PolicyParameters = 5,
-    /// Minibatches drawn for the policy updates between two snapshots; indexed by the former's version, which is the epoch unless flights are flown in legs.
+    /// Minibatches drawn for the policy updates between two snapshots; indexed by the former's version, which is the epoch unless episodes are flown in segments.
     PolicyBatches = 6,
     /// Action noise inside the policy updates between two snapshots; indexed likewise.
     PolicyNoise = 7,
@@ -27,15 +27,15 @@ pub enum Purpose {
     VaeBatches = 8,
     /// Reparameterisation noise of the VAE steps between two snapshots; indexed likewise.
     VaeNoise = 9,
-    /// Where one flight starts; derived from the ticket's seed.
+    /// Where one episode starts; derived from the ticket's seed.
     StartPosition = 10,
-    /// Exploration noise of one flight, or of the leg of it that begins at the step of this index; derived from the ticket's seed, so that a start drawn otherwise does not shift it.
+    /// Exploration noise of one episode, or of the segment of it that begins at the step of this index; derived from the ticket's seed, so that a start drawn otherwise does not shift it.
     ActionNoise = 11,
-    /// What disturbs one flight; derived from the ticket's seed.
+    /// What disturbs one episode; derived from the ticket's seed.
     Disturbances = 12,
     /// Resamples of the runs of an experiment, from which the uncertainty of what it found is told; the seed is their number, the index that of the resamples.
     Bootstrap = 13,
-    /// Generated course on which a candidate for the best snapshot is confirmed; indexed by flight.
+    /// Generated course on which a candidate for the best snapshot is confirmed; indexed by episode.
     ConfirmationCourse = 14,
 }
 
@@ -53,10 +53,10 @@ mod tests {
 
     #[test]
     fn seeds_differ_by_run_purpose_and_index() {
-        let base = derive(1, Purpose::Flight, 0);
-        assert_ne!(base, derive(2, Purpose::Flight, 0));
-        assert_ne!(base, derive(1, Purpose::EvaluationFlight, 0));
-        assert_ne!(base, derive(1, Purpose::Flight, 1));
-        assert_eq!(base, derive(1, Purpose::Flight, 0));
+        let base = derive(1, Purpose::Episode, 0);
+        assert_ne!(base, derive(2, Purpose::Episode, 0));
+        assert_ne!(base, derive(1, Purpose::EvaluationEpisode, 0));
+        assert_ne!(base, derive(1, Purpose::Episode, 1));
+        assert_eq!(base, derive(1, Purpose::Episode, 0));
     }
 }

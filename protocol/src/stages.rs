@@ -69,11 +69,11 @@ stages! {
     Actors {
         /// Snapshots are taken in and made ready to fly with. Snapshots.
         TakeSnapshot => "snapshot",
-        /// The simulator is set to the start of a flight, or to where a leg begins. Flights, legs.
-        TakeOff => "take-off",
+        /// The simulator is set to the start of an episode, or to where a segment begins. Episodes, segments.
+        Reset => "reset",
         /// The drone moves until its next decision. Environment steps.
         Physics => "physics",
-        /// A depth image is rendered into its record. Observations: one more than steps in each flight.
+        /// A depth image is rendered into its record. Observations: one more than steps in each episode.
         Camera => "camera",
         /// The image is encoded. Observations.
         Encoder => "encoder",
@@ -81,21 +81,21 @@ stages! {
         Policy => "policy",
         /// A record is loaned from shared memory, completed by reward and end, and sent. Records.
         Send => "send",
-        /// The learner is listened to, and given signs of life. Looks.
+        /// The learner is listened to, and given heartbeats. Looks.
         ActorControl => "control",
         /// There is no ticket, or its snapshot is not there yet. Waits.
         ActorIdle => "idle",
     }
     Receiving {
-        /// Records are checked, put together into flights, and delivered. Records.
+        /// Records are checked, put together into episodes, and delivered. Records.
         Assemble => "assemble",
-        /// Orders are taken; tickets, snapshots and signs of life go out. Rounds.
+        /// Orders are taken; tickets, snapshots and heartbeats go out. Rounds.
         HandOut => "hand out",
         /// Nobody has sent anything. Waits.
         ReceivingIdle => "idle",
     }
     Training {
-        /// Flights go into replay and metrics. Flights, legs.
+        /// Episodes go into replay and metrics. Episodes, segments.
         TakeIn => "take in",
         /// A minibatch of depth images is gathered. Minibatches.
         SampleImages => "sample images",
@@ -109,13 +109,13 @@ stages! {
         PolicyUpdate => "policy update",
         /// The parameters are copied into a snapshot and handed over. Snapshots.
         Publish => "publish",
-        /// Evaluation flights are waited for. Flights.
+        /// Evaluation episodes are waited for. Episodes.
         Evaluate => "evaluation",
         /// The state is copied for a checkpoint and handed over. Checkpoints.
         Checkpoint => "checkpoint",
         /// The start, orders, curves, the files at the end, waits that were broken off. Not counted.
         OtherTraining => "other",
-        /// Training flights are waited for. Waits.
+        /// Training episodes are waited for. Waits.
         TrainingIdle => "idle",
     }
 }

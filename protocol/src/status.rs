@@ -1,12 +1,12 @@
-//! What an actor tells the learner besides its flights: that it is there, and that it lives.
+//! What an actor tells the learner besides its episodes: that it is there, and that it incarnations.
 
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::ids::{ActorId, Incarnation, PolicyVersion, RunId};
+use crate::ids::{ActorId, ActorIncarnation, PolicyVersion, RunId};
 use crate::stages::{ACTOR_STAGES, Tally, Times};
 
-/// Sign of life of an actor, sent at its start, when it finds nothing to fly, at every heartbeat and at its end.
+/// Sign of incarnation of an actor, sent at its start, when it finds nothing to fly, at every heartbeat and at its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
 #[type_name("skein.StatusRecord.v2")]
@@ -14,7 +14,7 @@ pub struct StatusRecord {
     run: u64,
     incarnation: u64,
     newest_policy: u64,
-    flights_flown: u64,
+    episodes_flown: u64,
     actor: u32,
     pid: u32,
     state: u32,
@@ -31,17 +31,17 @@ const _: () = assert!(size_of::<StatusRecord>() == 4 * 8 + 4 * 4 + ACTOR_STAGES 
 pub struct ActorStatus {
     /// The actor.
     pub actor: ActorId,
-    /// Its life.
-    pub incarnation: Incarnation,
+    /// Its incarnation.
+    pub incarnation: ActorIncarnation,
     /// Its process.
     pub pid: u32,
     /// What it is about.
     pub state: ActorState,
     /// The newest snapshot it holds, if any.
     pub newest_policy: Option<PolicyVersion>,
-    /// Flights it has flown in this life.
-    pub flights_flown: u64,
-    /// What its time in this life has gone into, until its last lap.
+    /// Episodes it has flown in this incarnation.
+    pub episodes_flown: u64,
+    /// What its time in this incarnation has gone into, until its last lap.
     pub times: Times,
 }
 
@@ -63,7 +63,7 @@ impl StatusRecord {
             run: run.0,
             incarnation: status.incarnation.0,
             newest_policy: status.newest_policy.map_or(NO_POLICY, |version| version.0),
-            flights_flown: status.flights_flown,
+            episodes_flown: status.episodes_flown,
             actor: status.actor.0,
             pid: status.pid,
             state: match status.state {
@@ -85,11 +85,11 @@ impl StatusRecord {
         let times = Times::read_actor(&self.times)?;
         (self.run == run.0).then_some(ActorStatus {
             actor: ActorId(self.actor),
-            incarnation: Incarnation(self.incarnation),
+            incarnation: ActorIncarnation(self.incarnation),
             pid: self.pid,
             state,
             newest_policy: (self.newest_policy != NO_POLICY).then_some(PolicyVersion(self.newest_policy)),
-            flights_flown: self.flights_flown,
+            episodes_flown: self.episodes_flown,
             times,
         })
     }
@@ -107,11 +107,11 @@ mod tests {
         for newest_policy in [None, Some(PolicyVersion(4))] {
             let status = ActorStatus {
                 actor: ActorId(1),
-                incarnation: Incarnation(2),
+                incarnation: ActorIncarnation(2),
                 pid: 3,
                 state: ActorState::Leaving,
                 newest_policy,
-                flights_flown: 6,
+                episodes_flown: 6,
                 times: times(7),
             };
             let record = StatusRecord::new(RunId(9), &status);
@@ -133,11 +133,11 @@ mod tests {
         let read = |times| {
             let status = ActorStatus {
                 actor: ActorId(1),
-                incarnation: Incarnation(2),
+                incarnation: ActorIncarnation(2),
                 pid: 3,
                 state: ActorState::Serving,
                 newest_policy: None,
-                flights_flown: 6,
+                episodes_flown: 6,
                 times,
             };
             StatusRecord::new(RunId(9), &status).read(RunId(9))

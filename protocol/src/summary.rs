@@ -28,21 +28,21 @@ pub struct Summary {
     pub final_version: PolicyVersion,
     /// The best snapshot, if one was confirmed.
     pub best_version: Option<PolicyVersion>,
-    /// Walls passed in the best snapshot's confirmation flights, on average.
+    /// Walls passed in the best snapshot's confirmation episodes, on average.
     pub best_confirmed_walls_passed: Option<f64>,
     /// When a candidate for the best snapshot first passed the share `evaluation.trained_rate` of walls, if one did.
     #[serde(default)]
     pub trained: Option<Trained>,
-    /// Training flights committed.
-    pub flights: u64,
-    /// Environment steps of training flights.
+    /// Training episodes committed.
+    pub episodes: u64,
+    /// Environment steps of training episodes.
     pub steps: u64,
     /// Updates of the agent, SAC or TD3.
     pub updates: u64,
     /// VAE steps.
     pub vae_updates: u64,
-    /// Flights without exploration: those that the best snapshot was chosen by, and those of its evaluation. Their steps are in no other count.
-    pub evaluation_flights: u64,
+    /// Episodes without exploration: those that the best snapshot was chosen by, and those of its evaluation. Their steps are in no other count.
+    pub evaluation_episodes: u64,
     /// Tickets issued again, for whatever reason.
     pub tickets_reissued: u64,
     /// Records that were refused.
@@ -53,16 +53,16 @@ pub struct Summary {
     /// [`Summary::records_refused`] by reason; without reasons that did not occur.
     #[serde(default)]
     pub refused_by_reason: BTreeMap<String, u64>,
-    /// Times the learner was started again, whether it went on from a checkpoint or from the first flight.
+    /// Times the learner was started again, whether it went on from a checkpoint or from the first episode.
     #[serde(default)]
     pub resumes: u64,
-    /// Seconds from the learner's start to its end, over all its lives; what a death undid is not counted.
+    /// Seconds from the learner's start to its end, over all its incarnations; what a death undid is not counted.
     pub wall_secs: f64,
     /// What the time of actors and learner went into, as far as `wall_secs`. An actor that was killed has told of it until its last heartbeat or the end of
-    /// its last flight, whichever was later.
+    /// its last episode, whichever was later.
     #[serde(default)]
     pub stages: Times,
-    /// Seconds of processor time in the learner's last life by those of its threads that lived until its end; `reception` receives and assembles flights.
+    /// Seconds of processor time in the learner's last incarnation by those of its threads that lived until its end; `receiver` receives and assembles episodes.
     #[serde(default)]
     pub thread_cpu_secs: BTreeMap<String, f64>,
 }
@@ -86,15 +86,15 @@ impl Summary {
 /// When a policy first did what it was trained for: what is behind it then.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Trained {
-    /// Share R of walls passed in its evaluation flights, without exploration noise, from the start of level 1, where `evaluation.confirm_on` says.
+    /// Share R of walls passed in its evaluation episodes, without exploration noise, from the start of level 1, where `evaluation.confirm_on` says.
     pub rate: f64,
-    /// Training flights committed.
-    pub flights: u64,
-    /// Environment steps of training flights.
+    /// Training episodes committed.
+    pub episodes: u64,
+    /// Environment steps of training episodes.
     pub steps: u64,
     /// Policy updates.
     pub updates: u64,
-    /// Seconds from the learner's start until its evaluation flights were flown, over all lives; what a death undid is not counted.
+    /// Seconds from the learner's start until its evaluation episodes were flown, over all incarnations; what a death undid is not counted.
     pub wall_secs: f64,
 }
 
@@ -102,7 +102,7 @@ pub struct Trained {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Ending {
-    /// All flights were flown.
+    /// All episodes were flown.
     Completed,
     /// It was told to stop.
     Interrupted,
@@ -134,16 +134,16 @@ mod tests {
             best_confirmed_walls_passed: None,
             trained: Some(Trained {
                 rate: 0.95,
-                flights: 30,
+                episodes: 30,
                 steps: 300,
                 updates: 15,
                 wall_secs: 1.25,
             }),
-            flights: 40,
+            episodes: 40,
             steps: 400,
             updates: 20,
             vae_updates: 10,
-            evaluation_flights: 6,
+            evaluation_episodes: 6,
             tickets_reissued: 0,
             records_refused: 0,
             reissued_by_reason: BTreeMap::new(),
@@ -151,7 +151,7 @@ mod tests {
             resumes: 2,
             wall_secs: 1.5,
             stages,
-            thread_cpu_secs: BTreeMap::from([("reception".to_owned(), 0.25)]),
+            thread_cpu_secs: BTreeMap::from([("receiver".to_owned(), 0.25)]),
         };
         summary.save(&path).unwrap();
         assert_eq!(Summary::of(&run), Some(summary));
@@ -164,7 +164,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         let old = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"ab","final_version":80,"best_version":70,
-            "best_confirmed_walls_passed":4.9,"flights":800,"steps":42837,"updates":20418,"vae_updates":400,"evaluation_flights":400,
+            "best_confirmed_walls_passed":4.9,"episodes":800,"steps":42837,"updates":20418,"vae_updates":400,"evaluation_episodes":400,
             "tickets_reissued":0,"records_refused":0,"wall_secs":333.3,"phase_secs":{"publish":12.5}}"#;
         std::fs::write(run.summary_json(), old).unwrap();
         assert_eq!(Summary::of(&run).unwrap().stages, Times::default());

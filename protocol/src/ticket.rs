@@ -1,23 +1,23 @@
-//! The ticket: everything a flight is a function of.
+//! The ticket: everything an episode is a function of.
 //!
-//! A flight is flown only against a ticket, and two actors that hold the same ticket fly the same flight, bit for bit. The learner sends tickets inside
-//! [`ControlRecord`]s, fixed-size messages that actors listen to; those of [legs](crate::leg) inside [`LegRecord`]s, which have room for more.
+//! An episode is flown only against a ticket, and two actors that hold the same ticket fly the same episode, bit for bit. The learner sends tickets inside
+//! [`ControlRecord`]s, fixed-size messages that actors listen to; those of [segments](crate::segment) inside [`SegmentRecord`]s, which have room for more.
 
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion, RunId};
-use crate::leg::{Leg, LegRecord};
+use crate::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion, RunId};
+use crate::segment::{Segment, SegmentRecord};
 
-/// What a flight is flown for, how, where and with which policy.
+/// What an episode is flown for, how, where and with which policy.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ticket {
     /// The run it belongs to.
     pub run: RunId,
     /// Its number.
-    pub flight: FlightId,
-    /// How often this flight had been issued before.
+    pub episode: EpisodeId,
+    /// How often this episode had been issued before.
     pub attempt: Attempt,
     /// The snapshot to hold for all that the ticket is for.
     pub policy_version: PolicyVersion,
@@ -27,20 +27,20 @@ pub struct Ticket {
     pub start_level: u8,
     /// How actions are chosen.
     pub exploration: Exploration,
-    /// Seed of everything random in the flight.
+    /// Seed of everything random in the episode.
     pub seed: u64,
-    /// The part of the flight to fly; `None` for all of it.
-    pub leg: Option<Leg>,
+    /// The part of the episode to fly; `None` for all of it.
+    pub segment: Option<Segment>,
 }
 
 impl Ticket {
-    /// Steps of the flight that were flown on other tickets before.
+    /// Steps of the episode that were flown on other tickets before.
     pub fn first_step(&self) -> u32 {
-        self.leg.as_ref().map_or(0, |leg| leg.flown.len() as u32)
+        self.segment.as_ref().map_or(0, |segment| segment.flown.len() as u32)
     }
 }
 
-/// Where a flight is flown.
+/// Where an episode is flown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum CourseChoice {
     /// The training course.
@@ -82,7 +82,7 @@ pub enum Control {
 pub struct ControlRecord {
     run: u64,
     to_incarnation: u64,
-    flight: u64,
+    episode: u64,
     policy_version: u64,
     course_seed: u64,
     seed: u64,
@@ -101,8 +101,8 @@ const _: () = assert!(size_of::<ControlRecord>() == 6 * 8 + 3 * 4 + 4);
 const EVERYONE: u32 = u32::MAX;
 
 impl ControlRecord {
-    /// `ticket` for all of its flight, for one life of one actor.
-    pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: Incarnation) -> Self {
+    /// `ticket` for all of its episode, for one incarnation of one actor.
+    pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: ActorIncarnation) -> Self {
         let (course_kind, course_index, course_seed) = match ticket.course {
             CourseChoice::Training => (0, 0, 0),
             CourseChoice::Evaluation(index) => (1, index, 0),
@@ -111,7 +111,7 @@ impl ControlRecord {
         Self {
             run: ticket.run.0,
             to_incarnation: incarnation.0,
-            flight: ticket.flight.0,
+            episode: ticket.episode.0,
             policy_version: ticket.policy_version.0,
             course_seed,
             seed: ticket.seed,
@@ -129,7 +129,7 @@ impl ControlRecord {
         }
     }
 
-    /// A sign of life to all actors.
+    /// A heartbeat to all actors.
     pub fn heartbeat(run: RunId) -> Self {
         Self::to_everyone(run, 0)
     }
@@ -139,8 +139,8 @@ impl ControlRecord {
         Self::to_everyone(run, 2)
     }
 
-    /// The request to one life of one actor to join anew.
-    pub fn rejoin(run: RunId, actor: ActorId, incarnation: Incarnation) -> Self {
+    /// The request to one incarnation of one actor to join anew.
+    pub fn rejoin(run: RunId, actor: ActorId, incarnation: ActorIncarnation) -> Self {
         Self {
             to_actor: actor.0,
             to_incarnation: incarnation.0,
@@ -152,7 +152,7 @@ impl ControlRecord {
         Self {
             run: run.0,
             to_incarnation: 0,
-            flight: 0,
+            episode: 0,
             policy_version: 0,
             course_seed: 0,
             seed: 0,
@@ -166,8 +166,8 @@ impl ControlRecord {
         }
     }
 
-    /// Whether this life of this actor is meant.
-    pub fn is_for(&self, actor: ActorId, incarnation: Incarnation) -> bool {
+    /// Whether this incarnation of this actor is meant.
+    pub fn is_for(&self, actor: ActorId, incarnation: ActorIncarnation) -> bool {
         self.to_actor == EVERYONE || (self.to_actor == actor.0 && self.to_incarnation == incarnation.0)
     }
 
@@ -200,7 +200,7 @@ impl ControlRecord {
         }
         Ok(Ticket {
             run,
-            flight: FlightId(self.flight),
+            episode: EpisodeId(self.episode),
             attempt: Attempt(self.attempt),
             policy_version: PolicyVersion(self.policy_version),
             course: match self.course_kind {
@@ -227,7 +227,7 @@ impl ControlRecord {
                 }
             },
             seed: self.seed,
-            leg: None,
+            segment: None,
         })
     }
 }
@@ -235,26 +235,26 @@ impl ControlRecord {
 /// A message to actors, for the service that has room for it.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Message {
-    /// Everything but tickets of legs.
+    /// Everything but tickets of segments.
     Control(ControlRecord),
-    /// The ticket of a leg.
-    Leg(Box<LegRecord>),
+    /// The ticket of a segment.
+    Segment(Box<SegmentRecord>),
 }
 
 impl Message {
-    /// `ticket`, for one life of one actor.
-    pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: Incarnation) -> Self {
-        match &ticket.leg {
+    /// `ticket`, for one incarnation of one actor.
+    pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: ActorIncarnation) -> Self {
+        match &ticket.segment {
             None => Self::Control(ControlRecord::fly(ticket, actor, incarnation)),
-            Some(leg) => Self::Leg(Box::new(LegRecord::fly(ticket, leg, actor, incarnation))),
+            Some(segment) => Self::Segment(Box::new(SegmentRecord::fly(ticket, segment, actor, incarnation))),
         }
     }
 
-    /// Whether this life of this actor is meant.
-    pub fn is_for(&self, actor: ActorId, incarnation: Incarnation) -> bool {
+    /// Whether this incarnation of this actor is meant.
+    pub fn is_for(&self, actor: ActorId, incarnation: ActorIncarnation) -> bool {
         match self {
             Self::Control(record) => record.is_for(actor, incarnation),
-            Self::Leg(record) => record.is_for(actor, incarnation),
+            Self::Segment(record) => record.is_for(actor, incarnation),
         }
     }
 
@@ -265,7 +265,7 @@ impl Message {
     pub fn read(&self, run: RunId) -> Result<Control, ControlFault> {
         match self {
             Self::Control(record) => record.read(run),
-            Self::Leg(record) => record.read(run),
+            Self::Segment(record) => record.read(run),
         }
     }
 }
@@ -284,9 +284,9 @@ pub enum ControlFault {
         /// Its value.
         value: u8,
     },
-    /// The ticket of a leg makes no sense.
-    #[error("the ticket of a leg {0}")]
-    Leg(&'static str),
+    /// The ticket of a segment makes no sense.
+    #[error("the ticket of a segment {0}")]
+    Segment(&'static str),
 }
 
 #[cfg(test)]
@@ -296,14 +296,14 @@ pub(crate) mod tests {
     pub(crate) fn ticket() -> Ticket {
         Ticket {
             run: RunId(3),
-            flight: FlightId(7),
+            episode: EpisodeId(7),
             attempt: Attempt(1),
             policy_version: PolicyVersion(5),
             course: CourseChoice::Generated(99),
             start_level: 2,
             exploration: Exploration::Sample,
             seed: 42,
-            leg: None,
+            segment: None,
         }
     }
 
@@ -321,26 +321,26 @@ pub(crate) mod tests {
                 exploration,
                 ..ticket()
             };
-            let record = ControlRecord::fly(&ticket, ActorId(4), Incarnation(8));
+            let record = ControlRecord::fly(&ticket, ActorId(4), ActorIncarnation(8));
             assert_eq!(record.read(RunId(3)), Ok(Control::Fly(ticket)));
         }
     }
 
     #[test]
-    fn a_ticket_is_for_one_life_of_one_actor() {
-        let record = ControlRecord::fly(&ticket(), ActorId(4), Incarnation(8));
-        assert!(record.is_for(ActorId(4), Incarnation(8)));
-        assert!(!record.is_for(ActorId(4), Incarnation(9)));
-        assert!(!record.is_for(ActorId(5), Incarnation(8)));
-        assert!(ControlRecord::stop(RunId(3)).is_for(ActorId(5), Incarnation(1)));
-        let rejoin = ControlRecord::rejoin(RunId(3), ActorId(4), Incarnation(8));
+    fn a_ticket_is_for_one_incarnation_of_one_actor() {
+        let record = ControlRecord::fly(&ticket(), ActorId(4), ActorIncarnation(8));
+        assert!(record.is_for(ActorId(4), ActorIncarnation(8)));
+        assert!(!record.is_for(ActorId(4), ActorIncarnation(9)));
+        assert!(!record.is_for(ActorId(5), ActorIncarnation(8)));
+        assert!(ControlRecord::stop(RunId(3)).is_for(ActorId(5), ActorIncarnation(1)));
+        let rejoin = ControlRecord::rejoin(RunId(3), ActorId(4), ActorIncarnation(8));
         assert_eq!(rejoin.read(RunId(3)), Ok(Control::Rejoin));
-        assert!(rejoin.is_for(ActorId(4), Incarnation(8)) && !rejoin.is_for(ActorId(4), Incarnation(9)));
+        assert!(rejoin.is_for(ActorId(4), ActorIncarnation(8)) && !rejoin.is_for(ActorId(4), ActorIncarnation(9)));
     }
 
     #[test]
     fn garbage_is_refused_with_the_field() {
-        let mut record = ControlRecord::fly(&ticket(), ActorId(4), Incarnation(8));
+        let mut record = ControlRecord::fly(&ticket(), ActorId(4), ActorIncarnation(8));
         assert_eq!(record.read(RunId(4)), Err(ControlFault::OtherRun(3)));
         record.exploration = 77;
         assert_eq!(

@@ -1,6 +1,6 @@
-//! The transition record: one step of a flight, as it lies in shared memory.
+//! The transition record: one step of an episode, as it lies in shared memory.
 //!
-//! A flight of T steps is T+1 records, and so is a leg of one. Record t holds the observation at step t, the action chosen on it, and the reward and end flags that
+//! An episode of T steps is T+1 records, and so is a segment of one. Record t holds the observation at step t, the action chosen on it, and the reward and end flags that
 //! followed; the closing record holds the last observation only. The depth camera renders into [`TransitionRecord::depth`] of a loaned sample, and the learner reads
 //! it there: the image's bytes are written once.
 
@@ -8,7 +8,7 @@ use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ActorId, Incarnation};
+use crate::ids::{ActorId, ActorIncarnation};
 use crate::ticket::Ticket;
 use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
 
@@ -16,30 +16,30 @@ use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
 /// precision ends at 3 · 10³⁸.
 pub const LARGEST_NUMBER: f32 = 1e7;
 
-/// One step of a flight on the wire. Every bit pattern is a valid value of every field's type; [`TransitionRecord::check`] says whether it makes sense.
+/// One step of an episode on the wire. Every bit pattern is a valid value of every field's type; [`TransitionRecord::check`] says whether it makes sense.
 #[derive(Debug, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
 #[type_name("skein.TransitionRecord.v4")]
 pub struct TransitionRecord {
     /// The run.
     pub run: u64,
-    /// The flight.
-    pub flight: u64,
+    /// The episode.
+    pub episode: u64,
     /// The snapshot that all of the ticket is flown with.
     pub policy_version: u64,
-    /// The actor's life.
+    /// The actor's incarnation.
     pub incarnation: u64,
     /// The actor.
     pub actor: u32,
-    /// The ticket's attempt: tells a flight flown again from its late twin.
+    /// The ticket's attempt: tells an episode flown again from its late twin.
     pub attempt: u32,
-    /// Position in the flight, from 0 without a gap, legs flown before included; the closing record counts too.
+    /// Position in the episode, from 0 without a gap, segments flown before included; the closing record counts too.
     pub step: u32,
     /// A [`RecordKind`].
     pub kind: u8,
-    /// The level the flight took off from.
+    /// The level the episode took off from.
     pub start_level: u8,
-    /// Walls passed in the flight so far, this step's included.
+    /// Walls passed in the episode so far, this step's included.
     pub walls_passed: u8,
     /// An [`Outcome`], in the closing record.
     pub outcome: u8,
@@ -59,13 +59,13 @@ pub struct TransitionRecord {
     pub reward_terms: [f32; 4],
     /// 1 when a wall was crossed or the destination reached in this step.
     pub level_up: u8,
-    /// 1 when the flight ended in this step in a state without a future (collision, destination).
+    /// 1 when the episode ended in this step in a state without a future (collision, destination).
     pub terminated: u8,
-    /// 1 when the flight was cut off in this step by its step limit; its value still bootstraps.
+    /// 1 when the episode was cut off in this step by its step limit; its value still bootstraps.
     pub truncated: u8,
     /// Walls of the course, in the closing record: what `walls_passed` is measured against.
     pub course_walls: u8,
-    /// In the closing record of a flight that collided: the wall that was hit, from 1 in flight order, or 0 for the corridor. 0 in all others.
+    /// In the closing record of an episode that collided: the wall that was hit, from 1 in course order, or 0 for the corridor. 0 in all others.
     pub hit_wall: u8,
     reserved: [u8; 7],
     /// What the simulator knows of the observation's moment and the camera does not see; see [`CriticInput::GroundTruth`](crate::config::CriticInput::GroundTruth).
@@ -79,20 +79,20 @@ const _: () = assert!(std::mem::offset_of!(TransitionRecord, depth) == 448);
 const _: () = assert!(size_of::<TransitionRecord>() == 448 + IMAGE_PIXELS);
 const _: () = assert!(align_of::<TransitionRecord>() == 8);
 
-/// What a record is within its flight.
+/// What a record is within its episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RecordKind {
     /// An observation, the action on it and what followed.
     Step,
-    /// The last observation; ends the flight.
+    /// The last observation; ends the episode.
     Closing,
-    /// The last observation of a leg whose flight goes on.
-    LegEnd,
-    /// The flight broke off by a fault in the simulator; what was sent of it is void.
+    /// The last observation of a segment whose episode goes on.
+    SegmentEnd,
+    /// The episode broke off by a fault in the simulator; what was sent of it is void.
     Failed,
 }
 
-/// How a flight ended.
+/// How an episode ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
@@ -121,7 +121,7 @@ impl Outcome {
             .find(|outcome| outcome.code() == code)
     }
 
-    /// As in `flights.csv`.
+    /// As in `episodes.csv`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Collided => "collided",
@@ -138,13 +138,13 @@ impl RecordKind {
             Self::Step => 1,
             Self::Closing => 2,
             Self::Failed => 3,
-            Self::LegEnd => 4,
+            Self::SegmentEnd => 4,
         }
     }
 
     /// From the wire; `None` for what is no kind.
     pub fn from_code(code: u8) -> Option<Self> {
-        [Self::Step, Self::Closing, Self::Failed, Self::LegEnd]
+        [Self::Step, Self::Closing, Self::Failed, Self::SegmentEnd]
             .into_iter()
             .find(|kind| kind.code() == code)
     }
@@ -152,10 +152,10 @@ impl RecordKind {
 
 impl TransitionRecord {
     /// Writes who flies what; everything but the image is reset. The image is left as it is, to be rendered over.
-    pub fn begin(&mut self, ticket: &Ticket, actor: ActorId, incarnation: Incarnation, step: u32) {
+    pub fn begin(&mut self, ticket: &Ticket, actor: ActorId, incarnation: ActorIncarnation, step: u32) {
         bytemuck::bytes_of_mut(self)[..std::mem::offset_of!(Self, depth)].fill(0);
         self.run = ticket.run.0;
-        self.flight = ticket.flight.0;
+        self.episode = ticket.episode.0;
         self.policy_version = ticket.policy_version.0;
         self.incarnation = incarnation.0;
         self.actor = actor.0;
@@ -173,7 +173,7 @@ impl TransitionRecord {
         &self,
         ticket: &Ticket,
         actor: ActorId,
-        incarnation: Incarnation,
+        incarnation: ActorIncarnation,
         step: u32,
     ) -> Result<RecordKind, RecordFault> {
         let same = |name, found: u64, expected: u64| {
@@ -184,7 +184,7 @@ impl TransitionRecord {
             }
         };
         same("run", self.run, ticket.run.0)?;
-        same("flight", self.flight, ticket.flight.0)?;
+        same("episode", self.episode, ticket.episode.0)?;
         same("policy_version", self.policy_version, ticket.policy_version.0)?;
         same("attempt", self.attempt.into(), ticket.attempt.0.into())?;
         same("actor", self.actor.into(), actor.0.into())?;
@@ -254,7 +254,7 @@ impl TransitionRecord {
         }
         if self.terminated == 1 && self.truncated == 1 {
             return Err(RecordFault::Contradiction {
-                what: "the flight was terminated and truncated in one step",
+                what: "the episode was terminated and truncated in one step",
             });
         }
         Ok(())
@@ -273,7 +273,7 @@ impl TransitionRecord {
         Err(RecordFault::Code { name, value })
     }
 
-    /// Whether `hit_wall` is none, or one that a flight which collided could reach: no farther than the first that it has not passed.
+    /// Whether `hit_wall` is none, or one that an episode which collided could reach: no farther than the first that it has not passed.
     fn may_have_hit_wall(&self) -> bool {
         let next = u32::from(self.start_level) + u32::from(self.walls_passed);
         let reachable = next.min(self.course_walls.into());
@@ -295,7 +295,7 @@ pub enum RecordFault {
         /// The value it should have.
         expected: u64,
     },
-    /// A field has a value that no flight gives it.
+    /// A field has a value that no episode gives it.
     #[error("{name} has the impossible value {value}")]
     Code {
         /// The field.
@@ -317,10 +317,10 @@ pub enum RecordFault {
         /// The number.
         value: f32,
     },
-    /// The flight goes on and on.
-    #[error("the flight has more than the {most} records of transport.max_records_per_flight")]
+    /// The episode goes on and on.
+    #[error("the episode has more than the {most} records of transport.max_records_per_episode")]
     TooLong {
-        /// Records of the longest flight.
+        /// Records of the longest episode.
         most: usize,
     },
     /// It contradicts itself or the records before it.
@@ -341,23 +341,23 @@ pub enum RecordFault {
 mod tests {
     use super::*;
     use crate::LONGEST_LATENT;
-    use crate::ids::{Attempt, FlightId, PolicyVersion, RunId};
+    use crate::ids::{Attempt, EpisodeId, PolicyVersion, RunId};
     use crate::ticket::{CourseChoice, Exploration};
 
     const ACTOR: ActorId = ActorId(2);
-    const INCARNATION: Incarnation = Incarnation(11);
+    const INCARNATION: ActorIncarnation = ActorIncarnation(11);
 
     fn ticket() -> Ticket {
         Ticket {
             run: RunId(1),
-            flight: FlightId(5),
+            episode: EpisodeId(5),
             attempt: Attempt(0),
             policy_version: PolicyVersion(3),
             course: CourseChoice::Training,
             start_level: 1,
             exploration: Exploration::Sample,
             seed: 9,
-            leg: None,
+            segment: None,
         }
     }
 
@@ -384,7 +384,7 @@ mod tests {
             record.check(&ticket(), ACTOR, INCARNATION, 4).unwrap_err().to_string()
         };
         assert!(check(|r| r.run = 2).contains("run"));
-        assert!(check(|r| r.flight = 6).contains("flight"));
+        assert!(check(|r| r.episode = 6).contains("episode"));
         assert!(check(|r| r.policy_version = 4).contains("policy_version"));
         assert!(check(|r| r.attempt = 1).contains("attempt"));
         assert!(check(|r| r.actor = 3).contains("actor"));
@@ -422,7 +422,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wall_is_hit_only_by_a_flight_that_collided_and_could_reach_it() {
+    fn a_wall_is_hit_only_by_an_episode_that_collided_and_could_reach_it() {
         let hit = |outcome: Outcome, hit_wall| {
             let mut record = record();
             record.kind = RecordKind::Closing.code();

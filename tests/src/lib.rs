@@ -4,11 +4,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
 
-mod flights;
+mod episodes;
 mod programs;
 mod run;
 
-pub use flights::{Flight, Learned, flights};
+pub use episodes::{Episode, Learned, episodes};
 pub use programs::{Output, program, repository, run_program};
 pub use run::{Ended, Recipe, Running};
 pub use skein_launch::inspection::{Process, Role, leftovers, processes_of};

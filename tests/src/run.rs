@@ -15,7 +15,7 @@ use skein_protocol::run::{RunDirectory, sweep_leftovers};
 use skein_protocol::summary::Summary;
 use tempfile::TempDir;
 
-use crate::flights::{Flight, Learned, flights};
+use crate::episodes::{Episode, Learned, episodes};
 use crate::programs::{Output, program, repository};
 
 /// No run here takes a fifth of it on an idle machine.
@@ -193,22 +193,22 @@ impl Running {
         }
     }
 
-    /// Waits until so many training flights are learned from.
+    /// Waits until so many training episodes are learned from.
     ///
     /// # Panics
     /// As [`Running::until`].
-    pub fn until_flights(&mut self, count: usize) {
-        self.until(&format!("{count} flights were learned from"), |run| {
-            (flights(&run.directory).len() >= count).then_some(())
+    pub fn until_episodes(&mut self, count: usize) {
+        self.until(&format!("{count} episodes were learned from"), |run| {
+            (episodes(&run.directory).len() >= count).then_some(())
         });
     }
 
-    /// Kills the learner once so many flights were learned from, and waits until another is there.
+    /// Kills the learner once so many episodes were learned from, and waits until another is there.
     ///
     /// # Panics
     /// When the run ends before, or none comes.
-    pub fn kill_learner_after(&mut self, flights: usize) {
-        self.until_flights(flights);
+    pub fn kill_learner_after(&mut self, episodes: usize) {
+        self.until_episodes(episodes);
         let victim = self.process("skein-learner");
         victim.signal(Signal::KILL);
         self.until("another learner was there", |run| {
@@ -398,12 +398,12 @@ impl Ended {
         json(self.directory.evaluation_json())
     }
 
-    /// `flights.csv`.
+    /// `episodes.csv`.
     ///
     /// # Panics
     /// When it is malformed.
-    pub fn flights(&self) -> Vec<Flight> {
-        flights(&self.directory)
+    pub fn episodes(&self) -> Vec<Episode> {
+        episodes(&self.directory)
     }
 
     /// Requires that it came to the same as `calm`, in every file and every point of every curve, who flew what apart.

@@ -12,11 +12,11 @@ use std::time::{Duration, Instant};
 use rustix::process::Signal;
 use skein_launch::inspection::{Footprint, footprint};
 use skein_protocol::run::RunIdentity;
-use skein_tests::{Ended, Recipe, Role, Running, flights, run_program};
+use skein_tests::{Ended, Recipe, Role, Running, episodes, run_program};
 
 /// Long enough to be disturbed several times.
 fn recipe() -> Recipe {
-    Recipe::small().set("run.flights=100")
+    Recipe::small().set("run.episodes=100")
 }
 
 /// What it comes to when nobody disturbs it. Run once for all tests that are under way at a time; to be asked for before one's own run is started, which
@@ -35,8 +35,8 @@ fn calm() -> Arc<Ended> {
 fn a_learner_killed_three_times_goes_on_from_its_checkpoints() {
     let calm = calm();
     let mut run = recipe().start();
-    for flights in [10, 30, 70] {
-        run.kill_learner_after(flights);
+    for episodes in [10, 30, 70] {
+        run.kill_learner_after(episodes);
     }
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
@@ -48,7 +48,7 @@ fn a_learner_killed_three_times_goes_on_from_its_checkpoints() {
 fn a_run_whose_supervisor_was_killed_is_resumed_with_another_number_of_actors() {
     let calm = calm();
     let mut run = recipe().start();
-    run.until_flights(50);
+    run.until_episodes(50);
     run.kill_supervisor();
     run.resume(3);
     run.finish().assert_same_as(&calm);
@@ -79,12 +79,12 @@ fn after_a_power_cut_a_damaged_checkpoint_is_named_and_the_one_before_it_used() 
             .any(|line| words.iter().all(|word| line.contains(word)))
     };
     assert!(told([name, "damaged"]), "nobody was warned of {name}:\n{terminal}");
-    assert!(told(["going on after flight", ""]), "{terminal}");
+    assert!(told(["going on after episode", ""]), "{terminal}");
 }
 
 /// The checkpoints that are in their place, oldest first.
 fn checkpoints(run: &Running) -> Vec<PathBuf> {
-    let number = |path: &PathBuf| -> Option<u64> { path.file_name()?.to_str()?.strip_prefix("flight-")?.parse().ok() };
+    let number = |path: &PathBuf| -> Option<u64> { path.file_name()?.to_str()?.strip_prefix("episode-")?.parse().ok() };
     let mut found: Vec<_> = fs::read_dir(run.directory().checkpoints())
         .into_iter()
         .flatten()
@@ -99,7 +99,7 @@ fn checkpoints(run: &Running) -> Vec<PathBuf> {
 fn goes_on_without(remove: impl Fn(&Running, &RunIdentity)) {
     let calm = calm();
     let mut run = recipe().start();
-    run.until_flights(30);
+    run.until_episodes(30);
     remove(&run, &run.directory().open().unwrap().0);
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
@@ -138,7 +138,7 @@ fn a_run_whose_shared_memory_is_removed_makes_another() {
 fn a_copy_of_a_runs_directory_is_not_resumed_while_the_run_is_under_way() {
     let calm = calm();
     let mut run = recipe().start();
-    run.until_flights(30);
+    run.until_episodes(30);
     let copies = tempfile::tempdir().unwrap();
     let copy = copies.path().join("copy");
     // It complains of files that a living run replaces meanwhile, and copies the rest.
@@ -148,7 +148,7 @@ fn a_copy_of_a_runs_directory_is_not_resumed_while_the_run_is_under_way() {
         .arg(&copy)
         .status();
     assert!(copied.is_ok(), "{copied:?}");
-    // Between two lives of the learner, too.
+    // Between two incarnations of the learner, too.
     run.process("skein-learner").signal(Signal::KILL);
     let refused = run_program("skein", &["run", "--resume", copy.to_str().unwrap(), "--actors", "1"]);
     refused.assert_refused(&["under way in another directory", "copy"]);
@@ -159,11 +159,11 @@ fn a_copy_of_a_runs_directory_is_not_resumed_while_the_run_is_under_way() {
 fn an_actor_that_was_frozen_too_long_is_not_mixed_in_when_it_wakes() {
     let calm = calm();
     let mut run = recipe().set("transport.actor_silence_secs=0.5").start();
-    run.until_flights(10);
+    run.until_episodes(10);
     let sleeper = run.processes(Role::Actor).remove(0);
     sleeper.signal(Signal::STOP);
     // Whatever it was about to fly is flown by the other: else there would be no further epoch.
-    run.until_flights(30);
+    run.until_episodes(30);
     sleeper.signal(Signal::CONT);
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
@@ -177,7 +177,7 @@ fn a_frozen_learner_goes_on_where_it_was() {
         .set("transport.learner_silence_secs=2")
         .set("transport.actor_silence_secs=1")
         .start();
-    run.until_flights(30);
+    run.until_episodes(30);
     let learner = run.process("skein-learner");
     learner.signal(Signal::STOP);
     // Longer than actors wait, so that all of them leave.
@@ -192,7 +192,7 @@ fn a_frozen_learner_goes_on_where_it_was() {
 fn a_learner_slowed_down_ten_times_holds_the_actors_back_and_nothing_is_lost() {
     let calm = calm();
     let mut run = recipe().actors(4).start();
-    run.until_flights(10);
+    run.until_episodes(10);
     let learner = run.process("skein-learner");
     let end = Instant::now() + Duration::from_secs(6);
     while Instant::now() < end {
@@ -220,7 +220,7 @@ fn sixty_four_actors_lose_nothing_and_take_bounded_memory() {
         .actors(64)
         .set("transport.actor_silence_secs=60")
         .set("transport.learner_silence_secs=60")
-        .set("transport.flight_deadline_secs=600")
+        .set("transport.episode_deadline_secs=600")
         .start();
     let mut most = Footprint::default();
     let id = run.until("the run had an identity", |run| {
@@ -229,7 +229,7 @@ fn sixty_four_actors_lose_nothing_and_take_bounded_memory() {
     run.until("all actors were there", |run| {
         let now = footprint(id);
         most.segment_bytes = most.segment_bytes.max(now.segment_bytes);
-        (run.processes(Role::Actor).len() == 64 && flights_begun(run)).then_some(())
+        (run.processes(Role::Actor).len() == 64 && episodes_begun(run)).then_some(())
     });
     let ended = run.finish();
     ended.assert_same_as(&calm);
@@ -242,8 +242,8 @@ fn sixty_four_actors_lose_nothing_and_take_bounded_memory() {
     assert!(most.segment_bytes < 64 * 5_200_000 + 64_000_000, "{most:?}");
 }
 
-fn flights_begun(run: &Running) -> bool {
-    !flights(run.directory()).is_empty()
+fn episodes_begun(run: &Running) -> bool {
+    !episodes(run.directory()).is_empty()
 }
 
 #[test]
@@ -253,7 +253,7 @@ fn two_runs_side_by_side_never_meet() {
     let other = recipe().set("run.seed=2").start_beside(&one);
     let (one, other) = (one.finish(), other.finish());
     one.assert_same_as(&calm);
-    assert_eq!(other.flights().len(), 100);
+    assert_eq!(other.episodes().len(), 100);
     for run in [&one, &other] {
         let summary = run.summary();
         assert_eq!(
@@ -268,7 +268,7 @@ fn two_runs_side_by_side_never_meet() {
 fn a_second_learner_of_a_run_is_refused_and_the_first_goes_on() {
     let calm = calm();
     let mut run = recipe().start();
-    run.until_flights(10);
+    run.until_episodes(10);
     let second = run_program("skein-learner", &["--run", run.directory().root().to_str().unwrap()]);
     second.assert_refused(&["another learner"]);
     run.finish().assert_same_as(&calm);

@@ -8,9 +8,9 @@ use rustix::process::Signal;
 use skein_protocol::run::RunDirectory;
 use skein_tests::{Ended, Process, Recipe, Role, processes_of};
 
-/// The actors that flew training flights.
+/// The actors that flew training episodes.
 fn crew(run: &Ended) -> BTreeSet<u32> {
-    run.flights().iter().map(|flight| flight.actor).collect()
+    run.episodes().iter().map(|episode| episode.actor).collect()
 }
 
 #[test]
@@ -25,7 +25,7 @@ fn one_two_and_four_actors_and_one_attached_half_way_learn_the_same_bit_for_bit(
         run.learned().assert_same(&alone.learned(), &format!("{actors} actors"));
     }
     let mut run = Recipe::smoke().actors(1).start();
-    run.until_flights(alone.flights().len() / 2);
+    run.until_episodes(alone.episodes().len() / 2);
     run.attach();
     let joined = run.finish();
     assert_eq!(
@@ -49,11 +49,11 @@ fn actors_that_fly_while_the_learner_updates_change_nothing_either() {
 
 #[test]
 fn an_actor_killed_in_the_middle_changes_nothing() {
-    // Long enough that the actor's second life falls into the run.
-    let long = || Recipe::small().set("run.flights=150");
+    // Long enough that the actor's second incarnation falls into the run.
+    let long = || Recipe::small().set("run.episodes=150");
     let undisturbed = long().finish();
     let mut run = long().start();
-    run.until_flights(10);
+    run.until_episodes(10);
     let victim = actor(run.directory(), 0).unwrap();
     victim.signal(Signal::KILL);
     let successor = run.until("actor 0 was started again", |run| {

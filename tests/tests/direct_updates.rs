@@ -1,4 +1,4 @@
-//! Direct updates: the weights are refreshed in the middle of a flight, and what is learned is a function of configuration and seed all the same.
+//! Direct updates: the weights are refreshed in the middle of an episode, and what is learned is a function of configuration and seed all the same.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
 
@@ -6,29 +6,29 @@ use rustix::process::Signal;
 use skein_protocol::summary::Ending;
 use skein_tests::{Ended, Recipe, Role};
 
-/// Updated after every step, checkpoints every five flights.
+/// Updated after every step, checkpoints every five episodes.
 fn direct() -> Recipe {
-    in_legs_of(1).set("checkpoints.every_flights=5")
+    in_segments_of(1).set("checkpoints.every_episodes=5")
 }
 
-fn in_legs_of(steps: u64) -> Recipe {
+fn in_segments_of(steps: u64) -> Recipe {
     Recipe::small()
-        .set(&format!("learning.leg_steps={steps}"))
-        .set("learning.flights_per_epoch=1")
-        .set("run.flights=40")
+        .set(&format!("learning.segment_steps={steps}"))
+        .set("learning.episodes_per_epoch=1")
+        .set("run.episodes=40")
 }
 
-/// That the policy was updated in the middle of flights.
+/// That the policy was updated in the middle of episodes.
 fn assert_direct(run: &Ended) {
-    let (flights, summary) = (run.flights(), run.summary());
-    assert_eq!(flights.len(), 40);
-    let versions: Vec<_> = flights.iter().map(|flight| flight.policy_version).collect();
+    let (episodes, summary) = (run.episodes(), run.summary());
+    assert_eq!(episodes.len(), 40);
+    let versions: Vec<_> = episodes.iter().map(|episode| episode.policy_version).collect();
     assert!(versions.is_sorted_by(|one, next| one < next), "{versions:?}");
     assert!(
-        summary.final_version.0 > 2 * summary.flights && summary.final_version.0 <= summary.steps + summary.flights,
+        summary.final_version.0 > 2 * summary.episodes && summary.final_version.0 <= summary.steps + summary.episodes,
         "{summary:?}"
     );
-    let steps: u64 = flights.iter().map(|flight| flight.steps).sum();
+    let steps: u64 = episodes.iter().map(|episode| episode.steps).sum();
     assert_eq!(summary.steps, steps);
 }
 
@@ -39,8 +39,8 @@ fn one_actor_three_and_one_that_is_killed_twice_learn_the_same_bit_for_bit() {
     direct().actors(3).finish().assert_same_as(&alone);
 
     let mut run = direct().actors(2).start();
-    for flights in [8, 20] {
-        run.until_flights(flights);
+    for episodes in [8, 20] {
+        run.until_episodes(episodes);
         // The one that flies: the other is in reserve, and has to repeat what was flown.
         let flyer = run
             .processes(Role::Actor)
@@ -59,26 +59,26 @@ fn one_actor_three_and_one_that_is_killed_twice_learn_the_same_bit_for_bit() {
 }
 
 #[test]
-fn a_learner_killed_in_the_middle_of_a_flight_goes_back_to_one_that_had_ended() {
+fn a_learner_killed_in_the_middle_of_an_episode_goes_back_to_one_that_had_ended() {
     let calm = direct().finish();
     let mut run = direct().start();
-    for flights in [7, 18, 29] {
-        run.kill_learner_after(flights);
+    for episodes in [7, 18, 29] {
+        run.kill_learner_after(episodes);
     }
     run.finish().assert_same_as(&calm);
 }
 
 #[test]
-fn a_run_that_is_stopped_flies_its_flight_to_the_end_and_loses_nothing() {
+fn a_run_that_is_stopped_flies_its_episode_to_the_end_and_loses_nothing() {
     let calm = direct().finish();
-    let mut run = direct().set("checkpoints.every_flights=1000").start();
-    run.until_flights(25);
+    let mut run = direct().set("checkpoints.every_episodes=1000").start();
+    run.until_episodes(25);
     run.signal(Signal::INT);
     run.until_ended();
     let summary: skein_protocol::summary::Summary =
         serde_json::from_slice(&std::fs::read(run.directory().summary_json()).unwrap()).unwrap();
     assert_eq!(summary.ending, Ending::Interrupted);
-    assert!(summary.flights >= 25, "{summary:?}");
+    assert!(summary.episodes >= 25, "{summary:?}");
     run.resume(3);
     run.finish()
         .learned()
@@ -86,10 +86,12 @@ fn a_run_that_is_stopped_flies_its_flight_to_the_end_and_loses_nothing() {
 }
 
 #[test]
-fn a_leg_as_long_as_any_flight_is_delayed_learning() {
-    let delayed = in_legs_of(0).finish();
-    let one_leg = in_legs_of(256).finish();
-    one_leg.learned().assert_same(&delayed.learned(), "flights of one leg");
-    let legs = in_legs_of(4).finish().learned();
-    assert_ne!(legs.policy_sha256(), delayed.learned().policy_sha256());
+fn a_segment_as_long_as_any_episode_is_delayed_learning() {
+    let delayed = in_segments_of(0).finish();
+    let one_segment = in_segments_of(256).finish();
+    one_segment
+        .learned()
+        .assert_same(&delayed.learned(), "episodes of one segment");
+    let segments = in_segments_of(4).finish().learned();
+    assert_ne!(segments.policy_sha256(), delayed.learned().policy_sha256());
 }

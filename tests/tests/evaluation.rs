@@ -25,7 +25,7 @@ fn evaluate(folder: &Path, arguments: &[&str]) -> EvaluationReport {
 
 #[test]
 fn a_runs_snapshot_flies_later_as_it_flew_in_the_run() {
-    let run = Recipe::small().set("evaluation.flights=8").finish();
+    let run = Recipe::small().set("evaluation.episodes=8").finish();
     let in_the_run = run.evaluation();
     let directory = run.directory.root().to_str().unwrap();
     let best = run.directory.best_snapshot();
@@ -37,10 +37,10 @@ fn a_runs_snapshot_flies_later_as_it_flew_in_the_run() {
     }
     let later = evaluate(folder.path(), &["--snapshot", best.to_str().unwrap()]);
     assert_eq!(later, in_the_run, "--snapshot");
-    let fewer = evaluate(folder.path(), &["--run", directory, "--flights", "3"]);
-    assert!(fewer.courses.iter().all(|course| course.flights == 3));
+    let fewer = evaluate(folder.path(), &["--run", directory, "--episodes", "3"]);
+    assert!(fewer.courses.iter().all(|course| course.episodes == 3));
 
-    a_recording_holds_every_step_of_every_flight(&run, 32, folder.path());
+    a_recording_holds_every_step_of_every_episode(&run, 32, folder.path());
 }
 
 #[test]
@@ -48,7 +48,7 @@ fn a_code_of_another_length_is_learned_flown_and_recorded() {
     for latent in [8, 64] {
         let run = Recipe::small()
             .set(&format!("vae.latent={latent}"))
-            .set("evaluation.flights=8")
+            .set("evaluation.episodes=8")
             .finish();
         let summary = run.summary();
         assert!(summary.vae_updates > 0 && summary.updates > 0, "{summary:?}");
@@ -56,7 +56,7 @@ fn a_code_of_another_length_is_learned_flown_and_recorded() {
         let folder = tempfile::tempdir().unwrap();
         let later = evaluate(folder.path(), &["--run", directory]);
         assert_eq!(later, run.evaluation(), "{latent} numbers");
-        a_recording_holds_every_step_of_every_flight(&run, latent, folder.path());
+        a_recording_holds_every_step_of_every_episode(&run, latent, folder.path());
     }
 }
 
@@ -77,7 +77,7 @@ fn the_shipped_generalist_flies_courses_that_it_never_saw() {
     // By a bare name, from where it lies.
     let json = folder.path().join("report.json");
     let output = Command::new(program("skein-evaluate"))
-        .args(["--snapshot", "generalist.safetensors", "--flights", "10", "--json"])
+        .args(["--snapshot", "generalist.safetensors", "--episodes", "10", "--json"])
         .arg(&json)
         .current_dir(&snapshots)
         .output()
@@ -92,8 +92,8 @@ fn the_shipped_generalist_flies_courses_that_it_never_saw() {
 }
 
 /// Read as NumPy documents its format, without any of our code.
-fn a_recording_holds_every_step_of_every_flight(run: &Ended, latent: usize, folder: &Path) {
-    let file = folder.join("flights.npz");
+fn a_recording_holds_every_step_of_every_episode(run: &Ended, latent: usize, folder: &Path) {
+    let file = folder.join("episodes.npz");
     evaluate(
         folder,
         &[
@@ -107,7 +107,7 @@ fn a_recording_holds_every_step_of_every_flight(run: &Ended, latent: usize, fold
     let rows = closing.shape[0];
     for (name, kind, row) in [
         ("course", "<i4", &[][..]),
-        ("flight", "<i4", &[]),
+        ("episode", "<i4", &[]),
         ("step", "<i4", &[]),
         ("position_m", "<f4", &[3]),
         ("orientation", "<f4", &[4]),
@@ -130,10 +130,10 @@ fn a_recording_holds_every_step_of_every_flight(run: &Ended, latent: usize, fold
         last.map(f32::from_le_bytes).any(|number| number != 0.0),
         "no code is as long as that"
     );
-    let flights = closing.data.iter().filter(|&&closing| closing == 1).count();
-    assert_eq!(flights, 16, "eight flights on each of two courses");
+    let episodes = closing.data.iter().filter(|&&closing| closing == 1).count();
+    assert_eq!(episodes, 16, "eight episodes on each of two courses");
 
-    // The rewards of all flights on the first course are those of the report.
+    // The rewards of all episodes on the first course are those of the report.
     let evaluation = run.evaluation();
     let (course, reward) = (array(&file, "course", "<i4"), array(&file, "reward", "<f4"));
     let total: f64 = course

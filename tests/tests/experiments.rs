@@ -13,12 +13,12 @@ use skein_launch::inspection::compare;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::summary::{Ending, Summary};
-use skein_tests::{Output, Recipe, flights, leftovers, program, repository, run_program};
+use skein_tests::{Output, Recipe, episodes, leftovers, program, repository, run_program};
 
 /// An experiment of four runs takes a tenth of it on an idle machine.
 const LIMIT: Duration = Duration::from_secs(300);
 /// Beside `tests/small.toml`, in both arms.
-const SETTINGS: [&str; 2] = ["run.flights=60", "evaluation.window_flights=10"];
+const SETTINGS: [&str; 2] = ["run.episodes=60", "evaluation.window_episodes=10"];
 
 /// A repository with one experiment, and no other content than it needs.
 struct Scene {
@@ -42,18 +42,18 @@ impl Scene {
         let base = repository().join("tests/small.toml");
         let text = format!(
             "question = \"What for?\"\nbase = {base:?}\nseeds = 2\nsuite = \"../few.toml\"\ntables = [\"evaluation\", \"outcomes\", \"suite\", \"learning\", \"cost\"]\n\
-             curves = [{{ measure = \"walls_passed\", over = \"flights\" }}]\nsettings.run.flights = 60\nsettings.evaluation.window_flights = 10\n\
+             curves = [{{ measure = \"walls_passed\", over = \"episodes\" }}]\nsettings.run.episodes = 60\nsettings.evaluation.window_episodes = 10\n\
              [[arm]]\nname = \"one-part\"\nlabel = \"one part\"\nsettings.replay.success_share = 0.0\n\
              [[arm]]\nname = \"half\"\nlabel = \"half\"\nsettings.replay.success_share = {share}\n"
         );
         fs::write(self.path("configs/experiments/tiny.toml"), text).unwrap();
     }
 
-    /// Writes the experiment's suite: this many flights of each entry.
-    fn write_suite(&self, flights: u64) {
+    /// Writes the experiment's suite: this many episodes of each entry.
+    fn write_suite(&self, episodes: u64) {
         let course = repository().join("configs/courses/training.toml");
         let text = format!(
-            "name = \"few\"\nflights = {flights}\n[[entry]]\nname = \"as it is\"\ncourse = {course:?}\n\
+            "name = \"few\"\nepisodes = {episodes}\n[[entry]]\nname = \"as it is\"\ncourse = {course:?}\n\
              [[entry]]\nname = \"in any order\"\norders_of = {course:?}\ndisturbances.latency_periods = 1\n"
         );
         fs::write(self.path("configs/few.toml"), text).unwrap();
@@ -117,8 +117,8 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
         .collect();
 
     let mut experiment = scene.start();
-    until("the first run has flights", || {
-        (flights(&runs[0]).len() >= 20).then_some(())
+    until("the first run has episodes", || {
+        (episodes(&runs[0]).len() >= 20).then_some(())
     });
     kill_process(Pid::from_raw(experiment.id().cast_signed()).unwrap(), Signal::INT).unwrap();
     let status = until("the experiment stops", || experiment.try_wait().unwrap());
@@ -147,12 +147,12 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
         "flew the suite `few.toml`",
         "| in any order |     2 |       5 |",
         "| hit wall 1, 2, … | hit the corridor before 1, …, end | timed out before 1, …, end |",
-        "How the flights of the suite `few.toml` went",
+        "How the episodes of the suite `few.toml` went",
         "2 seeds an arm",
     ] {
         assert!(text.contains(part), "`{part}` is missing in\n{text}");
     }
-    let picture = fs::read(report.join("walls_passed_over_flights.png")).unwrap();
+    let picture = fs::read(report.join("walls_passed_over_episodes.png")).unwrap();
     assert!(picture.starts_with(b"\x89PNG"));
 
     // What was interrupted came to the same as a run of a user who set the same and was left in peace.
@@ -201,7 +201,7 @@ fn assert_published(scene: &Scene, report: &str) {
     let results = scene.results();
     assert!(results.starts_with("# Results\n\nBefore.\n\n## Experiment: tiny\n\n<!-- experiment: tiny -->\n"));
     assert_eq!(results.matches("<!-- end -->").count(), 1);
-    let picture = "launch/pictures/experiments/tiny_walls_passed_over_flights.png";
+    let picture = "launch/pictures/experiments/tiny_walls_passed_over_episodes.png";
     assert!(results.contains(picture) && scene.path(picture).is_file());
     let lines = fs::read_to_string(scene.path("launch/pictures/experiments/tiny_runs.csv")).unwrap();
     for (arm, seed) in [("one-part", 1), ("half", 1), ("one-part", 2), ("half", 2)] {
@@ -218,7 +218,7 @@ fn assert_published(scene: &Scene, report: &str) {
     output.assert_refused(&["another experiment is being published"]);
     drop(pictures);
     // A part of it is no result to replace that by.
-    for part in [["--seeds", "1"], ["--flights", "20"]] {
+    for part in [["--seeds", "1"], ["--episodes", "20"]] {
         let output = scene.finish(&[&part[..], &["--report", "--publish"]].concat());
         output.assert_refused(&["--publish", "2 seeds"]);
         assert_eq!(scene.results(), results);
@@ -237,7 +237,7 @@ fn suite_results(run: &RunDirectory) -> Vec<PathBuf> {
 /// A run that is trained flies its suite and nothing else, whatever kept it from that before: it failed, was interrupted, or is another suite now.
 fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     let files = |run: &RunDirectory| {
-        [run.summary_json(), run.flights_csv()].map(|file| fs::metadata(file).unwrap().modified().unwrap())
+        [run.summary_json(), run.episodes_csv()].map(|file| fs::metadata(file).unwrap().modified().unwrap())
     };
     let before: Vec<_> = runs.iter().map(files).collect();
     let result = suite_results(&runs[1]).pop().unwrap();
@@ -246,7 +246,7 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     let entries: Vec<_> = report
         .courses
         .iter()
-        .map(|entry| (entry.course.as_str(), entry.flights))
+        .map(|entry| (entry.course.as_str(), entry.episodes))
         .collect();
     assert_eq!(entries, [("as it is", 5), ("in any order", 5)]);
 
@@ -281,7 +281,7 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     assert_eq!(
         fs::read(&result).unwrap(),
         flown,
-        "the same flights came to something else"
+        "the same episodes came to something else"
     );
 
     // Another suite of the same name, too long to be flown to its end, is interrupted; the results of the first are as good as they were.
@@ -289,7 +289,7 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     let mut experiment = scene.start();
     until("a suite is flown", || {
         let said = fs::read_to_string(runs[0].root().with_extension("log")).unwrap();
-        said.contains("1000000 flights on each of 2 entries").then_some(())
+        said.contains("1000000 episodes on each of 2 entries").then_some(())
     });
     kill_process(Pid::from_raw(experiment.id().cast_signed()).unwrap(), Signal::INT).unwrap();
     let status = until("the experiment stops", || experiment.try_wait().unwrap());
@@ -308,14 +308,14 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
 fn assert_a_suite_is_flown_as_often_as_the_experiment_says(scene: &Scene, runs: &[RunDirectory]) {
     let file = scene.path("configs/experiments/tiny.toml");
     let text = fs::read_to_string(&file).unwrap();
-    fs::write(&file, format!("suite_flights = 2\n{text}")).unwrap();
+    fs::write(&file, format!("suite_episodes = 2\n{text}")).unwrap();
     let output = scene.finish(&[]);
     assert_eq!(output.code, Some(0), "{}", output.stderr);
     for run in runs {
         let results = suite_results(run);
         let flown = |result: &PathBuf| -> Vec<u64> {
             let report: EvaluationReport = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
-            report.courses.iter().map(|entry| entry.flights).collect()
+            report.courses.iter().map(|entry| entry.episodes).collect()
         };
         assert_eq!(
             results.iter().filter(|result| flown(result) == [2, 2]).count(),
@@ -342,10 +342,10 @@ fn assert_refused_when_changed(scene: &Scene) {
         assert!(completed(&changed));
     }
     scene
-        .finish(&["--flights", "60"])
-        .assert_refused(&["tiny.toml", "--flights = 60 shortens nothing"]);
-    let nothing: &Path = &scene.path("runs/experiments/tiny_20_flights");
+        .finish(&["--episodes", "60"])
+        .assert_refused(&["tiny.toml", "--episodes = 60 shortens nothing"]);
+    let nothing: &Path = &scene.path("runs/experiments/tiny_20_episodes");
     scene
-        .finish(&["--flights", "20", "--report"])
+        .finish(&["--episodes", "20", "--report"])
         .assert_refused(&["no run in", &nothing.display().to_string()]);
 }

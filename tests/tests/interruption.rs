@@ -14,8 +14,8 @@ const INTERRUPTED: i32 = 130;
 
 /// A run that would go on for hours, some way into it.
 fn long_run() -> Running {
-    let mut run = Recipe::small().set("run.flights=1000000").start();
-    run.until_flights(20);
+    let mut run = Recipe::small().set("run.episodes=1000000").start();
+    run.until_episodes(20);
     run
 }
 
@@ -29,18 +29,18 @@ fn the_first_interruption_saves_everything_learned() {
 
     let summary = ended.summary();
     assert_eq!(summary.ending, Ending::Interrupted);
-    assert!(summary.flights >= 20 && summary.updates > 0, "{summary:?}");
+    assert!(summary.episodes >= 20 && summary.updates > 0, "{summary:?}");
     let (latest, _) = Snapshot::load(&ended.directory.latest_snapshot()).unwrap();
     assert_eq!(latest.sha256(), summary.policy_sha256);
     assert_eq!(
-        ended.flights().len() as u64,
-        summary.flights,
-        "flights that were not learned from are listed, or the reverse"
+        ended.episodes().len() as u64,
+        summary.episodes,
+        "episodes that were not learned from are listed, or the reverse"
     );
     let checkpoint = ended
         .directory
         .checkpoints()
-        .join(format!("flight-{}", summary.flights));
+        .join(format!("episode-{}", summary.episodes));
     assert!(checkpoint.join("manifest.json").is_file(), "no {checkpoint:?}");
     for plot in ["return.png", "walls_passed.png"] {
         assert!(
@@ -100,7 +100,7 @@ fn no_process_outlives_a_killed_supervisor_not_even_a_frozen_one() {
 }
 
 #[test]
-fn a_run_between_two_lives_of_its_learner_stops_in_order() {
+fn a_run_between_two_incarnations_of_its_learner_stops_in_order() {
     let mut run = long_run();
     let processes = processes_of(run.directory());
     let learner = processes.iter().find(|process| process.runs("skein-learner")).unwrap();

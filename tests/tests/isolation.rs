@@ -41,9 +41,9 @@ fn set_mode(path: &Path, mode: u32) {
 
 /// A run that flies, in a folder that everybody may enter.
 fn flying_run() -> Running {
-    let mut run = Recipe::small().set("run.flights=100").start();
+    let mut run = Recipe::small().set("run.episodes=100").start();
     set_mode(run.directory().root().parent().unwrap(), 0o755);
-    run.until_flights(10);
+    run.until_episodes(10);
     run
 }
 
@@ -76,8 +76,8 @@ fn another_user_can_neither_read_nor_write_nor_join() {
     let files = [
         run.directory().identity(),
         run.directory().config(),
-        run.directory().flights_csv(),
-        identity.transport_folder().join("life"),
+        run.directory().episodes_csv(),
+        identity.transport_folder().join("incarnation"),
         identity.transport_folder().join("learner.lock"),
     ];
     for path in segments.iter().chain(&files) {

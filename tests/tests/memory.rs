@@ -21,11 +21,11 @@ fn assert_actors_stay_below(bytes: u64, policy_lag: u64) {
     // Networks as wide as in local.toml, and three times as many snapshots as there are places for.
     let mut run = Recipe::small()
         .set("sac.hidden_width=256")
-        .set("learning.flights_per_epoch=2")
+        .set("learning.episodes_per_epoch=2")
         .set(&format!("learning.policy_lag={policy_lag}"))
-        .set("run.flights=60")
+        .set("run.episodes=60")
         .start();
-    run.until_flights(48);
+    run.until_episodes(48);
     let actors = run.processes(Role::Actor);
     assert_eq!(actors.len(), 2);
     for actor in actors {

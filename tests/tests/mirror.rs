@@ -1,11 +1,11 @@
-//! What `learning.mirror` takes for granted: flown with mirrored commands through a mirrored course, a flight is the mirror image of the flight, image by image.
+//! What `learning.mirror` takes for granted: flown with mirrored commands through a mirrored course, an episode is the mirror image of the episode, image by image.
 
 use std::sync::Arc;
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_learner::flight::{CommittedFlight, StepObservation};
-use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
+use skein_learner::episode::{CommittedEpisode, StepObservation};
+use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::{ACTION, IMAGE_PIXELS, LONGEST_LATENT};
 use skein_simulator::course::{Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout};
 use skein_simulator::simulator::{Ahead, GroundTruth, Simulator, SimulatorSettings};
@@ -48,7 +48,7 @@ fn course(side: f32) -> Course {
     .expect("the course can be flown")
 }
 
-fn fly(side: f32) -> CommittedFlight {
+fn fly(side: f32) -> CommittedEpisode {
     let mut simulator =
         Simulator::new(Arc::new(course(side)), &SimulatorSettings::default()).expect("the default settings are sound");
     let [mut start, mut calm] = [1, 2].map(Pcg64Mcg::seed_from_u64);
@@ -75,8 +75,8 @@ fn fly(side: f32) -> CommittedFlight {
             actions.push(action);
         }
     }
-    CommittedFlight {
-        flight: FlightId(0),
+    CommittedEpisode {
+        episode: EpisodeId(0),
         epoch: Epoch(0),
         policy_version: PolicyVersion(0),
         actor: ActorId(0),
@@ -97,7 +97,7 @@ fn fly(side: f32) -> CommittedFlight {
 }
 
 #[test]
-fn the_mirror_image_of_a_flight_is_the_flight_through_the_mirrored_course() {
+fn the_mirror_image_of_an_episode_is_the_episode_through_the_mirrored_course() {
     let (mirrored, flown) = (fly(1.0).mirrored(), fly(-1.0));
     assert_eq!(mirrored.actions, flown.actions);
     for (step, (one, other)) in mirrored.observations.iter().zip(&flown.observations).enumerate() {
@@ -121,7 +121,7 @@ fn the_mirror_image_of_a_flight_is_the_flight_through_the_mirrored_course() {
 
 #[test]
 fn all_that_points_to_the_left_points_to_the_right_in_the_mirror_and_nothing_else_is_turned() {
-    // `side` is 1 for the flight, -1 for its mirror image.
+    // `side` is 1 for the episode, -1 for its mirror image.
     let truth = |side: f32| {
         let ahead = |distance_m: f32| Ahead {
             distance_m,

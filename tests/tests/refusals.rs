@@ -9,7 +9,7 @@ use std::process::Command;
 use skein_tests::{Output, Recipe, program, repository, run_program};
 use tempfile::TempDir;
 
-/// `skein run` with a configuration of its own, which must not come to life.
+/// `skein run` with a configuration of its own, which must not come to incarnation.
 struct Attempt {
     folder: TempDir,
 }
@@ -73,7 +73,7 @@ fn an_unknown_key_section_or_setting() {
     let sound = Attempt::new("");
     sound.assert_refused(&["--set", "run.sede=1"], &["[run]", "sede"]);
     sound.assert_refused(&["--set", "seed=1"], &["--set seed=1", "section.key=value"]);
-    sound.assert_refused(&["--set", "run.flights=many"], &["[run]", "flights"]);
+    sound.assert_refused(&["--set", "run.episodes=many"], &["[run]", "episodes"]);
     sound.assert_refused(
         &["--set", "learning.policy_lag=2"],
         &["learning.policy_lag = 2", "above 1"],
@@ -130,7 +130,7 @@ fn an_actor_for_a_run_that_is_not_there_or_over() {
     let empty = tempfile::tempdir().unwrap();
     let directory = empty.path().to_str().unwrap();
     run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory]);
-    let over = Recipe::small().set("run.flights=1").finish();
+    let over = Recipe::small().set("run.episodes=1").finish();
     let directory = over.directory.root().to_str().unwrap();
     run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory, "not under way"]);
 }
@@ -187,12 +187,12 @@ fn a_resumption_of_what_cannot_be_gone_on_with() {
     );
 
     let mut running = Recipe::small().start();
-    running.until_flights(1);
+    running.until_episodes(1);
     let root = running.directory().root().to_owned();
     let directory = root.to_str().unwrap();
     run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "under way", "attach_actor.sh"]);
     let _complete = running.finish();
-    run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "complete", "40 flights"]);
+    run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "complete", "40 episodes"]);
 }
 
 #[test]

@@ -42,7 +42,7 @@ fn without_a_vae_a_run_killed_and_gone_on_with_by_more_actors_learns_the_same_bi
 
     let mut run = end_to_end("sac").actors(2).start();
     // After the first checkpoint, amid updates.
-    run.until_flights(25);
+    run.until_episodes(25);
     run.process("skein-learner").signal(Signal::KILL);
     run.finish().assert_same_as(&calm);
 }
@@ -61,7 +61,7 @@ fn snapshots_of_such_a_run_are_laid_out_as_ever_and_the_critic_has_trained_their
     // Nothing is there to be reconstructed, and nothing is told of it.
     assert!(!trained.directory.reconstructions().exists());
     assert!(!trained.directory.plots().join("reconstructions.png").exists());
-    assert!(trained.directory.plots().join("flight_paths.png").exists());
+    assert!(trained.directory.plots().join("trajectories.png").exists());
 }
 
 #[test]

@@ -53,25 +53,25 @@ fn every_shipped_configuration_can_be_flown_as_it_stands() {
             Simulator::new(course, &settings).unwrap();
         }
         Course::generate(0, &settings.generator).unwrap();
-        assert!((settings.max_steps as usize) < config.transport.max_records_per_flight);
+        assert!((settings.max_steps as usize) < config.transport.max_records_per_episode);
     }
 }
 
 #[test]
 fn the_faithful_configuration_is_the_papers() {
     let paper = load("paper.toml");
-    assert_eq!(paper.run.flights, 4000);
-    assert_eq!(paper.learning.flights_per_epoch, 1);
+    assert_eq!(paper.run.episodes, 4000);
+    assert_eq!(paper.learning.episodes_per_epoch, 1);
     assert_eq!(paper.learning.policy_lag, 0);
     assert_eq!(paper.learning.warmup_steps, 2000);
-    assert_eq!(paper.learning.flights_per_level, 10);
+    assert_eq!(paper.learning.episodes_per_level, 10);
     assert_eq!(paper.learning.levels, 5);
     assert_eq!(paper.learning.observation, Observation::Latent);
     assert_eq!(paper.vae.train_steps, 10_000);
     assert_eq!(paper.replay.capacity, 131_072);
     assert_eq!(paper.replay.success_share, 0.125);
-    assert_eq!(paper.evaluation.window_flights, 50);
-    assert_eq!(paper.evaluation.flights, 100);
+    assert_eq!(paper.evaluation.window_episodes, 50);
+    assert_eq!(paper.evaluation.episodes, 100);
     assert_eq!(paper.courses.generated_share, 0.0);
     assert_eq!(
         paper.courses.evaluation.len(),
@@ -88,7 +88,7 @@ fn every_shipped_suite_can_be_flown_and_one_tells_every_family_of_shapes_apart()
     let [generalist, shapes, untried] = ["generalist.toml", "shapes.toml", "untried.toml"].map(suite);
     let all = [&generalist, &shapes, &untried, &suite("paper.toml")];
     for entry in all.into_iter().flat_map(|suite| &suite.entries) {
-        entry.courses.of_flight(0).unwrap();
+        entry.courses.of_episode(0).unwrap();
     }
     let told: Vec<&str> = shapes.entries.iter().map(|entry| entry.name.as_str()).collect();
     let families = GeneratedShape::HELD_OUT.into_iter().chain(GeneratedShape::TRAINED);

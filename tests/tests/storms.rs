@@ -24,7 +24,7 @@ fn storm(settings: &[&str], arguments: &[&str]) -> String {
 fn kills_freezes_and_comings_and_goings_change_nothing() {
     // Silences that the freezes of a short run can exceed.
     let settings = [
-        "run.flights=200",
+        "run.episodes=200",
         "transport.actor_silence_secs=1",
         "transport.learner_silence_secs=6",
     ];
@@ -35,8 +35,8 @@ fn kills_freezes_and_comings_and_goings_change_nothing() {
 }
 
 #[test]
-fn kills_change_nothing_where_flights_are_flown_while_the_learner_updates() {
-    let settings = ["run.flights=120", "learning.policy_lag=1"];
+fn kills_change_nothing_where_episodes_are_flown_while_the_learner_updates() {
+    let settings = ["run.episodes=120", "learning.policy_lag=1"];
     let kills = ["--actor-kills", "8", "--learner-kills", "3", "--supervisor-kills", "1"];
     storm(
         &settings,
@@ -46,6 +46,6 @@ fn kills_change_nothing_where_flights_are_flown_while_the_learner_updates() {
 
 #[test]
 fn a_death_at_any_named_point_changes_nothing() {
-    // Enough flights that every point is passed again after all deaths before it.
-    storm(&["run.flights=400"], &["--points"]);
+    // Enough episodes that every point is passed again after all deaths before it.
+    storm(&["run.episodes=400"], &["--points"]);
 }

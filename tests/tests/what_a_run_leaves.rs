@@ -17,8 +17,8 @@ use skein_tests::{Ended, Recipe};
 fn a_completed_run_leaves_what_it_promises() {
     let run = Recipe::small().set("run.seed=7").finish();
     the_configuration_is_resolved(&run);
-    the_flights_have_the_promised_columns(&run);
-    the_summary_agrees_with_the_flights(&run);
+    the_episodes_have_the_promised_columns(&run);
+    the_summary_agrees_with_the_episodes(&run);
     the_stages_agree_with_the_counts(&run);
     the_snapshots_are_those_of_the_summary(&run);
     the_evaluation_is_of_the_best_snapshot(&run);
@@ -60,23 +60,23 @@ fn the_configuration_is_resolved(run: &Ended) {
     }
 }
 
-fn the_flights_have_the_promised_columns(run: &Ended) {
-    let text = fs::read_to_string(run.directory.flights_csv()).unwrap();
+fn the_episodes_have_the_promised_columns(run: &Ended) {
+    let text = fs::read_to_string(run.directory.episodes_csv()).unwrap();
     assert_eq!(
         text.lines().next(),
-        Some("flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome")
+        Some("episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome")
     );
-    let flights = run.flights();
-    assert_eq!(flights.len(), 40);
-    for (number, flight) in (0u64..).zip(&flights) {
-        // Ten flights from each level in turn.
-        assert_eq!(u64::from(flight.level), number / 10 % 5 + 1, "{flight:?}");
-        assert!((1..=160).contains(&flight.steps), "{flight:?}");
-        assert!(flight.walls_passed <= 5, "{flight:?}");
-        assert!(flight.r#return.parse::<f32>().unwrap().is_finite(), "{flight:?}");
+    let episodes = run.episodes();
+    assert_eq!(episodes.len(), 40);
+    for (number, episode) in (0u64..).zip(&episodes) {
+        // Ten episodes from each level in turn.
+        assert_eq!(u64::from(episode.level), number / 10 % 5 + 1, "{episode:?}");
+        assert!((1..=160).contains(&episode.steps), "{episode:?}");
+        assert!(episode.walls_passed <= 5, "{episode:?}");
+        assert!(episode.r#return.parse::<f32>().unwrap().is_finite(), "{episode:?}");
         assert!(
-            ["collided", "reached_end", "timed_out"].contains(&flight.outcome.as_str()),
-            "{flight:?}"
+            ["collided", "reached_end", "timed_out"].contains(&episode.outcome.as_str()),
+            "{episode:?}"
         );
     }
 }
@@ -95,8 +95,8 @@ fn last_commit() -> String {
     String::from_utf8(output.stdout).unwrap().trim().to_owned()
 }
 
-fn the_summary_agrees_with_the_flights(run: &Ended) {
-    let (summary, flights) = (run.summary(), run.flights());
+fn the_summary_agrees_with_the_episodes(run: &Ended) {
+    let (summary, episodes) = (run.summary(), run.episodes());
     // In a clone with the commit behind it.
     let (version, commit) = summary
         .skein_version
@@ -111,11 +111,11 @@ fn the_summary_agrees_with_the_flights(run: &Ended) {
     assert_eq!(summary.seed, 7);
     assert_eq!(summary.ending, Ending::Completed);
     assert_eq!(summary.final_version.0, 4);
-    assert_eq!(summary.flights, flights.len() as u64);
-    assert_eq!(summary.steps, flights.iter().map(|flight| flight.steps).sum::<u64>());
+    assert_eq!(summary.episodes, episodes.len() as u64);
+    assert_eq!(summary.steps, episodes.iter().map(|episode| episode.steps).sum::<u64>());
     assert!(summary.updates > 0 && summary.vae_updates > 0, "{summary:?}");
     // Three on each of two courses, and at least one that confirmed the best snapshot.
-    assert!(summary.evaluation_flights > 6, "{summary:?}");
+    assert!(summary.evaluation_episodes > 6, "{summary:?}");
 }
 
 /// Each thread's stages are its whole time, and each was gone through as often as there was something to do.
@@ -123,24 +123,24 @@ fn the_stages_agree_with_the_counts(run: &Ended) {
     let summary = run.summary();
     let count = |stage| summary.stages.of(stage).count;
     let secs = |thread| summary.stages.total_nanos(thread) as f64 / 1e9;
-    let evaluated = fs::read_to_string(run.directory.evaluation_paths_csv()).unwrap();
-    // A header, and a row for each observation of six flights.
+    let evaluated = fs::read_to_string(run.directory.evaluation_trajectories_csv()).unwrap();
+    // A header, and a row for each observation of six episodes.
     let evaluation_steps = evaluated.lines().count() as u64 - 1 - 6;
-    let (flights, steps) = (count(Stage::TakeOff), count(Stage::Physics));
-    let flown = summary.flights + summary.evaluation_flights;
-    // The last flight's end may not have been heard of yet.
+    let (episodes, steps) = (count(Stage::Reset), count(Stage::Physics));
+    let flown = summary.episodes + summary.evaluation_episodes;
+    // The last episode's end may not have been heard of yet.
     assert!(
-        (flown - 1..=flown).contains(&flights),
-        "{flights} flights of {summary:?}"
+        (flown - 1..=flown).contains(&episodes),
+        "{episodes} episodes of {summary:?}"
     );
     // Those that confirmed the best snapshot were flown besides.
     assert!(steps > summary.steps + evaluation_steps, "{steps} steps of {summary:?}");
     assert_eq!(count(Stage::Policy), steps);
-    assert_eq!([Stage::Camera, Stage::Encoder].map(count), [steps + flights; 2]);
-    assert!((steps + flights - 1..=steps + flights).contains(&count(Stage::Send)));
-    assert!(count(Stage::Assemble) >= summary.steps + summary.flights);
-    assert_eq!(count(Stage::TakeIn), summary.flights);
-    assert_eq!(count(Stage::Evaluate), summary.evaluation_flights);
+    assert_eq!([Stage::Camera, Stage::Encoder].map(count), [steps + episodes; 2]);
+    assert!((steps + episodes - 1..=steps + episodes).contains(&count(Stage::Send)));
+    assert!(count(Stage::Assemble) >= summary.steps + summary.episodes);
+    assert_eq!(count(Stage::TakeIn), summary.episodes);
+    assert_eq!(count(Stage::Evaluate), summary.evaluation_episodes);
     assert_eq!([Stage::Sample, Stage::PolicyUpdate].map(count), [summary.updates; 2]);
     assert_eq!(
         [Stage::SampleImages, Stage::VaeStep].map(count),
@@ -183,7 +183,7 @@ fn the_evaluation_is_of_the_best_snapshot(run: &Ended) {
     let names: Vec<_> = evaluation.courses.iter().map(|course| course.course.as_str()).collect();
     assert_eq!(names, ["training", "non_rectangular"]);
     for course in &evaluation.courses {
-        assert_eq!(course.flights, 3);
+        assert_eq!(course.episodes, 3);
         assert_eq!(course.walls_passed.len(), 5);
         let rate = course.walls_passed.iter().sum::<u64>() as f64 / 15.0;
         assert!((course.r - rate).abs() < 1e-9, "{course:?}");
@@ -195,7 +195,7 @@ fn the_evaluation_is_of_the_best_snapshot(run: &Ended) {
 fn the_newest_checkpoint_is_of_the_end(run: &Ended) {
     assert_eq!(
         names_in(&run.directory.checkpoints()),
-        BTreeSet::from(["flight-20".to_owned(), "flight-40".to_owned()])
+        BTreeSet::from(["episode-20".to_owned(), "episode-40".to_owned()])
     );
 }
 
@@ -219,7 +219,7 @@ fn the_curves_are_in_an_event_file(run: &Ended) {
     let holds = |event: &[u8], text: &str| event.windows(text.len()).any(|part| part == text.as_bytes());
     assert!(holds(events[0], "brain.Event:2"));
     for (curve, least) in [
-        ("flight/return", 40),
+        ("episode/return", 40),
         ("window/walls_passed", 40),
         ("policy/critic_loss", 1),
         ("policy/temperature", 1),
@@ -233,7 +233,7 @@ fn the_curves_are_in_an_event_file(run: &Ended) {
 
 fn the_plots_show_something(run: &Ended) {
     let plots = [
-        "flight_paths.png",
+        "trajectories.png",
         "reconstructions.png",
         "return.png",
         "walls_passed.png",
@@ -272,7 +272,7 @@ fn the_conclusion_shows_the_tables_and_the_paths(run: &Ended) {
     for part in [
         "non_rectangular",
         &run.summary().stages.to_string(),
-        "flights.csv",
+        "episodes.csv",
         "plots/walls_passed.png",
         "snapshots/best.safetensors",
     ] {
@@ -294,7 +294,7 @@ fn names_in(folder: &Path) -> BTreeSet<String> {
 #[test]
 fn logs_are_as_verbose_and_of_the_format_that_was_asked_for() {
     let run = Recipe::small()
-        .set("run.flights=10")
+        .set("run.episodes=10")
         .actors(1)
         .environment("RUST_LOG", "debug")
         .environment("SKEIN_LOG_FORMAT", "json")

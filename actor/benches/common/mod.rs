@@ -5,8 +5,8 @@ use std::path::Path;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::config::{Config, Observation};
-use skein_protocol::ids::{Attempt, FlightId, PolicyVersion, RunId};
-use skein_protocol::run::{LearnerSeat, RunDirectory, RunIdentity};
+use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion, RunId};
+use skein_protocol::run::{LearnerLock, RunDirectory, RunIdentity};
 use skein_protocol::services::LearnerPorts;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
@@ -19,7 +19,7 @@ pub(crate) struct Learner {
     pub(crate) identity: RunIdentity,
     pub(crate) config: Config,
     pub(crate) ports: LearnerPorts,
-    _seat: LearnerSeat,
+    _lock: LearnerLock,
     #[allow(dead_code, reason = "only the benchmark that starts a process says where")]
     pub(crate) directory: tempfile::TempDir,
 }
@@ -35,13 +35,13 @@ impl Learner {
         config.courses.evaluation = vec![courses.join("training.toml")];
         run.create(&config).expect("the directory is new");
         let (identity, config) = run.open().expect("it was just created");
-        let seat = LearnerSeat::take(&run, &identity).expect("nobody else knows of it");
-        let ports = LearnerPorts::open(&identity, seat.life(), &config).expect("services can be created");
+        let lock = LearnerLock::take(&run, &identity).expect("nobody else knows of it");
+        let ports = LearnerPorts::open(&identity, lock.incarnation(), &config).expect("services can be created");
         Self {
             identity,
             config,
             ports,
-            _seat: seat,
+            _lock: lock,
             directory,
         }
     }
@@ -62,17 +62,17 @@ impl Learner {
     }
 }
 
-/// A training flight with that snapshot.
-pub(crate) fn ticket(run: RunId, flight: u64, level: u8) -> Ticket {
+/// A training episode with that snapshot.
+pub(crate) fn ticket(run: RunId, episode: u64, level: u8) -> Ticket {
     Ticket {
         run,
-        flight: FlightId(flight),
+        episode: EpisodeId(episode),
         attempt: Attempt(0),
         policy_version: PolicyVersion(0),
         course: CourseChoice::Training,
         start_level: level,
         exploration: Exploration::Sample,
-        seed: flight,
-        leg: None,
+        seed: episode,
+        segment: None,
     }
 }

@@ -1,6 +1,6 @@
 //! The depth camera: frames a second drawn, drawn with a stereo camera's errors, and traced ray by ray in the same scene.
 //!
-//! An iteration is a flight's worth of poses through the whole corridor, leaning as drones do, so that near walls and open corridor are in it as they
+//! An iteration is an episode's worth of poses through the whole corridor, leaning as drones do, so that near walls and open corridor are in it as they
 //! are in training.
 
 use std::hint::black_box;
@@ -69,7 +69,7 @@ fn camera(criterion: &mut Criterion, name: &str) {
     group.finish();
 }
 
-/// A pose of a flight that goes to each opening in turn.
+/// A pose of an episode that goes to each opening in turn.
 fn pose(course: &Course, number: usize) -> Isometry3<f32> {
     let x = 1.0 + (course.corridor().length_m - 2.0) * number as f32 / DRAWN as f32;
     let ahead = course

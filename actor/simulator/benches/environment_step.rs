@@ -1,6 +1,6 @@
-//! The environment step: half a second of flight, physics alone and with the image after it.
+//! The environment step: half a second of episode, physics alone and with the image after it.
 //!
-//! An iteration is a whole flight through the training course, the oracle steering, take-off included.
+//! An iteration is a whole episode through the training course, the oracle steering, reset included.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -71,5 +71,5 @@ fn fly(simulator: &mut Simulator, camera: Camera) -> u64 {
             return steps;
         }
     }
-    unreachable!("the step limit ends every flight")
+    unreachable!("the step limit ends every episode")
 }

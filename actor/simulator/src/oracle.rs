@@ -1,4 +1,4 @@
-//! A pilot that sees the course itself instead of the depth image: proof that a course can be flown by a given drone.
+//! A policy that sees the course itself instead of the depth image: proof that a course can be flown by a given drone.
 
 use crate::course::{Course, Wall};
 use crate::simulator::walls_ahead;
@@ -44,8 +44,8 @@ mod tests {
     use crate::simulator::{Outcome, Simulator, SimulatorSettings};
     use crate::vehicle::{Preset, VehicleSettings};
 
-    /// Per course and drone, spread over the levels; `examples/oracle_flight.rs` flies a hundred from each.
-    const FLIGHTS: u64 = 10;
+    /// Per course and drone, spread over the levels; `examples/oracle_episode.rs` flies a hundred from each.
+    const EPISODES: u64 = 10;
 
     #[test]
     fn every_shipped_course_can_be_flown_from_every_level_with_every_drone() {
@@ -64,9 +64,9 @@ mod tests {
                     ..Default::default()
                 };
                 let mut simulator = Simulator::new(course.clone(), &settings).unwrap();
-                for flight in 0..FLIGHTS {
-                    let level = 1 + (flight % u64::from(course.levels())) as u8;
-                    let [mut start, mut calm] = [flight, 0].map(Pcg64Mcg::seed_from_u64);
+                for episode in 0..EPISODES {
+                    let level = 1 + (episode % u64::from(course.levels())) as u8;
+                    let [mut start, mut calm] = [episode, 0].map(Pcg64Mcg::seed_from_u64);
                     simulator.reset(level, &mut start, &mut calm).unwrap();
                     let outcome = fly(&mut simulator);
                     let at = simulator.state().position_m;
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn pilot_steers_towards_the_opening_and_brakes_before_it() {
+    fn oracle_steers_towards_the_opening_and_brakes_before_it() {
         let course = test_course();
         let [y_m, z_m] = course.walls()[0].safe_point();
         let below_right = VehicleState::at_rest(Point3::new(5.0, y_m - 2.0, z_m - 2.0));
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn pilot_holds_still_until_its_tail_has_left_the_wall() {
+    fn oracle_holds_still_until_its_tail_has_left_the_wall() {
         let course = test_course();
         let wall = &course.walls()[0];
         let [y_m, z_m] = wall.safe_point();

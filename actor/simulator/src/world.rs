@@ -1,6 +1,6 @@
 //! The rigid body among the course's surfaces: rapier integrates it, parry says what it touches.
 //!
-//! Any contact ends a flight, so contact forces never act and rapier's solver has nothing to solve: the course is not in
+//! Any contact ends an episode, so contact forces never act and rapier's solver has nothing to solve: the course is not in
 //! rapier's world at all. After each step the body's cuboid is tested, exactly, against the triangles that the depth camera
 //! also draws; a bounding-volume tree makes that some 0.1 µs when nothing is near. The body moves centimetres a step and is
 //! longer than that in every direction it can move, so it cannot pass a surface between two tests.
@@ -59,8 +59,8 @@ impl World {
         })
     }
 
-    /// Puts the body at rest at `position_m`, `mass_factor` times as heavy as it nominally is. Physics is rebuilt, so that nothing of an earlier flight
-    /// remains in rapier's caches: a flight is a function of its start and actions alone.
+    /// Puts the body at rest at `position_m`, `mass_factor` times as heavy as it nominally is. Physics is rebuilt, so that nothing of an earlier episode
+    /// remains in rapier's caches: an episode is a function of its start and actions alone.
     pub(crate) fn reset(&mut self, position_m: &Point3<f32>, mass_factor: f32) {
         let body = self.nominal.scaled(mass_factor);
         self.mass_kg = body.mass_kg;
@@ -110,7 +110,7 @@ impl World {
         !self.physics.quarantine().is_empty()
     }
 
-    /// Which wall of `course` the body touches now, by its place in flight order from 0.
+    /// Which wall of `course` the body touches now, by its place in episode order from 0.
     pub(crate) fn touched_wall(&self, course: &Course) -> Option<usize> {
         let mesh = course.mesh();
         (0..course.walls().len()).find(|&place| {

@@ -77,7 +77,7 @@ fn every_opening_leaves_the_same_free_space() {
 }
 
 #[test]
-fn straight_flight_passes_no_wall() {
+fn straight_episode_passes_no_wall() {
     for name in ["training.toml", "non_rectangular.toml"] {
         let course = shipped(name);
         let start = course.start();

@@ -17,14 +17,14 @@ use skein_protocol::failure::with_causes;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::snapshot::Snapshot;
 use skein_simulator::camera::Instructions;
-use skein_simulator::suite::{EntryCourses, MOST_FLIGHTS, Suite, SuiteEntry};
+use skein_simulator::suite::{EntryCourses, MOST_EPISODES, Suite, SuiteEntry};
 
 /// Flies a trained snapshot through courses and prints how it fares.
 ///
-/// Every flight takes off from the start of level 1 and follows the policy without noise. The flights are the same each time, whatever the number of threads:
+/// Every episode takes off from the start of level 1 and follows the policy without noise. The episodes are the same each time, whatever the number of threads:
 /// their seeds derive from the seed of the run that trained the snapshot, whose configuration lies in the snapshot file.
 ///
-/// R is the average rate of walls passed, (t_1 + … + t_n) / (n · flights), where t_i counts the flights that passed wall i. Beside it stands what the other flights
+/// R is the average rate of walls passed, (t_1 + … + t_n) / (n · episodes), where t_i counts the episodes that passed wall i. Beside it stands what the other episodes
 /// failed by: which wall they hit, or before which one they hit the corridor or ran out of steps. Walls are counted in the order in which they are met.
 #[derive(Parser)]
 #[command(version, after_long_help = columns_help())]
@@ -37,13 +37,13 @@ struct Arguments {
     /// A suite file to fly instead: courses, all orders of a course's walls, generated courses, each with disturbances of its own; as configs/evaluations/generalist.toml.
     #[arg(long, value_name = "FILE", conflicts_with = "course")]
     suite: Option<PathBuf>,
-    /// Flights per course, or of each entry of the suite. By default evaluation.flights of that run, or what the suite says.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=MOST_FLIGHTS))]
-    flights: Option<u64>,
+    /// Episodes per course, or of each entry of the suite. By default evaluation.episodes of that run, or what the suite says.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=MOST_EPISODES))]
+    episodes: Option<u64>,
     /// Also write the result to this file, as JSON.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Also write every step of every flight to this file, as .npz; takes 9.3 KiB of memory for each step, about 1 MiB for each whole flight.
+    /// Also write every step of every episode to this file, as .npz; takes 9.3 KiB of memory for each step, about 1 MiB for each whole episode.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     // Not a doc comment: those cannot name the constant.
@@ -125,7 +125,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     if let Some(file) = &arguments.record {
         let names: Vec<_> = courses.evaluation().map(|entry| entry.name.as_str()).collect();
-        write_recording(file, &names, config.vae.latent, &evaluated.flights)?;
+        write_recording(file, &names, config.vae.latent, &evaluated.episodes)?;
     }
     Ok(())
 }
@@ -196,20 +196,24 @@ fn courses(arguments: &Arguments, config: &Config, snapshot: &Path) -> anyhow::R
         (None, []) => Courses::of_files(config, &evaluation_courses(config, snapshot)?)?,
         (None, files) => Courses::of_files(config, files)?,
     };
-    Ok(match arguments.flights {
-        Some(flights) => courses.with_flights(flights),
+    Ok(match arguments.episodes {
+        Some(episodes) => courses.with_episodes(episodes),
         None => courses,
     })
 }
 
-/// How many flights of what, in words; `entries` is what there is a number of flights for.
+/// How many episodes of what, in words; `entries` is what there is a number of episodes for.
 fn what_is_flown(courses: &Courses, entries: &str) -> String {
-    let flights: Vec<u64> = courses.evaluation().map(|entry| entry.flights).collect();
-    match flights.as_slice() {
-        [first, others @ ..] if others.iter().all(|flights| flights == first) => {
-            format!("{first} flights on each of {} {entries}", flights.len())
+    let episodes: Vec<u64> = courses.evaluation().map(|entry| entry.episodes).collect();
+    match episodes.as_slice() {
+        [first, others @ ..] if others.iter().all(|episodes| episodes == first) => {
+            format!("{first} episodes on each of {} {entries}", episodes.len())
         }
-        _ => format!("{} flights in {} {entries}", flights.iter().sum::<u64>(), flights.len()),
+        _ => format!(
+            "{} episodes in {} {entries}",
+            episodes.iter().sum::<u64>(),
+            episodes.len()
+        ),
     }
 }
 
@@ -255,7 +259,7 @@ fn evaluation_courses(config: &Config, snapshot: &Path) -> anyhow::Result<Vec<Pa
 }
 
 fn threads_help() -> String {
-    format!("Most threads to fly on, at most {MAX_THREADS} and one a flight. By default one a core")
+    format!("Most threads to fly on, at most {MAX_THREADS} and one an episode. By default one a core")
 }
 
 /// The arrays of a recording, for the long help.
@@ -273,7 +277,7 @@ fn columns_help() -> String {
         )
     });
     format!(
-        "Arrays in the file of --record, read by numpy.load(FILE); a row for each observation, flights and courses in order:\n{}  {:<13} {:<4} {:<14} {}",
+        "Arrays in the file of --record, read by numpy.load(FILE); a row for each observation, episodes and courses in order:\n{}  {:<13} {:<4} {:<14} {}",
         rows.collect::<String>(),
         "course_names",
         "<U",

@@ -3,7 +3,7 @@ use std::sync::Arc;
 use bytemuck::Zeroable;
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{Observation, Precision, View};
-use skein_protocol::ids::{Attempt, FlightId, RunId};
+use skein_protocol::ids::{Attempt, EpisodeId, RunId};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::ticket::{CourseChoice, Exploration};
 
@@ -13,7 +13,7 @@ use crate::testing::{config, random_snapshot};
 use skein_inference::Scratch;
 
 pub(super) const ACTOR: ActorId = ActorId(3);
-pub(super) const LIFE: Incarnation = Incarnation(8);
+pub(super) const INCARNATION: ActorIncarnation = ActorIncarnation(8);
 
 /// Keeps what is sent, and where each image lay when it was loaned and when it was sent.
 #[derive(Default)]
@@ -54,14 +54,14 @@ impl RecordLink for Tape {
 pub(super) fn ticket(exploration: Exploration, seed: u64) -> Ticket {
     Ticket {
         run: RunId(1),
-        flight: FlightId(5),
+        episode: EpisodeId(5),
         attempt: Attempt(2),
         policy_version: NETWORK,
         course: CourseChoice::Training,
         start_level: 2,
         exploration,
         seed,
-        leg: None,
+        segment: None,
     }
 }
 
@@ -72,12 +72,17 @@ fn view() -> View {
     View::present(Observation::LatentVelocityAction, 32)
 }
 
-pub(super) fn pilot(simulator: &str) -> Pilot {
+pub(super) fn environment_loop(simulator: &str) -> EnvironmentLoop {
     let courses = Courses::of_run(&config(simulator)).unwrap();
-    Pilot::new(ACTOR, LIFE, Simulators::new(Arc::new(courses)), Agent::new(view()))
+    EnvironmentLoop::new(
+        ACTOR,
+        INCARNATION,
+        Simulators::new(Arc::new(courses)),
+        Agent::new(view()),
+    )
 }
 
-/// Everything that may disturb a flight.
+/// Everything that may disturb an episode.
 pub(super) const STORMY: &str =
     "disturbances = { mass_spread = 0.2, latency_periods = 1, gust.force_rms_n = 0.15, depth.model = \"stereo\" }";
 
@@ -88,14 +93,14 @@ pub(super) fn network(change: impl Fn(&mut [f32])) -> Network {
     Network::new(&snapshot, &layout, Precision::F32)
 }
 
-pub(super) fn flown(pilot: &mut Pilot, ticket: &Ticket) -> (FlightScore, Tape) {
-    let (score, tape) = fly(pilot, ticket);
-    (score.expect("the flight is flown whole"), tape)
+pub(super) fn flown(environment_loop: &mut EnvironmentLoop, ticket: &Ticket) -> (EpisodeScore, Tape) {
+    let (score, tape) = fly(environment_loop, ticket);
+    (score.expect("the episode is flown whole"), tape)
 }
 
-pub(super) fn fly(pilot: &mut Pilot, ticket: &Ticket) -> (Option<FlightScore>, Tape) {
+pub(super) fn fly(environment_loop: &mut EnvironmentLoop, ticket: &Ticket) -> (Option<EpisodeScore>, Tape) {
     let mut tape = Tape::default();
-    let score = pilot.fly(ticket, &network(|_| {}), &mut tape).unwrap();
+    let score = environment_loop.fly(ticket, &network(|_| {}), &mut tape).unwrap();
     (score, tape)
 }
 
@@ -108,14 +113,14 @@ pub(super) fn raw(records: &[Box<TransitionRecord>]) -> Vec<&[u8]> {
 }
 
 #[test]
-fn a_ticket_flown_again_is_the_same_flight_bit_for_bit() {
-    let mut used = pilot("");
+fn a_ticket_flown_again_is_the_same_episode_bit_for_bit() {
+    let mut used = environment_loop("");
     for exploration in [Exploration::Uniform, Exploration::Sample, Exploration::Mode] {
         let (score, first) = flown(&mut used, &ticket(exploration, 1));
         let (_, other) = flown(&mut used, &ticket(exploration, 2));
         assert_ne!(bytes(&first), bytes(&other));
         let (score_again, again) = flown(&mut used, &ticket(exploration, 1));
-        let (_, elsewhere) = flown(&mut pilot(""), &ticket(exploration, 1));
+        let (_, elsewhere) = flown(&mut environment_loop(""), &ticket(exploration, 1));
         assert_eq!(score, score_again);
         assert_eq!(bytes(&first), bytes(&again));
         assert_eq!(bytes(&first), bytes(&elsewhere));
@@ -124,15 +129,15 @@ fn a_ticket_flown_again_is_the_same_flight_bit_for_bit() {
 
 #[test]
 fn how_actions_are_chosen_does_not_move_the_start() {
-    let start = |exploration| flown(&mut pilot(""), &ticket(exploration, 1)).1.sent[0].position_m;
+    let start = |exploration| flown(&mut environment_loop(""), &ticket(exploration, 1)).1.sent[0].position_m;
     assert_eq!(start(Exploration::Uniform), start(Exploration::Mode));
     assert_eq!(start(Exploration::Uniform), start(Exploration::Sample));
 }
 
 #[test]
-fn a_flight_is_its_steps_without_a_gap_and_one_closing_record() {
+fn an_episode_is_its_steps_without_a_gap_and_one_closing_record() {
     let ticket = ticket(Exploration::Sample, 1);
-    let (score, tape) = flown(&mut pilot(""), &ticket);
+    let (score, tape) = flown(&mut environment_loop(""), &ticket);
     let (closing, steps) = tape.sent.split_last().unwrap();
     assert!(steps.len() > 3);
     for (step, record) in (0u32..).zip(&tape.sent) {
@@ -141,7 +146,7 @@ fn a_flight_is_its_steps_without_a_gap_and_one_closing_record() {
         } else {
             RecordKind::Step
         };
-        assert_eq!(record.check(&ticket, ACTOR, LIFE, step), Ok(kind));
+        assert_eq!(record.check(&ticket, ACTOR, INCARNATION, step), Ok(kind));
     }
     assert_eq!(Outcome::from_code(closing.outcome), Some(score.outcome));
     assert_eq!(u32::from(closing.walls_passed), score.walls_passed);
@@ -150,12 +155,12 @@ fn a_flight_is_its_steps_without_a_gap_and_one_closing_record() {
     let ends = |record: &&TransitionRecord| record.terminated + record.truncated > 0;
     assert!(steps.iter().rev().skip(1).all(|record| !ends(&&**record)) && ends(&&**steps.last().unwrap()));
     let sum: f64 = steps.iter().map(|record| f64::from(record.reward)).sum();
-    assert_eq!(f64::from(sum as f32), score.flight_return);
+    assert_eq!(f64::from(sum as f32), score.episode_return);
 }
 
 #[test]
 fn each_record_holds_what_was_seen_and_the_reward_for_what_came_next() {
-    let (_, tape) = flown(&mut pilot(""), &ticket(Exploration::Sample, 1));
+    let (_, tape) = flown(&mut environment_loop(""), &ticket(Exploration::Sample, 1));
     let (network, mut scratch) = (network(|_| {}), Scratch::default());
     for pair in tape.sent.windows(2) {
         assert_eq!(pair[0].latent, network.encode(&pair[0].depth, &mut scratch));
@@ -173,7 +178,7 @@ fn each_record_holds_what_was_seen_and_the_reward_for_what_came_next() {
 
 #[test]
 fn images_are_rendered_into_the_loaned_record_and_sent_from_there() {
-    let (_, tape) = flown(&mut pilot(""), &ticket(Exploration::Uniform, 1));
+    let (_, tape) = flown(&mut environment_loop(""), &ticket(Exploration::Uniform, 1));
     assert_eq!(tape.loaned_at, tape.sent_at);
     assert!(
         tape.sent
@@ -183,26 +188,26 @@ fn images_are_rendered_into_the_loaned_record_and_sent_from_there() {
 }
 
 #[test]
-fn a_flight_cut_off_by_the_step_limit_is_truncated_and_not_terminated() {
-    let (score, tape) = flown(&mut pilot("max_steps = 3"), &ticket(Exploration::Mode, 1));
+fn an_episode_cut_off_by_the_step_limit_is_truncated_and_not_terminated() {
+    let (score, tape) = flown(&mut environment_loop("max_steps = 3"), &ticket(Exploration::Mode, 1));
     assert_eq!((score.outcome, tape.sent.len()), (Outcome::TimedOut, 4));
     assert_eq!((tape.sent[2].truncated, tape.sent[2].terminated), (1, 0));
 }
 
 #[test]
-fn an_abandoned_flight_has_no_closing_record() {
+fn an_abandoned_episode_has_no_closing_record() {
     let mut tape = Tape {
         abandon_after: Some(2),
         ..Tape::default()
     };
-    let end = pilot("").fly(&ticket(Exploration::Mode, 1), &network(|_| {}), &mut tape);
-    assert!(matches!(end, Err(FlightError::Abandoned)));
+    let end = environment_loop("").fly(&ticket(Exploration::Mode, 1), &network(|_| {}), &mut tape);
+    assert!(matches!(end, Err(EpisodeError::Abandoned)));
     assert_eq!(tape.sent.len(), 2);
     assert!(tape.sent.iter().all(|record| record.kind == RecordKind::Step.code()));
 }
 
 #[test]
-fn a_fault_ends_the_flight_with_a_record_that_says_so() {
+fn a_fault_ends_the_episode_with_a_record_that_says_so() {
     let mut tape = Tape::default();
     // Finite parameters whose products are not: infinity minus infinity in the second layer.
     let network = network(|policy| {
@@ -212,13 +217,13 @@ fn a_fault_ends_the_flight_with_a_record_that_says_so() {
             .for_each(|(index, value)| *value = if index % 2 == 0 { 1e38 } else { -9e37 });
     });
     let ticket = ticket(Exploration::Mode, 1);
-    let end = pilot("").fly(&ticket, &network, &mut tape);
+    let end = environment_loop("").fly(&ticket, &network, &mut tape);
     assert!(
-        matches!(end, Err(FlightError::Fault(FlightFault::Simulation(_)))),
+        matches!(end, Err(EpisodeError::Fault(EpisodeFault::Simulation(_)))),
         "{end:?}"
     );
     assert_eq!(
-        tape.sent.last().unwrap().check(&ticket, ACTOR, LIFE, 0),
+        tape.sent.last().unwrap().check(&ticket, ACTOR, INCARNATION, 0),
         Ok(RecordKind::Failed)
     );
 }
@@ -236,8 +241,8 @@ fn a_ticket_for_what_is_not_there_is_a_fault_and_not_a_crash() {
         },
     ] {
         let mut tape = Tape::default();
-        let end = pilot("").fly(&ticket, &network(|_| {}), &mut tape);
-        assert!(matches!(end, Err(FlightError::Fault(_))));
+        let end = environment_loop("").fly(&ticket, &network(|_| {}), &mut tape);
+        assert!(matches!(end, Err(EpisodeError::Fault(_))));
         assert_eq!(tape.sent[0].kind, RecordKind::Failed.code());
     }
 }
@@ -248,7 +253,7 @@ fn a_generated_course_is_the_tickets_own() {
         course: CourseChoice::Generated(seed),
         ..ticket(Exploration::Mode, 1)
     };
-    let mut used = pilot("");
+    let mut used = environment_loop("");
     let (_, first) = flown(&mut used, &generated(1));
     let (_, other) = flown(&mut used, &generated(2));
     let (_, again) = flown(&mut used, &generated(1));
@@ -257,18 +262,18 @@ fn a_generated_course_is_the_tickets_own() {
 }
 
 #[test]
-fn a_disturbed_flight_is_a_function_of_its_ticket_too() {
-    let mut used = pilot(STORMY);
+fn a_disturbed_episode_is_a_function_of_its_ticket_too() {
+    let mut used = environment_loop(STORMY);
     let (score, first) = flown(&mut used, &ticket(Exploration::Sample, 1));
     let (_, other) = flown(&mut used, &ticket(Exploration::Sample, 2));
     let (score_again, again) = flown(&mut used, &ticket(Exploration::Sample, 1));
-    let (_, elsewhere) = flown(&mut pilot(STORMY), &ticket(Exploration::Sample, 1));
+    let (_, elsewhere) = flown(&mut environment_loop(STORMY), &ticket(Exploration::Sample, 1));
     assert_eq!(score, score_again);
     assert_eq!(bytes(&first), bytes(&again));
     assert_eq!(bytes(&first), bytes(&elsewhere));
     assert_ne!(bytes(&first), bytes(&other));
-    // It starts where the calm flight of its ticket does, and sees it otherwise.
-    let (_, calm) = flown(&mut pilot(""), &ticket(Exploration::Sample, 1));
+    // It starts where the calm episode of its ticket does, and sees it otherwise.
+    let (_, calm) = flown(&mut environment_loop(""), &ticket(Exploration::Sample, 1));
     assert_eq!(first.sent[0].position_m, calm.sent[0].position_m);
     assert_ne!(first.sent[0].depth, calm.sent[0].depth);
 }
@@ -283,11 +288,12 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
     let layout = SnapshotLayout::new(&view, 16);
     let network = Network::new(&random_snapshot(&layout, NETWORK.0), &layout, Precision::F32);
     let courses = Arc::new(Courses::of_run(&config("")).unwrap());
-    let mut pilot = Pilot::new(ACTOR, LIFE, Simulators::new(courses), Agent::new(view.clone()));
-    // The second flight must not remember the first.
+    let mut environment_loop =
+        EnvironmentLoop::new(ACTOR, INCARNATION, Simulators::new(courses), Agent::new(view.clone()));
+    // The second episode must not remember the first.
     for seed in [1, 2] {
         let mut tape = Tape::default();
-        pilot
+        environment_loop
             .fly(&ticket(Exploration::Mode, seed), &network, &mut tape)
             .unwrap();
         let steps = tape.sent.len() - 1;
@@ -313,7 +319,7 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
 
 #[test]
 fn what_was_hit_is_in_the_closing_record() {
-    // A pilot that wants straight on hits the first wall; one that wants up, the ceiling.
+    // A environment_loop that wants straight on hits the first wall; one that wants up, the ceiling.
     let closing = |bias: f32| {
         let mut tape = Tape::default();
         let layout = SnapshotLayout::new(&view(), 16);
@@ -328,7 +334,7 @@ fn what_was_hit_is_in_the_closing_record() {
             start_level: 1,
             ..ticket(Exploration::Mode, 1)
         };
-        let score = pilot("").fly(&ticket, &steady, &mut tape).unwrap().unwrap();
+        let score = environment_loop("").fly(&ticket, &steady, &mut tape).unwrap().unwrap();
         let closing = tape.sent.pop().unwrap();
         assert_eq!((score.outcome, score.walls_passed), (Outcome::Collided, 0));
         (score.hit_wall, closing.hit_wall)

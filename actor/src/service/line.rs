@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use skein_protocol::fault::{FaultPoint, pass};
-use skein_protocol::ids::{ActorId, Incarnation};
+use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::run::RunIdentity;
 use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
 use skein_protocol::stages::{LapTimer, Stage};
@@ -20,12 +20,12 @@ use crate::environment_loop::{Directive, RecordLink};
 use crate::weights::Weights;
 use skein_inference::Network;
 
-/// The actor's end of the line to the learner: hears tickets, snapshots and the stop, sends records and signs of life.
+/// The actor's end of the line to the learner: hears tickets, snapshots and the stop, sends records and heartbeats.
 pub(super) struct LearnerLine<'a> {
     ports: ActorPorts,
     identity: &'a RunIdentity,
     actor: ActorId,
-    incarnation: Incarnation,
+    incarnation: ActorIncarnation,
     weights: Weights,
     tickets: VecDeque<QueuedTicket>,
     limits: Limits,
@@ -38,7 +38,7 @@ pub(super) struct LearnerLine<'a> {
     timer: LapTimer,
     /// Whether the learner was told that there is nothing to fly, since there was.
     has_told_of_waiting: bool,
-    pub(super) flights_flown: u64,
+    pub(super) episodes_flown: u64,
 }
 
 struct QueuedTicket {
@@ -49,14 +49,14 @@ struct QueuedTicket {
 /// Deadlines and limits, from the `[transport]` section.
 struct Limits {
     heartbeat: Duration,
-    ticket_life: Duration,
+    ticket_lifetime: Duration,
     actor_silence: Duration,
     learner_silence: Duration,
     tickets: usize,
 }
 
 impl<'a> LearnerLine<'a> {
-    /// A line over `ports`, for the present incarnation of `service`. It begins with nothing: what an earlier life knew is not taken over.
+    /// A line over `ports`, for the present incarnation of `service`. It begins with nothing: what an earlier incarnation knew is not taken over.
     pub(super) fn new(service: &Service<'a>, ports: ActorPorts) -> Self {
         let transport = &service.config.transport;
         Self {
@@ -68,7 +68,7 @@ impl<'a> LearnerLine<'a> {
             tickets: VecDeque::new(),
             limits: Limits {
                 heartbeat: transport.heartbeat(),
-                ticket_life: Duration::from_secs_f64(transport.flight_deadline_secs),
+                ticket_lifetime: Duration::from_secs_f64(transport.episode_deadline_secs),
                 actor_silence: Duration::from_secs_f64(transport.actor_silence_secs),
                 learner_silence: Duration::from_secs_f64(transport.learner_silence_secs),
                 tickets: transport.tickets_per_actor,
@@ -79,11 +79,11 @@ impl<'a> LearnerLine<'a> {
             last_said: Instant::now(),
             timer: LapTimer::start(),
             has_told_of_waiting: false,
-            flights_flown: 0,
+            episodes_flown: 0,
         }
     }
 
-    /// When the learner last gave a sign of life.
+    /// When the learner last sent a heartbeat.
     pub(super) fn last_sign(&self) -> Instant {
         self.last_sign
     }
@@ -101,7 +101,7 @@ impl<'a> LearnerLine<'a> {
         }
     }
 
-    /// Hears everything there is to hear, and gives a sign of life when one is due.
+    /// Hears everything there is to hear, and sends a heartbeat when one is due.
     pub(super) fn listen(&mut self) -> Result<(), ServiceError> {
         self.listen_for_control()?;
         self.timer.lap(Stage::ActorControl, 1);
@@ -115,11 +115,11 @@ impl<'a> LearnerLine<'a> {
             }
             self.timer.lap(Stage::TakeSnapshot, 1);
         }
-        let life = self.limits.ticket_life;
+        let incarnation = self.limits.ticket_lifetime;
         self.tickets.retain(|queued| {
-            let alive = queued.arrived.elapsed() < life;
+            let alive = queued.arrived.elapsed() < incarnation;
             if !alive {
-                warn!(flight = %queued.ticket.flight, policy = %queued.ticket.policy_version, "ticket expired");
+                warn!(episode = %queued.ticket.episode, policy = %queued.ticket.policy_version, "ticket expired");
             }
             alive
         });
@@ -152,8 +152,8 @@ impl<'a> LearnerLine<'a> {
 
     /// Whether the learner that was joined is still the one that lives: a dead one falls silent too, but this is known at once.
     fn look_at_learner(&mut self) {
-        match self.identity.present_life() {
-            Ok(Some(present)) if present.life == self.ports.life() => {}
+        match self.identity.present_incarnation() {
+            Ok(Some(present)) if present.incarnation == self.ports.incarnation() => {}
             Ok(_) => {
                 self.parting.get_or_insert(Parting::LearnerGone);
             }
@@ -169,10 +169,10 @@ impl<'a> LearnerLine<'a> {
             }
             Control::Stop => self.parting = Some(Parting::Leave(Ending::Stopped)),
             Control::Fly(ticket) => {
-                // A flight issued again replaces its earlier ticket.
-                self.tickets.retain(|queued| queued.ticket.flight != ticket.flight);
+                // An episode issued again replaces its earlier ticket.
+                self.tickets.retain(|queued| queued.ticket.episode != ticket.episode);
                 if self.tickets.len() >= self.limits.tickets {
-                    warn!(flight = %ticket.flight, limit = self.limits.tickets, "more tickets than agreed; the oldest is dropped");
+                    warn!(episode = %ticket.episode, limit = self.limits.tickets, "more tickets than agreed; the oldest is dropped");
                     self.tickets.pop_front();
                 }
                 self.tickets.push_back(QueuedTicket {
@@ -196,7 +196,7 @@ impl<'a> LearnerLine<'a> {
         Some((ticket, network))
     }
 
-    /// Waits for the learner, not longer than until the next sign of life. The learner is told first: it wakes actors only to what one that waits would miss.
+    /// Waits for the learner, not longer than until the next heartbeat. The learner is told first: it wakes actors only to what one that waits would miss.
     pub(super) fn wait(&mut self) -> Result<(), ServiceError> {
         if !self.has_told_of_waiting {
             self.has_told_of_waiting = true;
@@ -227,7 +227,7 @@ impl<'a> LearnerLine<'a> {
             pid: std::process::id(),
             state,
             newest_policy: self.weights.newest(),
-            flights_flown: self.flights_flown,
+            episodes_flown: self.episodes_flown,
             times: *self.timer.times(),
         };
         self.ports.send_status(StatusRecord::new(self.ports.run(), &status))?;
@@ -253,7 +253,7 @@ impl RecordLink for LearnerLine<'_> {
         if kind == RecordKind::Closing.code() {
             pass(FaultPoint::ActorAfterLastRecord);
         } else if step == 2 {
-            pass(FaultPoint::ActorMidFlight);
+            pass(FaultPoint::ActorMidEpisode);
         }
         Ok(())
     }

@@ -1,8 +1,8 @@
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-use skein_protocol::ids::{Attempt, FlightId, PolicyVersion};
-use skein_protocol::run::{LearnerSeat, Presence, RunDirectory};
+use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion};
+use skein_protocol::run::{LearnerLock, Presence, RunDirectory};
 use skein_protocol::services::LearnerPorts;
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::stages::{Stage, Thread};
@@ -20,7 +20,7 @@ const PATIENCE: Duration = Duration::from_secs(20);
 
 /// A run with a learner of the test's own and one actor on a thread.
 struct Run {
-    learner: Option<(LearnerPorts, LearnerSeat)>,
+    learner: Option<(LearnerPorts, LearnerLock)>,
     told_to_end: Arc<AtomicBool>,
     actor: Option<JoinHandle<Result<Ending, JoinError>>>,
     identity: RunIdentity,
@@ -46,22 +46,23 @@ impl Run {
             config: config.clone(),
             directory,
         };
-        started.begin_life();
+        started.begin_incarnation();
         started.actor = Some(std::thread::spawn(move || {
             let _presence = Presence::enter(&identity).unwrap();
             let courses = Arc::new(Courses::of_run(&config).unwrap());
             let agent = Agent::new(config.view());
-            let mut pilot = Pilot::new(ACTOR, Incarnation(0), Simulators::new(courses), agent);
-            Service::new(&identity, &config, ACTOR, &told_to_end).serve(&mut pilot)
+            let mut environment_loop =
+                EnvironmentLoop::new(ACTOR, ActorIncarnation(0), Simulators::new(courses), agent);
+            Service::new(&identity, &config, ACTOR, &told_to_end).serve(&mut environment_loop)
         }));
         started
     }
 
-    fn begin_life(&mut self) {
+    fn begin_incarnation(&mut self) {
         let directory = RunDirectory::new(self.directory.path());
-        let seat = LearnerSeat::take(&directory, &self.identity).unwrap();
-        let ports = LearnerPorts::open(&self.identity, seat.life(), &self.config).unwrap();
-        self.learner = Some((ports, seat));
+        let lock = LearnerLock::take(&directory, &self.identity).unwrap();
+        let ports = LearnerPorts::open(&self.identity, lock.incarnation(), &self.config).unwrap();
+        self.learner = Some((ports, lock));
     }
 
     fn learner(&self) -> &LearnerPorts {
@@ -71,14 +72,14 @@ impl Run {
     fn ticket(&self, version: u64) -> Ticket {
         Ticket {
             run: self.identity.run,
-            flight: FlightId(4),
+            episode: EpisodeId(4),
             attempt: Attempt(0),
             policy_version: PolicyVersion(version),
             course: CourseChoice::Training,
             start_level: 1,
             exploration: Exploration::Sample,
             seed: 6,
-            leg: None,
+            segment: None,
         }
     }
 
@@ -114,7 +115,7 @@ impl Run {
         })
     }
 
-    fn joined(&self) -> Incarnation {
+    fn joined(&self) -> ActorIncarnation {
         self.until_status("an actor", |status| status.state == ActorState::Serving)
             .incarnation
     }
@@ -140,12 +141,12 @@ fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
     let incarnation = run.joined();
     run.publish(1);
     let ticket = run.ticket(1);
-    // For another life of this actor: not to be flown.
+    // For another incarnation of this actor: not to be flown.
     let other = Ticket {
-        flight: FlightId(99),
+        episode: EpisodeId(99),
         ..ticket.clone()
     };
-    run.say(ControlRecord::fly(&other, ACTOR, Incarnation(1)));
+    run.say(ControlRecord::fly(&other, ACTOR, ActorIncarnation(1)));
     run.say(ControlRecord::fly(&ticket, ACTOR, incarnation));
     let mut steps = 0;
     for step in 0.. {
@@ -159,10 +160,10 @@ fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
     }
     run.say(ControlRecord::stop(run.identity.run));
     let last = run.until_status("the last word", |status| status.state == ActorState::Leaving);
-    assert_eq!((last.flights_flown, last.newest_policy), (1, Some(PolicyVersion(1))));
+    assert_eq!((last.episodes_flown, last.newest_policy), (1, Some(PolicyVersion(1))));
     let done = [
         Stage::TakeSnapshot,
-        Stage::TakeOff,
+        Stage::Reset,
         Stage::Physics,
         Stage::Camera,
         Stage::Encoder,
@@ -186,7 +187,7 @@ fn a_ticket_waits_for_its_snapshot_and_no_other_is_flown_in_its_stead() {
     run.until_status("the first snapshot", |status| {
         status.newest_policy == Some(PolicyVersion(1))
     });
-    run.until_status("a sign of life later", |_| true);
+    run.until_status("a heartbeat later", |_| true);
     assert!(run.learner().receive_transition().unwrap().is_none());
     run.publish(2);
     let record = run.until("a record", || run.learner().receive_transition().unwrap());
@@ -242,25 +243,25 @@ fn heartbeats_keep_an_actor_and_a_signal_ends_it() {
 }
 
 #[test]
-fn an_actor_joins_the_learners_next_life_with_nothing_of_the_former_one() {
+fn an_actor_joins_the_learners_next_incarnation_with_nothing_of_the_former_one() {
     let mut run = Run::start(30.0);
     let former = run.joined();
-    // Waits for a snapshot that never comes, and would be flown in the next life if it were taken along.
+    // Waits for a snapshot that never comes, and would be flown in the next incarnation if it were taken along.
     run.say(ControlRecord::fly(&run.ticket(2), ACTOR, former));
     run.publish(1);
     run.until_status("the first snapshot", |status| {
         status.newest_policy == Some(PolicyVersion(1))
     });
     run.learner = None;
-    run.begin_life();
-    let status = run.until_status("the actor in the next life", |_| true);
+    run.begin_incarnation();
+    let status = run.until_status("the actor in the next incarnation", |_| true);
     assert!(status.incarnation > former);
     assert_eq!(status.newest_policy, None);
     run.publish(2);
     run.until_status("the second snapshot", |status| {
         status.newest_policy == Some(PolicyVersion(2))
     });
-    run.until_status("a sign of life later", |_| true);
+    run.until_status("a heartbeat later", |_| true);
     assert!(run.learner().receive_transition().unwrap().is_none());
     run.say(ControlRecord::fly(&run.ticket(2), ACTOR, status.incarnation));
     let record = run.until("a record", || run.learner().receive_transition().unwrap());

@@ -29,11 +29,11 @@ pub struct Standing {
     pub name: String,
     /// What is done for it.
     pub stage: Stage,
-    /// Training flights learned from.
-    pub flights: u64,
-    /// Training flights of the whole run.
-    pub total_flights: u64,
-    /// Walls passed a flight over the last window; `None` before there is a flight.
+    /// Training episodes learned from.
+    pub episodes: u64,
+    /// Training episodes of the whole run.
+    pub total_episodes: u64,
+    /// Walls passed an episode over the last window; `None` before there is an episode.
     pub walls_passed: Option<f64>,
 }
 
@@ -44,10 +44,10 @@ pub struct Progress {
     pub complete: usize,
     /// Runs in the whole experiment.
     pub runs: usize,
-    /// Training flights learned from, in all runs.
-    pub flights: u64,
-    /// Training flights of the whole experiment.
-    pub total_flights: u64,
+    /// Training episodes learned from, in all runs.
+    pub episodes: u64,
+    /// Training episodes of the whole experiment.
+    pub total_episodes: u64,
     /// The runs under way.
     pub under_way: Vec<Standing>,
 }
@@ -56,8 +56,8 @@ pub struct Progress {
 pub struct Board {
     surface: Surface,
     started: Instant,
-    /// Flights that were there when it started.
-    first_flights: Option<u64>,
+    /// Episodes that were there when it started.
+    first_episodes: Option<u64>,
 }
 
 enum Surface {
@@ -72,18 +72,18 @@ impl Board {
         Self {
             surface,
             started: Instant::now(),
-            first_flights: None,
+            first_episodes: None,
         }
     }
 
     /// Shows where the experiment is.
     pub fn show(&mut self, progress: &Progress) {
-        let first = *self.first_flights.get_or_insert(progress.flights);
+        let first = *self.first_episodes.get_or_insert(progress.episodes);
         let head = head(progress, self.started.elapsed().as_secs_f64(), first);
         match &mut self.surface {
             Surface::Terminal(bar) => {
-                bar.set_length(progress.total_flights);
-                bar.set_position(progress.flights);
+                bar.set_length(progress.total_episodes);
+                bar.set_position(progress.episodes);
                 bar.set_message(format!("{head}{}", lines(&progress.under_way)));
             }
             Surface::Plain { last } => {
@@ -118,17 +118,17 @@ impl Default for Board {
     }
 }
 
-fn head(progress: &Progress, elapsed_secs: f64, first_flights: u64) -> String {
+fn head(progress: &Progress, elapsed_secs: f64, first_episodes: u64) -> String {
     let Progress {
         complete,
         runs,
-        flights,
-        total_flights,
+        episodes,
+        total_episodes,
         ..
     } = *progress;
     let mut text = format!("{complete} of {runs} runs complete · {}", Clock(elapsed_secs));
-    let pace = flights.saturating_sub(first_flights) as f64 / elapsed_secs;
-    let left = total_flights.saturating_sub(flights) as f64;
+    let pace = episodes.saturating_sub(first_episodes) as f64 / elapsed_secs;
+    let left = total_episodes.saturating_sub(episodes) as f64;
     if pace > 0.0 && left > 0.0 {
         let _ = write!(text, ", some {} left", Clock(left / pace));
     }
@@ -151,9 +151,9 @@ impl Standing {
         if self.stage == Stage::Suite {
             return "flying the suite".to_owned();
         }
-        let mut text = match self.flights >= self.total_flights {
+        let mut text = match self.episodes >= self.total_episodes {
             true => "evaluating".to_owned(),
-            false => format!("flight {}/{}", self.flights, self.total_flights),
+            false => format!("episode {}/{}", self.episodes, self.total_episodes),
         };
         if let Some(walls) = self.walls_passed {
             let _ = write!(text, ", walls passed {walls:.2}");
@@ -167,37 +167,37 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_left_follows_from_the_flights_of_this_session() {
+    fn what_is_left_follows_from_the_episodes_of_this_session() {
         let progress = Progress {
             complete: 3,
             runs: 12,
-            flights: 600,
-            total_flights: 1100,
+            episodes: 600,
+            total_episodes: 1100,
             under_way: vec![
                 Standing {
                     name: "none/seed-2".to_owned(),
                     stage: Stage::Training,
-                    flights: 50,
-                    total_flights: 100,
+                    episodes: 50,
+                    total_episodes: 100,
                     walls_passed: Some(1.234),
                 },
                 Standing {
                     name: "half/seed-10".to_owned(),
                     stage: Stage::Training,
-                    flights: 100,
-                    total_flights: 100,
+                    episodes: 100,
+                    total_episodes: 100,
                     walls_passed: None,
                 },
                 Standing {
                     name: "half/seed-9".to_owned(),
                     stage: Stage::Suite,
-                    flights: 100,
-                    total_flights: 100,
+                    episodes: 100,
+                    total_episodes: 100,
                     walls_passed: Some(4.5),
                 },
             ],
         };
-        // 300 flights were there before; the other 300 took 60 s.
+        // 300 episodes were there before; the other 300 took 60 s.
         assert_eq!(
             head(&progress, 60.0, 300),
             "3 of 12 runs complete · 1:00, some 1:40 left"
@@ -205,7 +205,7 @@ mod tests {
         assert_eq!(head(&progress, 60.0, 600), "3 of 12 runs complete · 1:00");
         assert_eq!(
             lines(&progress.under_way),
-            "\n  none/seed-2   flight 50/100, walls passed 1.23\n  half/seed-10  evaluating\n  half/seed-9   flying the suite"
+            "\n  none/seed-2   episode 50/100, walls passed 1.23\n  half/seed-10  evaluating\n  half/seed-9   flying the suite"
         );
     }
 }

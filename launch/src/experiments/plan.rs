@@ -97,9 +97,9 @@ pub struct Claim {
 
 /// Where in `runs` the experiment lies. One that is shortened by an option of the command has a place of its own, so that trying it out is never in its
 /// way.
-pub fn root(runs: &Path, experiment: &Experiment, flights: Option<u64>) -> PathBuf {
-    runs.join(match flights {
-        Some(flights) => format!("{}_{flights}_flights", experiment.name),
+pub fn root(runs: &Path, experiment: &Experiment, episodes: Option<u64>) -> PathBuf {
+    runs.join(match episodes {
+        Some(episodes) => format!("{}_{episodes}_episodes", experiment.name),
         None => experiment.name.clone(),
     })
 }
@@ -292,7 +292,7 @@ mod tests {
     }
 
     const SUMMARY: &str = r#"{"skein_version":"0","run":7,"seed":2,"ending":"ENDING","policy_sha256":"","final_version":8,"best_version":7,
-        "best_confirmed_walls_passed":4.9,"flights":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_flights":4,
+        "best_confirmed_walls_passed":4.9,"episodes":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_episodes":4,
         "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
 
     fn begin(run: &PlannedRun, experiment: &Experiment) {
@@ -343,10 +343,10 @@ mod tests {
     fn a_run_is_complete_when_its_suite_was_flown_and_not_another() {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().join("runs");
-        let suite = |flights: u64| {
+        let suite = |episodes: u64| {
             let course = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/courses/training.toml");
             let text =
-                format!("name = \"few\"\nflights = {flights}\n[[entry]]\nname = \"12345\"\ncourse = {course:?}\n");
+                format!("name = \"few\"\nepisodes = {episodes}\n[[entry]]\nname = \"12345\"\ncourse = {course:?}\n");
             fs::write(folder.path().join("few.toml"), text).unwrap();
             let experiment = experiment_with(folder.path(), "0.25", "tables = [\"suite\"]\nsuite = \"few.toml\"");
             (Plan::new(&experiment, &root, 1).unwrap(), experiment)

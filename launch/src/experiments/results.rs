@@ -12,7 +12,7 @@ use super::definition::{Axis, Measure};
 use super::plan::{Plan, PlannedRun, State};
 use super::statistics::{dispersion_across_time, drawdowns, level, volatility};
 use crate::reports::ReportError;
-use crate::reports::curves::{FlightRow, read_flights, trailing_mean};
+use crate::reports::curves::{EpisodeRow, read_episodes, trailing_mean};
 
 /// A run that is complete.
 #[derive(Debug)]
@@ -27,8 +27,8 @@ pub struct RunResult {
     pub evaluation: EvaluationReport,
     /// How it flew the experiment's suite, if it has one and this was flown.
     pub suite: Option<EvaluationReport>,
-    /// Its training flights, in order.
-    pub(super) flights: Vec<FlightRow>,
+    /// Its training episodes, in order.
+    pub(super) episodes: Vec<EpisodeRow>,
     window: usize,
     warmup_steps: u64,
 }
@@ -52,9 +52,9 @@ pub enum ResultError {
         /// What is wrong with it.
         problem: String,
     },
-    /// Its flights cannot be read.
+    /// Its episodes cannot be read.
     #[error(transparent)]
-    Flights(#[from] ReportError),
+    Episodes(#[from] ReportError),
 }
 
 /// The runs of `plan` that are complete, in its order.
@@ -81,8 +81,8 @@ impl RunResult {
             summary: of_training(&run.directory.summary_json())?,
             evaluation: of_training(&run.directory.evaluation_json())?,
             suite: None,
-            flights: read_flights(&run.directory.flights_csv())?,
-            window: evaluation.window_flights as usize,
+            episodes: read_episodes(&run.directory.episodes_csv())?,
+            window: evaluation.window_episodes as usize,
             warmup_steps: learning.warmup_steps as u64,
         })
     }
@@ -95,24 +95,24 @@ impl RunResult {
         Ok(self)
     }
 
-    /// Walls passed a flight over the last window of training flights; `None` if there were none.
+    /// Walls passed an episode over the last window of training episodes; `None` if there were none.
     pub fn final_walls_passed(&self) -> Option<f64> {
         trailing_mean(&self.values(Measure::WallsPassed), self.window).pop()
     }
 
-    /// Return of a flight over the last window of training flights; `None` if there were none.
+    /// Return of an episode over the last window of training episodes; `None` if there were none.
     pub fn final_return(&self) -> Option<f64> {
         trailing_mean(&self.values(Measure::Return), self.window).pop()
     }
 
-    /// Training flights until the average over a window of them first came to one wall passed; `None` if it never did. The rise itself: whether the agent is
+    /// Training episodes until the average over a window of them first came to one wall passed; `None` if it never did. The rise itself: whether the agent is
     /// trained is looked at in confirmations alone, which are far apart.
     pub fn one_wall_after(&self) -> Option<f64> {
-        let mut curve = self.curve(Measure::WallsPassed, Axis::Flights).into_iter();
-        curve.find(|(_, walls)| *walls >= 1.0).map(|(flights, _)| flights)
+        let mut curve = self.curve(Measure::WallsPassed, Axis::Episodes).into_iter();
+        curve.find(|(_, walls)| *walls >= 1.0).map(|(episodes, _)| episodes)
     }
 
-    /// Walls passed a flight that training came to; see [`level`].
+    /// Walls passed an episode that training came to; see [`level`].
     pub fn level(&self) -> Option<f64> {
         level(&self.values(Measure::WallsPassed), self.window)
     }
@@ -127,13 +127,13 @@ impl RunResult {
         dispersion_across_time(&self.values(Measure::WallsPassed), self.window)
     }
 
-    /// How far the walls passed over a window of training flights ever fell below the most they had been; `None` if there was no whole window.
+    /// How far the walls passed over a window of training episodes ever fell below the most they had been; `None` if there was no whole window.
     pub fn largest_drawdown(&self) -> Option<f64> {
-        let fallen = self.curve(Measure::Drawdown, Axis::Flights).into_iter();
+        let fallen = self.curve(Measure::Drawdown, Axis::Episodes).into_iter();
         fallen.map(|(_, below)| below).max_by(f64::total_cmp)
     }
 
-    /// The average of `measure` over each whole window of training flights, at the flights, steps or updates that were behind it then.
+    /// The average of `measure` over each whole window of training episodes, at the episodes, steps or updates that were behind it then.
     pub fn curve(&self, measure: Measure, over: Axis) -> Vec<(f64, f64)> {
         let partial = self.window.saturating_sub(1);
         let means = trailing_mean(&self.values(measure), self.window);
@@ -146,27 +146,27 @@ impl RunResult {
     }
 
     fn values(&self, measure: Measure) -> Vec<f64> {
-        self.flights
+        self.episodes
             .iter()
-            .map(|flight| match measure {
-                Measure::WallsPassed | Measure::Drawdown => f64::from(flight.walls_passed),
-                Measure::Return => flight.episode_return,
+            .map(|episode| match measure {
+                Measure::WallsPassed | Measure::Drawdown => f64::from(episode.walls_passed),
+                Measure::Return => episode.episode_return,
             })
             .collect()
     }
 
-    /// What was behind the run after each of its flights. Updates follow from steps: each step after the warm-up brings the same number of them.
+    /// What was behind the run after each of its episodes. Updates follow from steps: each step after the warm-up brings the same number of them.
     fn places(&self, over: Axis) -> Vec<f64> {
         let mut steps = 0;
         let learned_steps = self.summary.steps.saturating_sub(self.warmup_steps).max(1);
         let updates_per_step = self.summary.updates as f64 / learned_steps as f64;
-        self.flights
+        self.episodes
             .iter()
             .enumerate()
-            .map(|(number, flight)| {
-                steps += u64::from(flight.steps);
+            .map(|(number, episode)| {
+                steps += u64::from(episode.steps);
                 match over {
-                    Axis::Flights => (number + 1) as f64,
+                    Axis::Episodes => (number + 1) as f64,
                     Axis::Steps => steps as f64,
                     Axis::Updates => steps.saturating_sub(self.warmup_steps) as f64 * updates_per_step,
                 }

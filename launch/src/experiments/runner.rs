@@ -25,7 +25,7 @@ use crate::display::Clock;
 use crate::experiments::results::{RunResult, of_suite};
 use crate::interrupts::INTERRUPTED;
 use crate::orphans::signal_when_orphaned;
-use crate::reports::curves::{FlightRow, trailing_mean};
+use crate::reports::curves::{EpisodeRow, trailing_mean};
 use crate::supervisor::log_tail::log_tail;
 
 /// Between two looks at the runs under way.
@@ -174,7 +174,7 @@ fn fly(suite: &FlownSuite, run: &PlannedRun, evaluate: &Path) -> io::Result<Chil
     command.arg("--run").arg(run.directory.root());
     command.arg("--suite").arg(&suite.path);
     if let Some(each) = suite.each {
-        command.args(["--flights", &each.to_string()]);
+        command.args(["--episodes", &each.to_string()]);
     }
     command.arg("--json").arg(unfinished(&result));
     command.args(["--threads", "1"]);
@@ -308,25 +308,25 @@ impl Session {
 /// What there is of every run.
 struct Tally {
     complete: usize,
-    /// Training flights learned from, by the place of the run in the plan.
-    flights: Vec<u64>,
+    /// Training episodes learned from, by the place of the run in the plan.
+    episodes: Vec<u64>,
 }
 
 impl Tally {
     fn of(plan: &Plan) -> Self {
-        let flights = |run: &PlannedRun| match run.state {
-            State::Trained | State::Complete => run.config.run.flights,
+        let episodes = |run: &PlannedRun| match run.state {
+            State::Trained | State::Complete => run.config.run.episodes,
             State::New => 0,
             State::Begun | State::UnderWay => flown(&run.directory).len() as u64,
         };
         Self {
             complete: plan.count(State::Complete),
-            flights: plan.runs.iter().map(flights).collect(),
+            episodes: plan.runs.iter().map(episodes).collect(),
         }
     }
 
     fn ended(&mut self, one: &UnderWay<'_>, state: State) {
-        self.flights[one.place] = flown(&one.run.directory).len() as u64;
+        self.episodes[one.place] = flown(&one.run.directory).len() as u64;
         self.complete += usize::from(state == State::Complete);
     }
 
@@ -334,33 +334,33 @@ impl Tally {
         let mut standings = Vec::with_capacity(under_way.len());
         for &UnderWay { place, run, stage, .. } in under_way {
             let walls = flown(&run.directory);
-            self.flights[place] = walls.len() as u64;
+            self.episodes[place] = walls.len() as u64;
             standings.push(Standing {
                 name: run.name.clone(),
                 stage,
-                flights: walls.len() as u64,
-                total_flights: run.config.run.flights,
-                walls_passed: trailing_mean(&walls, run.config.evaluation.window_flights as usize).pop(),
+                episodes: walls.len() as u64,
+                total_episodes: run.config.run.episodes,
+                walls_passed: trailing_mean(&walls, run.config.evaluation.window_episodes as usize).pop(),
             });
         }
         Progress {
             complete: self.complete,
             runs: plan.runs.len(),
-            flights: self.flights.iter().sum(),
-            total_flights: plan.runs.iter().map(|run| run.config.run.flights).sum(),
+            episodes: self.episodes.iter().sum(),
+            total_episodes: plan.runs.iter().map(|run| run.config.run.episodes).sum(),
             under_way: standings,
         }
     }
 }
 
-/// Walls passed in each flight that a run has learned from so far. A row that is being written is left out.
+/// Walls passed in each episode that a run has learned from so far. A row that is being written is left out.
 fn flown(run: &RunDirectory) -> Vec<f64> {
-    let text = fs::read_to_string(run.flights_csv()).unwrap_or_default();
+    let text = fs::read_to_string(run.episodes_csv()).unwrap_or_default();
     let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
     csv::Reader::from_reader(whole.as_bytes())
         .deserialize()
-        .map_while(|row: Result<FlightRow, _>| row.ok())
-        .map(|flight| f64::from(flight.walls_passed))
+        .map_while(|row: Result<EpisodeRow, _>| row.ok())
+        .map(|episode| f64::from(episode.walls_passed))
         .collect()
 }
 

@@ -106,12 +106,12 @@ mod tests {
     fn train(run: &PlannedRun, experiment: &Experiment) {
         prepare(&experiment.base, &run.overrides, run.directory.root(), ACTORS).unwrap();
         let summary = r#"{"skein_version":"0","run":7,"seed":2,"ending":"completed","policy_sha256":"","final_version":8,"best_version":7,
-            "best_confirmed_walls_passed":4.9,"flights":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_flights":4,
+            "best_confirmed_walls_passed":4.9,"episodes":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_episodes":4,
             "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
         fs::write(run.directory.summary_json(), summary).unwrap();
         let evaluation = r#"{"policy_version":7,"policy_sha256":"","courses":[]}"#;
         fs::write(run.directory.evaluation_json(), evaluation).unwrap();
-        fs::write(run.directory.flights_csv(), "steps,walls_passed,return\n4,2,1.0\n").unwrap();
+        fs::write(run.directory.episodes_csv(), "steps,walls_passed,return\n4,2,1.0\n").unwrap();
     }
 
     fn taken_over(plan: &mut Plan) -> Vec<String> {

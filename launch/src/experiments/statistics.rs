@@ -125,7 +125,7 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
 /// The curve has risen when a window first averages 0.9 of the [`level`] that it comes to.
 /// `None` when fewer than three windows follow.
 ///
-/// Where start levels are flown in turn, a window should be whole turns of them (50 flights of 5 levels, 10 each): otherwise the turns themselves show.
+/// Where start levels are flown in turn, a window should be whole turns of them (50 episodes of 5 levels, 10 each): otherwise the turns themselves show.
 pub fn volatility(values: &[f64], window: usize) -> Option<f64> {
     let differences = differences_once_risen(values, window)?;
     let squares: f64 = differences.iter().map(|difference| difference.powi(2)).sum();

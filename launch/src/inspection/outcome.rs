@@ -14,7 +14,7 @@ use super::curves::{Curves, read_curves};
 
 /// Curves that tell of the machine and of what happened to the processes, not of what was learned: their values differ between any two runs.
 const OF_THE_MACHINE: [&str; 3] = ["rate/", "reissued/", "refused/"];
-/// The column of `flights.csv` that says who flew.
+/// The column of `episodes.csv` that says who flew.
 const WHO_FLEW: &str = "actor";
 
 /// One thing that two runs of one configuration and seed have in common.
@@ -32,7 +32,7 @@ pub fn compare(calm: &RunDirectory, other: &RunDirectory) -> Vec<Check> {
     let checks: [(&'static str, Compare); 8] = [
         ("policy_sha256", policies),
         ("summary.json, what was learned", summaries),
-        ("flights.csv, but for the actor", flights),
+        ("episodes.csv, but for the actor", episodes),
         ("best.safetensors", |calm, other| {
             snapshots(&calm.best_snapshot(), &other.best_snapshot())
         }),
@@ -42,8 +42,11 @@ pub fn compare(calm: &RunDirectory, other: &RunDirectory) -> Vec<Check> {
         ("evaluation.json", |calm, other| {
             bytes(&calm.evaluation_json(), &other.evaluation_json())
         }),
-        ("evaluation_paths.csv", |calm, other| {
-            bytes(&calm.evaluation_paths_csv(), &other.evaluation_paths_csv())
+        ("evaluation_trajectories.csv", |calm, other| {
+            bytes(
+                &calm.evaluation_trajectories_csv(),
+                &other.evaluation_trajectories_csv(),
+            )
         }),
         ("TensorBoard, every point once", curves),
     ];
@@ -79,9 +82,9 @@ fn policies(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String>
 fn summaries(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String> {
     let learned = |of: &Summary| {
         format!(
-            "{:?}: {} flights, {} steps, {} updates, {} VAE updates, version {}, best {:?} with {:?} walls passed",
+            "{:?}: {} episodes, {} steps, {} updates, {} VAE updates, version {}, best {:?} with {:?} walls passed",
             of.ending,
-            of.flights,
+            of.episodes,
             of.steps,
             of.updates,
             of.vae_updates,
@@ -103,9 +106,9 @@ fn rows(path: &Path) -> Result<(StringRecord, Vec<StringRecord>), String> {
     Ok((header, rows))
 }
 
-fn flights(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String> {
-    let (calm_header, calm_rows) = rows(&calm.flights_csv())?;
-    let (other_header, other_rows) = rows(&other.flights_csv())?;
+fn episodes(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String> {
+    let (calm_header, calm_rows) = rows(&calm.episodes_csv())?;
+    let (other_header, other_rows) = rows(&other.episodes_csv())?;
     if calm_header != other_header {
         return Err(format!("columns {other_header:?} instead of {calm_header:?}"));
     }
@@ -184,12 +187,12 @@ fn compare_curves(calm: &Curves, other: &Curves) -> Result<(), String> {
 mod tests {
     use super::*;
 
-    const HEADER: &str = "flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n";
+    const HEADER: &str = "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n";
 
     fn run_with(rows: &str) -> (tempfile::TempDir, RunDirectory) {
         let folder = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(folder.path());
-        fs::write(run.flights_csv(), format!("{HEADER}{rows}")).unwrap();
+        fs::write(run.episodes_csv(), format!("{HEADER}{rows}")).unwrap();
         (folder, run)
     }
 
@@ -197,11 +200,11 @@ mod tests {
     fn who_flew_is_no_difference_and_anything_else_is() {
         let (_calm, calm) = run_with("0,0,0,0,1,20,1,0.5,collided\n1,0,0,1,1,20,1,0.5,collided\n");
         let (_other, other) = run_with("0,0,0,7,1,20,1,0.5,collided\n1,0,0,7,1,20,1,0.5,collided\n");
-        assert_eq!(flights(&calm, &other), Ok("2 rows".to_owned()));
+        assert_eq!(episodes(&calm, &other), Ok("2 rows".to_owned()));
         let (_short, short) = run_with("0,0,0,7,1,20,1,0.5,collided\n");
-        assert!(flights(&calm, &short).is_err());
+        assert!(episodes(&calm, &short).is_err());
         let (_changed, changed) = run_with("0,0,0,7,1,20,1,0.5,collided\n1,0,0,7,1,20,1,0.50000006,collided\n");
-        assert!(flights(&calm, &changed).unwrap_err().contains("row 1"));
+        assert!(episodes(&calm, &changed).unwrap_err().contains("row 1"));
     }
 
     fn curves_of(points: &[(&str, i64, f32)]) -> Curves {

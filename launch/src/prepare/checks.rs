@@ -44,9 +44,9 @@ pub(crate) fn check(config_file: &Path, config: &Config, actors: usize) -> Resul
             check_level_count(config_file, config, &course, &"[simulator.generator] wall_x_m")?;
         }
     }
-    let records = config.transport.max_records_per_flight;
+    let records = config.transport.max_records_per_episode;
     if settings.max_steps as usize + 1 > records {
-        return Err(PrepareError::FlightTooLong {
+        return Err(PrepareError::EpisodeTooLong {
             max_steps: settings.max_steps,
             records,
         });

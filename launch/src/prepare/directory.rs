@@ -1,4 +1,4 @@
-//! The directory of a new run: created, filled with copies, and taken back if the run does not come to life.
+//! The directory of a new run: created, filled with copies, and taken back if the run does not come to incarnation.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;

@@ -45,13 +45,13 @@ pub enum PrepareError {
         #[source]
         source: RangesError,
     },
-    /// A flight may become longer than an actor can send.
+    /// An episode may become longer than an actor can send.
     #[error(
-        "[simulator] max_steps = {max_steps} makes flights of up to {} records, but transport.max_records_per_flight = {records}: set it to {} or more",
+        "[simulator] max_steps = {max_steps} makes episodes of up to {} records, but transport.max_records_per_episode = {records}: set it to {} or more",
         max_steps + 1,
         max_steps + 1
     )]
-    FlightTooLong {
+    EpisodeTooLong {
         /// The simulator's limit.
         max_steps: u32,
         /// The transport's limit.
@@ -59,7 +59,7 @@ pub enum PrepareError {
     },
     /// Training would start from a level that its course does not have.
     #[error(
-        "{}: learning.levels = {levels} is more than the {walls} walls of {}: no flight could start from the last level; set it to {walls} or fewer",
+        "{}: learning.levels = {levels} is more than the {walls} walls of {}: no episode could start from the last level; set it to {walls} or fewer",
         config.display(),
         course
     )]

@@ -1,4 +1,4 @@
-//! Whether the machine has room for a run: shared memory that is used up ends a process with SIGBUS in the middle of a flight, a full disk stops the
+//! Whether the machine has room for a run: shared memory that is used up ends a process with SIGBUS in the middle of an episode, a full disk stops the
 //! learner until there is room again. Both can be foreseen.
 
 use std::path::{Path, PathBuf};
@@ -118,8 +118,8 @@ pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
 /// Bytes of a checkpoint when the replay buffer is as full as it can become, with the depth images that are learned from.
 fn checkpoint_bytes(config: &Config) -> u64 {
     let learning = &config.learning;
-    let records = (config.transport.max_records_per_flight * learning.times_stored()) as u64;
-    let rows = (config.replay.capacity as u64).min(config.run.flights.saturating_mul(records));
+    let records = (config.transport.max_records_per_episode * learning.times_stored()) as u64;
+    let rows = (config.replay.capacity as u64).min(config.run.episodes.saturating_mul(records));
     let told = match learning.critic_input {
         CriticInput::Observation => 0,
         CriticInput::GroundTruth => TRUE_STATE,
@@ -129,8 +129,8 @@ fn checkpoint_bytes(config: &Config) -> u64 {
         EncoderTraining::Vae => config.vae.train_steps * learning.times_stored(),
         EncoderTraining::EndToEnd => config.replay.capacity,
     };
-    let images = 2 * steps as u64 + learning.flights_per_epoch * records;
-    let images = images.min(config.run.flights.saturating_mul(records));
+    let images = 2 * steps as u64 + learning.episodes_per_epoch * records;
+    let images = images.min(config.run.episodes.saturating_mul(records));
     let snapshot = 4 * SnapshotLayout::of(config).values() as u64;
     rows * row + images * IMAGE_PIXELS as u64 + CHECKPOINT_SNAPSHOTS * snapshot
 }

@@ -87,7 +87,7 @@ fn what_cannot_run_is_refused_before_anything_is_created() {
             "[simulator]\nmax_steps = 256",
             "",
             1,
-            vec!["max_steps = 256", "transport.max_records_per_flight = 256", "257"],
+            vec!["max_steps = 256", "transport.max_records_per_episode = 256", "257"],
         ),
         (
             "",
@@ -105,7 +105,7 @@ fn what_cannot_run_is_refused_before_anything_is_created() {
             "",
             "simulator.max_steps=256",
             1,
-            vec!["with --set simulator.max_steps=256, ", "max_records_per_flight"],
+            vec!["with --set simulator.max_steps=256, ", "max_records_per_episode"],
         ),
         (
             "[learning]\nlevels = 6",

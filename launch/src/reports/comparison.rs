@@ -136,7 +136,7 @@ impl Comparison<'_> {
             values.extend([low, high]);
         }
         let (low, high) = padded_range(&values);
-        // What cannot be negative has no axis below nought.
+        // What cannot be negative has no axis below zero.
         let is_negative = values.iter().any(|value| *value < 0.0);
         (0.0..self.furthest().max(1.0), if is_negative { low } else { 0.0 }..high)
     }

@@ -1,4 +1,4 @@
-//! Return and walls passed over the training flights, as in the paper's figures 9 and 10.
+//! Return and walls passed over the training episodes, as in the paper's figures 9 and 10.
 
 use std::path::Path;
 
@@ -11,27 +11,27 @@ use super::canvas::{Area, Canvas, FAINT, GRID, INK, REFERENCE, STRONG, font, px}
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 640;
 
-/// The columns of `flights.csv` that are plotted, in flight order.
+/// The columns of `episodes.csv` that are plotted, in episode order.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
-pub(crate) struct FlightRow {
+pub(crate) struct EpisodeRow {
     /// Its environment steps.
     pub(crate) steps: u32,
-    /// Walls passed in the flight.
+    /// Walls passed in the episode.
     pub(crate) walls_passed: u32,
     /// Sum of its rewards, undiscounted.
     #[serde(rename = "return")]
     pub(crate) episode_return: f64,
 }
 
-/// No return is larger: a flight has at most 65536 records, of rewards up to `skein_protocol::transition::LARGEST_NUMBER`. An axis much longer than any
+/// No return is larger: an episode has at most 65536 records, of rewards up to `skein_protocol::transition::LARGEST_NUMBER`. An axis much longer than any
 /// return would take for ever to divide.
 const LARGEST_RETURN: f64 = 1e12;
 
-/// Reads `flights.csv`.
+/// Reads `episodes.csv`.
 ///
 /// # Errors
 /// [`ReportError::Malformed`] names the line.
-pub(crate) fn read_flights(path: &Path) -> Result<Vec<FlightRow>, ReportError> {
+pub(crate) fn read_episodes(path: &Path) -> Result<Vec<EpisodeRow>, ReportError> {
     let malformed = |problem: String| ReportError::Malformed {
         path: path.to_owned(),
         problem,
@@ -39,26 +39,26 @@ pub(crate) fn read_flights(path: &Path) -> Result<Vec<FlightRow>, ReportError> {
     let mut rows = csv::Reader::from_path(path)
         .map_err(|error| malformed(error.to_string()))?
         .into_deserialize();
-    let mut flights = Vec::new();
+    let mut episodes = Vec::new();
     while let Some(row) = rows.next() {
-        let row: FlightRow = row.map_err(|error| malformed(error.to_string()))?;
+        let row: EpisodeRow = row.map_err(|error| malformed(error.to_string()))?;
         if !(-LARGEST_RETURN..=LARGEST_RETURN).contains(&row.episode_return) {
             let (line, value) = (rows.reader().position().line() - 1, row.episode_return);
             return Err(malformed(format!("line {line}: a return of {value} is none")));
         }
-        flights.push(row);
+        episodes.push(row);
     }
-    Ok(flights)
+    Ok(episodes)
 }
 
-/// Draws the return of every flight and its moving average over `window` flights (paper, figure 9).
+/// Draws the return of every episode and its moving average over `window` episodes (paper, figure 9).
 ///
 /// # Errors
 /// [`ReportError`] if the picture cannot be drawn or written.
-pub(super) fn draw_return(flights: &[FlightRow], window: usize, path: &Path) -> Result<(), ReportError> {
-    let values: Vec<f64> = flights.iter().map(|flight| flight.episode_return).collect();
+pub(super) fn draw_return(episodes: &[EpisodeRow], window: usize, path: &Path) -> Result<(), ReportError> {
+    let values: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
     Curve {
-        title: "Return of the training flights".to_owned(),
+        title: "Return of the training episodes".to_owned(),
         y_label: "return",
         range: padded_range(&values),
         values,
@@ -69,20 +69,20 @@ pub(super) fn draw_return(flights: &[FlightRow], window: usize, path: &Path) -> 
     .save(path)
 }
 
-/// Draws the walls passed, averaged over `window` flights (paper, figure 10). `ideal` is what an agent that passes every wall would average: flights
+/// Draws the walls passed, averaged over `window` episodes (paper, figure 10). `ideal` is what an agent that passes every wall would average: episodes
 /// start at each of the levels in turn.
 ///
 /// # Errors
 /// [`ReportError`] if the picture cannot be drawn or written.
 pub(super) fn draw_walls_passed(
-    flights: &[FlightRow],
+    episodes: &[EpisodeRow],
     window: usize,
     ideal: f64,
     path: &Path,
 ) -> Result<(), ReportError> {
-    let values: Vec<f64> = flights.iter().map(|flight| f64::from(flight.walls_passed)).collect();
+    let values: Vec<f64> = episodes.iter().map(|episode| f64::from(episode.walls_passed)).collect();
     Curve {
-        title: format!("Walls passed, average over {window} flights"),
+        title: format!("Walls passed, average over {window} episodes"),
         y_label: "walls passed",
         range: (0.0, ideal * 1.15),
         values,
@@ -132,7 +132,7 @@ impl Curve {
     }
 
     fn draw(&self, area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
-        let flights = self.values.len().max(2);
+        let episodes = self.values.len().max(2);
         let (low, high) = self.range;
         let mut chart = ChartBuilder::on(area)
             .caption(&self.title, font(22))
@@ -140,7 +140,7 @@ impl Curve {
             .margin_right(px(28))
             .x_label_area_size(px(48))
             .y_label_area_size(px(64))
-            .build_cartesian_2d(1.0..flights as f64, low..high)?;
+            .build_cartesian_2d(1.0..episodes as f64, low..high)?;
         chart
             .configure_mesh()
             .label_style(font(16))
@@ -152,7 +152,7 @@ impl Curve {
             .y_labels(7)
             .x_label_formatter(&|x| format!("{x:.0}"))
             .y_label_formatter(&|y| format!("{}", (y * 100.0).round() / 100.0))
-            .x_desc("training flight")
+            .x_desc("training episode")
             .y_desc(self.y_label)
             .draw()?;
 
@@ -165,11 +165,11 @@ impl Curve {
                         .enumerate()
                         .map(|point| Circle::new(at(point), px(2), STRONG.mix(0.28).filled())),
                 )?
-                .label("one flight")
+                .label("one episode")
                 .legend(|(x, y)| Circle::new((x + px(12) as i32, y), px(3), STRONG.mix(0.4).filled()));
         }
         if let Some((level, label)) = &self.level {
-            let ends = [(1.0, *level), (flights as f64, *level)];
+            let ends = [(1.0, *level), (episodes as f64, *level)];
             chart
                 .draw_series(DashedLineSeries::new(ends, px(8), px(6), REFERENCE.stroke_width(px(2))))?
                 .label(label)
@@ -182,7 +182,7 @@ impl Curve {
         chart.draw_series(thick_line(&points[..filling], FAINT, px(2)))?;
         chart
             .draw_series(thick_line(&points[filling.saturating_sub(1)..], STRONG, px(2)))?
-            .label(format!("average over {} flights", self.window))
+            .label(format!("average over {} episodes", self.window))
             .legend(|point| legend_line(point, STRONG));
 
         chart
@@ -250,23 +250,23 @@ mod tests {
     #[test]
     fn a_damaged_row_is_named_by_its_line() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("flights.csv");
-        std::fs::write(&path, "flight,steps,walls_passed,return\n0,9,2,1.5\n1,9,two,1.5\n").unwrap();
-        let error = read_flights(&path).unwrap_err().to_string();
-        assert!(error.contains("flights.csv") && error.contains("line: 3"), "{error}");
+        let path = directory.path().join("episodes.csv");
+        std::fs::write(&path, "episode,steps,walls_passed,return\n0,9,2,1.5\n1,9,two,1.5\n").unwrap();
+        let error = read_episodes(&path).unwrap_err().to_string();
+        assert!(error.contains("episodes.csv") && error.contains("line: 3"), "{error}");
     }
 
     #[test]
     fn a_return_that_no_axis_could_show_is_named_by_its_line() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("flights.csv");
+        let path = directory.path().join("episodes.csv");
         for value in ["1e308", "-1e13", "inf", "nan"] {
             std::fs::write(
                 &path,
-                format!("flight,steps,walls_passed,return\n0,9,2,1.5\n1,9,2,{value}\n"),
+                format!("episode,steps,walls_passed,return\n0,9,2,1.5\n1,9,2,{value}\n"),
             )
             .unwrap();
-            let error = read_flights(&path).unwrap_err().to_string();
+            let error = read_episodes(&path).unwrap_err().to_string();
             assert!(error.contains("line 3: a return of"), "{error}");
         }
     }

@@ -5,9 +5,9 @@
 mod canvas;
 pub mod comparison;
 pub(crate) mod curves;
-mod flight_paths;
 pub mod growth;
 mod reconstructions;
+mod trajectories;
 
 use std::io;
 use std::path::PathBuf;
@@ -53,9 +53,9 @@ pub enum ReportError {
 /// What a run left to be drawn. A run that ended early has less.
 #[derive(Debug)]
 pub struct Material {
-    flights: Option<Vec<curves::FlightRow>>,
+    episodes: Option<Vec<curves::EpisodeRow>>,
     reconstructions: Option<reconstructions::Pairs>,
-    paths: Option<flight_paths::PathsByCourse>,
+    paths: Option<trajectories::PathsByCourse>,
 }
 
 impl Material {
@@ -65,14 +65,14 @@ impl Material {
     /// [`ReportError`] names the file that is there but cannot be used.
     pub fn read(run: &RunDirectory) -> Result<Self, ReportError> {
         Ok(Self {
-            flights: existing(run.flights_csv())
-                .map(|path| curves::read_flights(&path))
+            episodes: existing(run.episodes_csv())
+                .map(|path| curves::read_episodes(&path))
                 .transpose()?,
             reconstructions: existing(run.reconstructions())
                 .map(|path| reconstructions::Pairs::read(&path))
                 .transpose()?,
-            paths: existing(run.evaluation_paths_csv())
-                .map(|path| flight_paths::read_paths(&path))
+            paths: existing(run.evaluation_trajectories_csv())
+                .map(|path| trajectories::read_paths(&path))
                 .transpose()?,
         })
     }
@@ -80,7 +80,7 @@ impl Material {
 
 /// Draws every plot whose input the run left, and returns the pictures. A run that ended early has fewer.
 ///
-/// `courses` are those of the final evaluation; `window` is the number of flights averaged over, and `ideal_walls_passed` what a perfect agent would average.
+/// `courses` are those of the final evaluation; `window` is the number of episodes averaged over, and `ideal_walls_passed` what a perfect agent would average.
 ///
 /// # Errors
 /// [`ReportError`] names the file that is there but cannot be used, or the picture that cannot be written.
@@ -97,15 +97,15 @@ pub fn draw_all(
         pictures.push(path.clone());
         path
     };
-    if let Some(flights) = &material.flights {
-        curves::draw_return(flights, window, &picture("return.png"))?;
-        curves::draw_walls_passed(flights, window, ideal_walls_passed, &picture("walls_passed.png"))?;
+    if let Some(episodes) = &material.episodes {
+        curves::draw_return(episodes, window, &picture("return.png"))?;
+        curves::draw_walls_passed(episodes, window, ideal_walls_passed, &picture("walls_passed.png"))?;
     }
     if let Some(pairs) = &material.reconstructions {
         reconstructions::draw(pairs, &picture("reconstructions.png"))?;
     }
     if let Some(paths) = &material.paths {
-        flight_paths::draw(courses, paths, &picture("flight_paths.png"))?;
+        trajectories::draw(courses, paths, &picture("trajectories.png"))?;
     }
     Ok(pictures)
 }
@@ -134,20 +134,20 @@ mod tests {
         }
     }
 
-    fn write_flights(run: &RunDirectory) {
-        let rows = "flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
+    fn write_episodes(run: &RunDirectory) {
+        let rows = "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
                     0,0,0,0,1,12,0,-0.9,collided\n1,0,0,1,1,33,1,0.2,collided\n";
-        fs::write(run.flights_csv(), rows).unwrap();
+        fs::write(run.episodes_csv(), rows).unwrap();
     }
 
     #[test]
     fn a_whole_run_has_four_pictures() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
-        write_flights(&run);
+        write_episodes(&run);
         let rows =
-            "course,flight,step,x_m,y_m,z_m,outcome\ntraining,0,0,1.5,0,3,collided\ntraining,0,1,9.7,1,3,collided\n";
-        fs::write(run.evaluation_paths_csv(), rows).unwrap();
+            "course,episode,step,x_m,y_m,z_m,outcome\ntraining,0,0,1.5,0,3,collided\ntraining,0,1,9.7,1,3,collided\n";
+        fs::write(run.evaluation_trajectories_csv(), rows).unwrap();
         let image = vec![7; skein_protocol::IMAGE_PIXELS];
         let shape = vec![1, skein_protocol::IMAGE_HEIGHT, skein_protocol::IMAGE_WIDTH];
         let view = TensorView::new(Dtype::U8, shape, &image).unwrap();
@@ -171,7 +171,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         assert!(draw_all(&run, &[training()], 50, 3.0).unwrap().is_empty());
-        write_flights(&run);
+        write_episodes(&run);
         assert_eq!(draw_all(&run, &[training()], 50, 3.0).unwrap().len(), 2);
     }
 }

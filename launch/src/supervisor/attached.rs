@@ -1,4 +1,4 @@
-//! Actors that were added to a run under way. Its learner is none of their supervisor's business: they find it, and its next lives, by themselves.
+//! Actors that were added to a run under way. Its learner is none of their supervisor's business: they find it, and its next incarnations, by themselves.
 
 use skein_protocol::summary::Summary;
 use tokio::sync::mpsc;

@@ -14,12 +14,12 @@ use tokio::time::{Instant, sleep};
 use super::log_tail::log_tail;
 use super::memory::want_of_memory;
 use super::process::{Exit, Launch, Order, Output, reap};
-use super::restarts::{ActorDeaths, Life, Verdict};
+use super::restarts::{ActorDeaths, LearnerIncarnation, Verdict};
 use super::work::Work;
 use super::{Event, SupervisorError};
 use crate::prepare::room::free_shared_memory;
 
-/// A life that lasted so long was a good start, whether or not there are reports that show it.
+/// An incarnation that lasted so long was a good start, whether or not there are reports that show it.
 const GOOD_START: Duration = Duration::from_secs(10);
 
 /// The actors of one supervisor.
@@ -37,13 +37,13 @@ pub(super) struct Crew<'a> {
     warnings: VecDeque<String>,
 }
 
-/// One actor, through all its lives.
+/// One actor, through all its incarnations.
 struct Member {
     id: ActorId,
     state: State,
     deaths: ActorDeaths,
     standing: Standing,
-    /// What the run had done when the present life began.
+    /// What the run had done when the present incarnation began.
     work_before: Option<Work>,
 }
 
@@ -68,16 +68,16 @@ struct Process {
 /// What is known of an actor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Standing {
-    /// No life of it has ever served.
+    /// No incarnation of it has ever served.
     Unknown,
-    /// It can do its work: some life of it has.
+    /// It can do its work: some incarnation of it has.
     Proven,
 }
 
 /// Why an actor is not started again for the time being.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum GivenUp {
-    /// It found no learner: another life would find none either.
+    /// It found no learner: another incarnation would find none either.
     LearnerGone,
     /// It failed too often.
     KeepsDying(String),
@@ -246,12 +246,14 @@ impl<'a> Crew<'a> {
             member.standing = Standing::Proven;
         }
         let want = want_of_memory(exit, free_shared_memory());
-        let life = match member.judge(work) {
+        let incarnation = match member.judge(work) {
             // Unless it was the supervisor, which kills only what no longer moves.
-            Life::InVain if want.is_some() || exit.is_a_kill() && told == Order::Run => Life::Interrupted,
-            life => life,
+            LearnerIncarnation::InVain if want.is_some() || exit.is_a_kill() && told == Order::Run => {
+                LearnerIncarnation::Interrupted
+            }
+            incarnation => incarnation,
         };
-        match member.deaths.died(Instant::now(), life) {
+        match member.deaths.died(Instant::now(), incarnation) {
             Verdict::RestartAfter(pause) => self.rest(number, &format!("{exit}{}", want.unwrap_or_default()), pause),
             Verdict::GiveUp => self.give_up(number, exit),
         }
@@ -344,12 +346,12 @@ impl<'a> Crew<'a> {
 }
 
 impl Member {
-    /// What a life of this member was good for that ended when the run had done `work`.
-    fn judge(&self, work: Option<Work>) -> Life {
+    /// What an incarnation of this member was good for that ended when the run had done `work`.
+    fn judge(&self, work: Option<Work>) -> LearnerIncarnation {
         match (work, self.standing) {
-            (None, Standing::Proven) => Life::Interrupted,
-            (Some(_), Standing::Proven) if self.work_before != work => Life::Served,
-            _ => Life::InVain,
+            (None, Standing::Proven) => LearnerIncarnation::Interrupted,
+            (Some(_), Standing::Proven) if self.work_before != work => LearnerIncarnation::Served,
+            _ => LearnerIncarnation::InVain,
         }
     }
 }

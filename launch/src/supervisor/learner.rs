@@ -1,4 +1,4 @@
-//! The learner of a run, through all its lives.
+//! The learner of a run, through all its incarnations.
 
 use std::time::Duration;
 
@@ -50,7 +50,7 @@ enum State {
 /// What a report shows beyond its figures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum News {
-    /// The learner is up: it is this life's first report.
+    /// The learner is up: it is this incarnation's first report.
     Up,
     /// More has been done since the last one.
     GetsOn,
@@ -107,7 +107,7 @@ impl<'a> Learner<'a> {
             let exit = reap(child, receiver).await;
             if let Some(mut said) = said {
                 let _ = timeout(LAST_WORDS, &mut said).await;
-                // Nothing of this life may be taken for a word of the next.
+                // Nothing of this incarnation may be taken for a word of the next.
                 said.abort();
             }
             let _ = events.send(Event::LearnerExited(exit)).await;
@@ -245,7 +245,7 @@ impl<'a> Learner<'a> {
         }
     }
 
-    /// What a learner that asks for another life says about it.
+    /// What a learner that asks for another incarnation says about it.
     fn reason_given(&self, exit: &Exit) -> String {
         (*exit == Exit::Status(EXIT_START_AGAIN.into()))
             .then(|| last_words(&self.plan.run.learner_log(), &self.plan.programs.learner))
@@ -253,7 +253,7 @@ impl<'a> Learner<'a> {
             .map_or(String::new(), |words| format!(" (\"{words}\")"))
     }
 
-    /// What its next life begins from.
+    /// What its next incarnation begins from.
     fn whence(&self) -> &'static str {
         match self.plan.run.newest_checkpoint() {
             Some(_) => "from its newest checkpoint",

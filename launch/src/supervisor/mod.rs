@@ -4,7 +4,7 @@
 //! a learner that will not come. Whoever dies is started again; a learner goes on from its newest checkpoint, and the actors, who stay alive, find it by
 //! themselves. Whoever is alive but gives no sign of it is killed first.
 //!
-//! The order of a stop matters: the learner is told first, because it abandons the flights in the air, saves what was learned and tells the actors
+//! The order of a stop matters: the learner is told first, because it abandons the episodes in the air, saves what was learned and tells the actors
 //! itself; only actors that are still there afterwards are ended from here. Every wait has a deadline, so that a stop always comes to an end, and
 //! every way out of this module leaves no process behind.
 //!
@@ -111,7 +111,7 @@ impl Deadlines {
         Self {
             // An overburdened machine may take so long; and killing what only is slow helps nobody.
             learner_start: Duration::from_secs(120),
-            // Actors wait for transport.learner_silence_secs and then leave: the rest of that time is for the next life to begin in.
+            // Actors wait for transport.learner_silence_secs and then leave: the rest of that time is for the next incarnation to begin in.
             learner_silence: Duration::from_secs_f64(
                 (config.transport.learner_silence_secs * 2.0 / 3.0).clamp(5.0, 60.0),
             ),

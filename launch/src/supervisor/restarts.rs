@@ -36,13 +36,13 @@ impl ActorDeaths {
     const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 
     /// Notes a death at `now` and decides what follows.
-    pub(super) fn died(&mut self, now: Instant, life: Life) -> Verdict {
+    pub(super) fn died(&mut self, now: Instant, incarnation: LearnerIncarnation) -> Verdict {
         self.recent.retain(|&death| now.duration_since(death) < Self::WINDOW);
         self.recent.push_back(now);
-        self.in_vain = match life {
-            Life::Served => 0,
-            Life::Interrupted => self.in_vain,
-            Life::InVain => self.in_vain + 1,
+        self.in_vain = match incarnation {
+            LearnerIncarnation::Served => 0,
+            LearnerIncarnation::Interrupted => self.in_vain,
+            LearnerIncarnation::InVain => self.in_vain + 1,
         };
         if self.in_vain >= Self::MAX_IN_VAIN {
             return Verdict::GiveUp;
@@ -53,9 +53,9 @@ impl ActorDeaths {
     }
 }
 
-/// What an actor's life was good for.
+/// What an actor's incarnation was good for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Life {
+pub(super) enum LearnerIncarnation {
     /// The learner heard of it, and the run got on meanwhile.
     Served,
     /// There was no learner to serve, or somebody killed it: that says nothing about the actor.
@@ -83,7 +83,7 @@ pub(super) struct LearnerDeaths {
 }
 
 impl LearnerDeaths {
-    /// Failures after which the run fails, if none of these lives got further than one before it. Not fewer, because a learner that dies before it has
+    /// Failures after which the run fails, if none of these incarnations got further than one before it. Not fewer, because a learner that dies before it has
     /// written a checkpoint may get no further by no fault of its own.
     pub(super) const MAX_WITHOUT_PROGRESS: u32 = 10;
     /// The longest pause, in first pauses.
@@ -99,7 +99,7 @@ impl LearnerDeaths {
         }
     }
 
-    /// Notes how far the run has come. Only what no life before has reached is progress: the rest is done over.
+    /// Notes how far the run has come. Only what no incarnation before has reached is progress: the rest is done over.
     pub(super) fn reached(&mut self, work: Work) {
         if self.furthest.is_none_or(|furthest| work > furthest) {
             // The first report of all shows where the run began, not that it gets on.
@@ -138,7 +138,7 @@ mod tests {
     fn pauses_double_until_the_actor_is_given_up() {
         let (mut deaths, start) = (ActorDeaths::default(), Instant::now());
         let verdicts: Vec<_> = (0..5)
-            .map(|second| deaths.died(start + Duration::from_secs(second), Life::InVain))
+            .map(|second| deaths.died(start + Duration::from_secs(second), LearnerIncarnation::InVain))
             .collect();
         let pause = |factor| Verdict::RestartAfter(ActorDeaths::FIRST_PAUSE * factor);
         assert_eq!(verdicts, [pause(1), pause(2), pause(4), pause(8), Verdict::GiveUp]);
@@ -148,13 +148,17 @@ mod tests {
     fn an_actor_that_serves_between_its_deaths_is_started_again_for_ever() {
         let (mut deaths, start) = (ActorDeaths::default(), Instant::now());
         for second in 0..1000 {
-            let life = if second % 4 == 0 { Life::Served } else { Life::InVain };
-            let verdict = deaths.died(start + Duration::from_secs(second), life);
+            let incarnation = if second % 4 == 0 {
+                LearnerIncarnation::Served
+            } else {
+                LearnerIncarnation::InVain
+            };
+            let verdict = deaths.died(start + Duration::from_secs(second), incarnation);
             assert_ne!(verdict, Verdict::GiveUp);
         }
-        let verdict = deaths.died(start + Duration::from_secs(1000), Life::Served);
+        let verdict = deaths.died(start + Duration::from_secs(1000), LearnerIncarnation::Served);
         assert_eq!(verdict, Verdict::RestartAfter(ActorDeaths::LONGEST_PAUSE));
-        let verdict = deaths.died(start + Duration::from_secs(1061), Life::Served);
+        let verdict = deaths.died(start + Duration::from_secs(1061), LearnerIncarnation::Served);
         assert_eq!(verdict, Verdict::RestartAfter(ActorDeaths::FIRST_PAUSE));
     }
 
@@ -162,7 +166,7 @@ mod tests {
     fn an_actor_is_not_blamed_for_a_learner_that_is_not_there() {
         let (mut deaths, now) = (ActorDeaths::default(), Instant::now());
         for _ in 0..100 {
-            assert_ne!(deaths.died(now, Life::Interrupted), Verdict::GiveUp);
+            assert_ne!(deaths.died(now, LearnerIncarnation::Interrupted), Verdict::GiveUp);
         }
     }
 
@@ -190,12 +194,12 @@ mod tests {
     }
 
     #[test]
-    fn only_what_no_life_before_reached_is_progress() {
+    fn only_what_no_incarnation_before_reached_is_progress() {
         let mut deaths = LearnerDeaths::new(Duration::from_secs(1));
         deaths.reached(Work::test(0));
-        for life in 0..1000 {
-            deaths.reached(Work::test(life));
-            deaths.reached(Work::test(life + 1));
+        for incarnation in 0..1000 {
+            deaths.reached(Work::test(incarnation));
+            deaths.reached(Work::test(incarnation + 1));
             assert_eq!(deaths.died(Cause::Failure), Verdict::RestartAfter(Duration::ZERO));
         }
         // It dies at the same place again and again, having done the same work each time.

@@ -142,7 +142,7 @@ impl<W: Watcher> Supervision<'_, W> {
         }
     }
 
-    /// Breaks unless there will be another life.
+    /// Breaks unless there will be another incarnation.
     fn learner_exited(&mut self, exit: &Exit) -> ControlFlow<()> {
         self.crew.learner_died();
         if *exit == Exit::SUCCESS || self.stop == Stop::AtOnce {

@@ -2,22 +2,22 @@
 
 use skein_protocol::progress::Progress;
 
-/// What a run has done so far. More work is greater: flights come first, then what is made of them.
+/// What a run has done so far. More work is greater: episodes come first, then what is made of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Work {
-    flights: u64,
+    episodes: u64,
     vae_updates: u64,
     updates: u64,
-    evaluation_flights: u64,
+    evaluation_episodes: u64,
 }
 
 impl Work {
     pub(super) fn of(progress: &Progress) -> Self {
         Self {
-            flights: progress.flights,
+            episodes: progress.episodes,
             vae_updates: progress.vae_updates,
             updates: progress.updates,
-            evaluation_flights: progress.evaluation_flights.0,
+            evaluation_episodes: progress.evaluation_episodes.0,
         }
     }
 
@@ -25,10 +25,10 @@ impl Work {
     #[cfg(test)]
     pub(super) fn test(updates: u64) -> Self {
         Self {
-            flights: 0,
+            episodes: 0,
             vae_updates: 0,
             updates,
-            evaluation_flights: 0,
+            evaluation_episodes: 0,
         }
     }
 }

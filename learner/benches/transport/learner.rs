@@ -1,4 +1,4 @@
-//! The learner's side: reception as in a run, with a training thread that only takes flights out.
+//! The learner's side: receiver as in a run, with a training thread that only takes episodes out.
 
 use std::collections::VecDeque;
 use std::hint::black_box;
@@ -7,13 +7,13 @@ use std::sync::atomic::AtomicBool;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use skein_learner::flight::CommittedFlight;
-use skein_learner::flights::assembly::Keep;
-use skein_learner::flights::reception::{Batch, Reception};
+use skein_learner::episode::CommittedEpisode;
+use skein_learner::episodes::assembly::Keep;
+use skein_learner::episodes::receiver::{Batch, EpisodeReceiver};
 use skein_learner::threads::cpu_secs;
 use skein_protocol::config::Config;
-use skein_protocol::ids::{Attempt, Epoch, FlightId, PolicyVersion};
-use skein_protocol::run::{LearnerSeat, RunDirectory, RunIdentity};
+use skein_protocol::ids::{Attempt, EpisodeId, Epoch, PolicyVersion};
+use skein_protocol::run::{LearnerLock, RunDirectory, RunIdentity};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::TransitionRecord;
 use tempfile::TempDir;
@@ -35,7 +35,7 @@ pub(crate) struct Load {
 
 /// What came of it.
 pub(crate) struct Throughput {
-    /// Records of flights that were taken out of their batches, whole and in order.
+    /// Records of episodes that were taken out of their batches, whole and in order.
     pub(crate) records_per_second: f64,
     /// Processor time of the receiving thread.
     pub(crate) thread_micros: f64,
@@ -45,16 +45,16 @@ pub(crate) struct Throughput {
     pub(crate) copy_micros: f64,
 }
 
-/// A learner, its actors, and the flights it has ordered.
+/// A learner, its actors, and the episodes it has ordered.
 pub(crate) struct Learner {
     identity: RunIdentity,
     directory: RunDirectory,
-    reception: Reception,
+    receiver: EpisodeReceiver,
     actors: Vec<Child>,
     batches: VecDeque<Batch>,
-    next_flight: u64,
+    next_episode: u64,
     // Last, for the others lie in it.
-    _seat: LearnerSeat,
+    _lock: LearnerLock,
     _folder: TempDir,
 }
 
@@ -68,15 +68,15 @@ impl Learner {
         config.sac.hidden_width = 8;
         directory.create(&config).unwrap();
         let (identity, config) = directory.open().unwrap();
-        let seat = LearnerSeat::take(&directory, &identity).unwrap();
+        let lock = LearnerLock::take(&directory, &identity).unwrap();
         Self {
-            reception: Reception::start(&identity, seat.life(), &config).unwrap(),
+            receiver: EpisodeReceiver::start(&identity, lock.incarnation(), &config).unwrap(),
             identity,
             directory,
             actors: Vec::new(),
             batches: VecDeque::new(),
-            next_flight: 0,
-            _seat: seat,
+            next_episode: 0,
+            _lock: lock,
             _folder: folder,
         }
     }
@@ -95,7 +95,7 @@ impl Learner {
             self.actors.push(actor);
         }
         let deadline = Instant::now() + PATIENCE;
-        while self.reception.shared().live_actors().len() < self.actors.len() {
+        while self.receiver.shared().live_actors().len() < self.actors.len() {
             assert!(Instant::now() < deadline, "not all of {count} actors have come");
             sleep(Duration::from_millis(5));
         }
@@ -104,17 +104,17 @@ impl Learner {
     /// What the learner's part in `load` costs.
     pub(crate) fn throughput(&mut self, load: &Load) -> Throughput {
         let copy_micros = copy_micros(load.measured / 4);
-        self.take_flights(load.keep, load.warm_up);
+        self.take_episodes(load.keep, load.warm_up);
         let cpu = || {
             let threads = cpu_secs();
-            (threads["reception"], threads.values().sum::<f64>())
+            (threads["receiver"], threads.values().sum::<f64>())
         };
         let (began, (thread_before, process_before)) = (Instant::now(), cpu());
-        let records = self.take_flights(load.keep, load.measured) as f64;
+        let records = self.take_episodes(load.keep, load.measured) as f64;
         let (took, (thread_after, process_after)) = (began.elapsed(), cpu());
         self.take_rest();
 
-        let faults = self.reception.shared().faults();
+        let faults = self.receiver.shared().faults();
         assert!(
             faults.reissued_by_reason().values().all(|&count| count == 0),
             "{faults:?}"
@@ -134,12 +134,12 @@ impl Learner {
 
     /// Sends the actors home, and ends.
     pub(crate) fn finish(mut self) {
-        self.reception.finish();
+        self.receiver.finish();
         await_ends(&mut self.actors);
     }
 
-    /// Orders flights and takes them out for so long; returns the number of their records.
-    fn take_flights(&mut self, keep: Keep, time: Duration) -> usize {
+    /// Orders episodes and takes them out for so long; returns the number of their records.
+    fn take_episodes(&mut self, keep: Keep, time: Duration) -> usize {
         let end = Instant::now() + time;
         let mut records = 0;
         while Instant::now() < end {
@@ -147,7 +147,7 @@ impl Learner {
                 self.order(keep);
             }
             match self.batches[0].next(&AtomicBool::new(false)).unwrap() {
-                Some(flight) => records += look_at(&flight, keep),
+                Some(episode) => records += look_at(&episode, keep),
                 None => drop(self.batches.pop_front()),
             }
         }
@@ -162,38 +162,38 @@ impl Learner {
     }
 
     fn order(&mut self, keep: Keep) {
-        let flights = (4 * self.actors.len() as u64).max(16);
-        let numbers = self.next_flight..self.next_flight + flights;
-        let ticket = |flight| Ticket {
+        let episodes = (4 * self.actors.len() as u64).max(16);
+        let numbers = self.next_episode..self.next_episode + episodes;
+        let ticket = |episode| Ticket {
             run: self.identity.run,
-            flight: FlightId(flight),
+            episode: EpisodeId(episode),
             attempt: Attempt(0),
             policy_version: PolicyVersion(0),
             course: CourseChoice::Training,
             start_level: 1,
             exploration: Exploration::Sample,
-            seed: flight,
-            leg: None,
+            seed: episode,
+            segment: None,
         };
         let tickets = numbers.clone().map(ticket).collect();
         self.batches
-            .push_back(self.reception.fly(Epoch(0), keep, tickets).unwrap());
-        self.next_flight = numbers.end;
+            .push_back(self.receiver.fly(Epoch(0), keep, tickets).unwrap());
+        self.next_episode = numbers.end;
     }
 }
 
-/// Makes sure that all of a flight is there; returns the number of its records.
-fn look_at(flight: &CommittedFlight, keep: Keep) -> usize {
-    flight.check().unwrap();
-    assert_eq!(flight.steps(), STEPS as usize);
-    assert_eq!(flight.depth.is_some(), keep == Keep::Depth);
-    if let Some(depth) = &flight.depth {
+/// Makes sure that all of an episode is there; returns the number of its records.
+fn look_at(episode: &CommittedEpisode, keep: Keep) -> usize {
+    episode.check().unwrap();
+    assert_eq!(episode.steps(), STEPS as usize);
+    assert_eq!(episode.depth.is_some(), keep == Keep::Depth);
+    if let Some(depth) = &episode.depth {
         assert_eq!(
             (depth[0], depth[depth.len() - 1]),
-            (flight.actor.0 as u8, flight.actor.0 as u8)
+            (episode.actor.0 as u8, episode.actor.0 as u8)
         );
     }
-    flight.observations.len()
+    episode.observations.len()
 }
 
 /// Waits for the actors' ends; whoever does not end is killed.
@@ -211,16 +211,16 @@ fn await_ends(actors: &mut [Child]) {
     }
 }
 
-/// Time to copy a record out of memory as large as an actor's into a flight, as [`Keep::Depth`] asks for.
+/// Time to copy a record out of memory as large as an actor's into an episode, as [`Keep::Depth`] asks for.
 fn copy_micros(time: Duration) -> f64 {
     let record = size_of::<TransitionRecord>();
-    let (of_actor, of_flight) = (512, STEPS as usize + 1);
+    let (of_actor, of_episode) = (512, STEPS as usize + 1);
     let from = vec![7_u8; of_actor * record];
-    let mut into = vec![0_u8; of_flight * record];
+    let mut into = vec![0_u8; of_episode * record];
     let (began, mut copied) = (Instant::now(), 0_usize);
     while began.elapsed() < time {
-        for _ in 0..of_flight {
-            let (source, target) = (copied % of_actor * record, copied % of_flight * record);
+        for _ in 0..of_episode {
+            let (source, target) = (copied % of_actor * record, copied % of_episode * record);
             into[target..target + record].copy_from_slice(black_box(&from[source..source + record]));
             copied += 1;
         }

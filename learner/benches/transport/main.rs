@@ -1,7 +1,7 @@
 //! What the way of the records costs the learner: `cargo bench -p skein-learner --bench transport`.
 //!
-//! The learner's reception, as in a run, in this process; synthetic actors, processes of their own, which use the actors' ends of the services as actors
-//! do, and send whole flights of valid records as fast as they can. Nobody simulates and nobody learns, so what is left is transport, assembly and
+//! The learner's receiver, as in a run, in this process; synthetic actors, processes of their own, which use the actors' ends of the services as actors
+//! do, and send whole episodes of valid records as fast as they can. Nobody simulates and nobody learns, so what is left is transport, assembly and
 //! delivery. The processor's time is the learner's own, so a machine with fewer cores than actors shows whether a record costs more the more actors
 //! there are, though not how many records a larger machine would move.
 //!
@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
-use skein_learner::flights::assembly::Keep;
+use skein_learner::episodes::assembly::Keep;
 use skein_protocol::allocation::keep_freed_memory;
 
 use crate::learner::{Learner, Load, Throughput};

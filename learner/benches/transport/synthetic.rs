@@ -1,4 +1,4 @@
-//! A synthetic actor: takes tickets and sends whole flights of valid records, without simulating.
+//! A synthetic actor: takes tickets and sends whole episodes of valid records, without simulating.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::Config;
-use skein_protocol::ids::{ActorId, Incarnation, PolicyVersion};
+use skein_protocol::ids::{ActorId, ActorIncarnation, PolicyVersion};
 use skein_protocol::run::{Presence, RunDirectory};
 use skein_protocol::services::{ActorPorts, LoanedTransition};
 use skein_protocol::stages::Times;
@@ -14,7 +14,7 @@ use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind};
 
-/// Steps of every flight: as many as from one end of the corridor to the other.
+/// Steps of every episode: as many as from one end of the corridor to the other.
 pub(crate) const STEPS: u32 = 120;
 /// How long to go on without a word of the learner.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -22,7 +22,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 struct Actor {
     ports: ActorPorts,
     id: ActorId,
-    incarnation: Incarnation,
+    incarnation: ActorIncarnation,
     heartbeat: Duration,
     last_heard: Instant,
     last_said: Instant,
@@ -55,7 +55,7 @@ impl Actor {
         Self {
             ports,
             id,
-            incarnation: Incarnation(1),
+            incarnation: ActorIncarnation(1),
             heartbeat: config.transport.heartbeat(),
             last_heard: Instant::now(),
             last_said: Instant::now(),
@@ -67,7 +67,7 @@ impl Actor {
         }
     }
 
-    /// Hears what there is to hear and gives a sign of life when one is due, as an actor does before every step.
+    /// Hears what there is to hear and sends a heartbeat when one is due, as an actor does before every step.
     fn listen(&mut self) {
         while let Some(record) = self.ports.receive_control().unwrap() {
             self.last_heard = Instant::now();
@@ -131,7 +131,7 @@ impl Actor {
             state,
             // As if there had been a snapshot.
             newest_policy: Some(PolicyVersion(0)),
-            flights_flown: 0,
+            episodes_flown: 0,
             times: Times::default(),
         };
         self.ports

@@ -64,16 +64,16 @@ pub enum CheckpointError {
         problem: String,
     },
     /// It counts on files beside it that are not as they were.
-    #[error("the checkpoint of flight {flights} does not fit: {problem}")]
+    #[error("the checkpoint of episode {episodes} does not fit: {problem}")]
     Unfit {
         /// The checkpoint.
-        flights: u64,
+        episodes: u64,
         /// What does not fit, with the file.
         problem: String,
     },
     /// There are checkpoints, but none can be used.
     #[error(
-        "none of the {count} checkpoints in {} can be used. The newest: {newest}. Mend that; or, to train anew from the first flight, remove that folder and flights.csv", directory.display()
+        "none of the {count} checkpoints in {} can be used. The newest: {newest}. Mend that; or, to train anew from the first episode, remove that folder and episodes.csv", directory.display()
     )]
     NoneUsable {
         /// Where they lie.

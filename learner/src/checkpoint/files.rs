@@ -26,7 +26,7 @@ pub(super) const CONFIG: &str = "config.toml";
 /// All files but the manifest.
 pub(super) const NAMES: [&str; 5] = [TENSORS, REPLAY, SNAPSHOTS, PROGRESS, CONFIG];
 
-/// Bytes that reading `progress.bin` may set aside: two windows of a million flights, and room for the rest. A length that makes no sense ends there.
+/// Bytes that reading `progress.bin` may set aside: two windows of a million episodes, and room for the rest. A length that makes no sense ends there.
 const PROGRESS_LIMIT: usize = 64 << 20;
 
 // Safetensors are little-endian, and values are written as they lie in memory.

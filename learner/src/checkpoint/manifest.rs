@@ -30,7 +30,7 @@ pub(super) struct Manifest {
     format: u32,
     /// `Config::digest`, hexadecimal: JSON's numbers do not hold 64 bits.
     config_digest: String,
-    flights: u64,
+    episodes: u64,
     files: Vec<Entry>,
 }
 
@@ -49,7 +49,7 @@ impl Manifest {
     pub(super) fn of(
         directory: &Path,
         names: &[&str],
-        flights: u64,
+        episodes: u64,
         config_digest: u64,
     ) -> Result<Self, CheckpointError> {
         let files = names
@@ -59,7 +59,7 @@ impl Manifest {
         Ok(Self {
             format: FORMAT,
             config_digest: hex(config_digest),
-            flights,
+            episodes,
             files,
         })
     }
@@ -122,9 +122,9 @@ impl Manifest {
         self.config_digest == hex(config_digest)
     }
 
-    /// Flights committed according to the manifest.
-    pub(super) fn flights(&self) -> u64 {
-        self.flights
+    /// Episodes committed according to the manifest.
+    pub(super) fn episodes(&self) -> u64 {
+        self.episodes
     }
 
     /// Reads the file `name` in `directory` and checks that it is what was written.

@@ -4,7 +4,7 @@
 //! buffer with the depth images it still needs, snapshots that are still flown or are the best, counters, averages, how far the files of metrics
 //! had come. Random generators are not: they are derived anew for every epoch.
 //!
-//! `checkpoints/flight-<n>/` holds
+//! `checkpoints/episode-<n>/` holds
 //! - `tensors.safetensors`: parameters, targets, moments, log α;
 //! - `replay.safetensors`: rows of both parts, numbers of their images, images;
 //! - `snapshots.safetensors`: snapshots by their versions;
@@ -29,7 +29,7 @@ use skein_protocol::snapshot::Snapshot;
 use skein_protocol::summary::Trained;
 use skein_protocol::ticket::Exploration;
 
-use crate::flights::assembly::Keep;
+use crate::episodes::assembly::Keep;
 use crate::metrics::MetricsState;
 use crate::replay::ReplayState;
 use crate::spent::Spent;
@@ -55,11 +55,11 @@ pub struct CheckpointState {
 /// How far a run is: every counter that decides what happens next, and what it came to so far.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
-    /// Training flights committed; the checkpoint's name.
-    pub flights: u64,
+    /// Training episodes committed; the checkpoint's name.
+    pub episodes: u64,
     /// Epochs learned from.
     pub epochs: u64,
-    /// The version of the newest snapshot. One is published after each epoch, and after each leg within one that brought an update.
+    /// The version of the newest snapshot. One is published after each epoch, and after each segment within one that brought an update.
     pub version: u64,
     /// SHA-256 of the newest snapshot.
     pub policy_sha256: String,
@@ -69,29 +69,29 @@ pub struct Progress {
     pub vae_steps: u64,
     /// Policy updates done.
     pub policy_updates: u64,
-    /// Epochs whose flights were ordered and not learned from, in order.
+    /// Epochs whose episodes were ordered and not learned from, in order.
     pub in_the_air: Vec<EpochOrder>,
-    /// Evaluations flown to confirm a candidate for the best snapshot; numbers their flights.
+    /// Evaluations flown to confirm a candidate for the best snapshot; numbers their episodes.
     pub evaluations: u64,
-    /// Evaluation flights flown.
-    pub evaluation_flights: u64,
-    /// Flights committed when the latest candidate was confirmed.
+    /// Evaluation episodes flown.
+    pub evaluation_episodes: u64,
+    /// Episodes committed when the latest candidate was confirmed.
     pub latest_candidate: Option<u64>,
     /// The best snapshot so far.
     pub best: Option<BestSnapshot>,
     /// When a candidate first did what it was trained for.
     pub trained: Option<Trained>,
-    /// Averages over the latest flights, and where the files of metrics end.
+    /// Averages over the latest episodes, and where the files of metrics end.
     pub metrics: MetricsState,
     /// Time and losses so far.
     pub spent: Spent,
 }
 
 impl Progress {
-    /// Of a run that has not begun, whose averages are over `window_flights` flights.
-    pub fn start(window_flights: usize) -> Self {
+    /// Of a run that has not begun, whose averages are over `window_episodes` episodes.
+    pub fn start(window_episodes: usize) -> Self {
         Self {
-            flights: 0,
+            episodes: 0,
             epochs: 0,
             version: 0,
             policy_sha256: String::new(),
@@ -100,11 +100,11 @@ impl Progress {
             policy_updates: 0,
             in_the_air: Vec::new(),
             evaluations: 0,
-            evaluation_flights: 0,
+            evaluation_episodes: 0,
             latest_candidate: None,
             best: None,
             trained: None,
-            metrics: MetricsState::new(window_flights),
+            metrics: MetricsState::new(window_episodes),
             spent: Spent::default(),
         }
     }
@@ -115,7 +115,7 @@ impl Progress {
     }
 }
 
-/// Flights of one epoch as they were ordered: what makes their tickets, besides configuration and run.
+/// Episodes of one epoch as they were ordered: what makes their tickets, besides configuration and run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EpochOrder {
     /// The epoch.
@@ -124,7 +124,7 @@ pub struct EpochOrder {
     pub policy_version: u64,
     /// How actions are chosen.
     pub exploration: Exploration,
-    /// What is kept of its flights.
+    /// What is kept of its episodes.
     pub keep: Keep,
 }
 
@@ -133,10 +133,10 @@ pub struct EpochOrder {
 pub struct BestSnapshot {
     /// The snapshot.
     pub policy_version: u64,
-    /// Training flights committed when it was chosen.
-    pub flights: u64,
-    /// Walls passed in the training flights of the window then, on average.
+    /// Training episodes committed when it was chosen.
+    pub episodes: u64,
+    /// Walls passed in the training episodes of the window then, on average.
     pub window_walls_passed: f64,
-    /// Walls passed in the evaluation flights that confirmed it, on average.
+    /// Walls passed in the evaluation episodes that confirmed it, on average.
     pub confirmed_walls_passed: f64,
 }

@@ -1,7 +1,7 @@
 //! The folder of checkpoints: writing into place, finding, loading, removing old ones.
 //!
 //! Names that begin with a dot are work in progress and never read: a checkpoint is written under such a name, all of it brought to disk, and renamed; to be
-//! removed, it is renamed back to one first. One that is written again, for the same flight, keeps its predecessor beside it until it is in place:
+//! removed, it is renamed back to one first. One that is written again, for the same episode, keeps its predecessor beside it until it is in place:
 //! there is no moment without a sound checkpoint, once there is one.
 
 use std::collections::BTreeSet;
@@ -16,7 +16,7 @@ use tracing::warn;
 use super::manifest::{self, Manifest};
 use super::{CheckpointError, CheckpointState, files};
 
-/// Ends the name of a checkpoint that is about to be replaced by one of the same flight.
+/// Ends the name of a checkpoint that is about to be replaced by one of the same episode.
 const REPLACED: &str = ".replaced";
 
 /// The checkpoints of a run.
@@ -30,13 +30,13 @@ pub struct CheckpointStore {
 /// A checkpoint in the folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Place {
-    flights: u64,
+    episodes: u64,
     path: PathBuf,
 }
 
-/// Where in `checkpoints` the state after `flights` committed flights lies.
-pub fn checkpoint_directory(checkpoints: &Path, flights: u64) -> PathBuf {
-    checkpoints.join(format!("flight-{flights}"))
+/// Where in `checkpoints` the state after `episodes` committed episodes lies.
+pub fn checkpoint_directory(checkpoints: &Path, episodes: u64) -> PathBuf {
+    checkpoints.join(format!("episode-{episodes}"))
 }
 
 impl CheckpointStore {
@@ -61,8 +61,8 @@ impl CheckpointStore {
     /// # Errors
     /// [`CheckpointError`]; what was there before still is, and what was half written takes no room.
     pub fn save(&self, state: &CheckpointState, relied_on: &[PathBuf]) -> Result<PathBuf, CheckpointError> {
-        let flights = state.progress.flights;
-        // One name for all: whatever an interrupted write left, of this flight or another, makes room for the next.
+        let episodes = state.progress.episodes;
+        // One name for all: whatever an interrupted write left, of this episode or another, makes room for the next.
         let aside = self.directory.join(".writing");
         remove(&aside)?;
         if let Err(error) = self.write_aside(&aside, state, relied_on) {
@@ -70,12 +70,12 @@ impl CheckpointStore {
             return Err(error);
         }
         pass(FaultPoint::CheckpointSynced);
-        let place = checkpoint_directory(&self.directory, flights);
+        let place = checkpoint_directory(&self.directory, episodes);
         self.make_way(&place)?;
         fs::rename(&aside, &place).map_err(CheckpointError::io("rename into place", &aside))?;
         sync(&self.directory)?;
         pass(FaultPoint::CheckpointRenamed);
-        self.remove_others(flights)?;
+        self.remove_others(episodes)?;
         Ok(place)
     }
 
@@ -83,7 +83,7 @@ impl CheckpointStore {
         durable::create_private_directory(aside).map_err(CheckpointError::io("create", aside))?;
         pass(FaultPoint::CheckpointCreated);
         files::write(aside, state, &self.config.portable())?;
-        self.seal(aside, state.progress.flights)?;
+        self.seal(aside, state.progress.episodes)?;
         pass(FaultPoint::CheckpointManifest);
         for name in files::NAMES.iter().chain([&manifest::NAME]) {
             sync(&aside.join(name))?;
@@ -95,12 +95,12 @@ impl CheckpointStore {
         all.try_for_each(sync_once)
     }
 
-    /// Writes the manifest of the files in `directory` as they are now, and so makes them a checkpoint after `flights` flights.
+    /// Writes the manifest of the files in `directory` as they are now, and so makes them a checkpoint after `episodes` episodes.
     ///
     /// # Errors
     /// [`CheckpointError::Io`] names the file.
-    pub fn seal(&self, directory: &Path, flights: u64) -> Result<(), CheckpointError> {
-        let manifest = Manifest::of(directory, &files::NAMES, flights, self.config.digest())?;
+    pub fn seal(&self, directory: &Path, episodes: u64) -> Result<(), CheckpointError> {
+        let manifest = Manifest::of(directory, &files::NAMES, episodes, self.config.digest())?;
         files::write_bytes(&directory.join(manifest::NAME), manifest.to_text().as_bytes())
     }
 
@@ -115,17 +115,17 @@ impl CheckpointStore {
         fs::rename(place, replaced).map_err(CheckpointError::io("rename", place))
     }
 
-    /// The flights of which there is a checkpoint, the newest first.
+    /// The episodes of which there is a checkpoint, the newest first.
     ///
     /// # Errors
     /// [`CheckpointError::Io`] when the folder cannot be read; a folder that does not exist has none.
     pub fn list(&self) -> Result<Vec<u64>, CheckpointError> {
-        let mut flights: Vec<u64> = self.places()?.iter().map(|place| place.flights).collect();
-        flights.dedup();
-        Ok(flights)
+        let mut episodes: Vec<u64> = self.places()?.iter().map(|place| place.episodes).collect();
+        episodes.dedup();
+        Ok(episodes)
     }
 
-    /// All checkpoints, the newest first; of two of one flight, the one that replaces the other.
+    /// All checkpoints, the newest first; of two of one episode, the one that replaces the other.
     fn places(&self) -> Result<Vec<Place>, CheckpointError> {
         if !self.directory.exists() {
             return Ok(Vec::new());
@@ -139,28 +139,28 @@ impl CheckpointStore {
                 continue;
             }
             let name = entry.file_name();
-            let flights = name.to_str().and_then(|name| {
-                let number = name.strip_prefix("flight-")?;
+            let episodes = name.to_str().and_then(|name| {
+                let number = name.strip_prefix("episode-")?;
                 number.strip_suffix(REPLACED).unwrap_or(number).parse::<u64>().ok()
             });
-            found.extend(flights.map(|flights| Place {
-                flights,
+            found.extend(episodes.map(|episodes| Place {
+                episodes,
                 path: self.directory.join(&name),
             }));
         }
         // The shorter of two names is that of the newer one.
-        found.sort_by_key(|place| (std::cmp::Reverse(place.flights), place.path.as_os_str().len()));
+        found.sort_by_key(|place| (std::cmp::Reverse(place.episodes), place.path.as_os_str().len()));
         Ok(found)
     }
 
-    /// Loads the checkpoint after `flights` committed flights.
+    /// Loads the checkpoint after `episodes` committed episodes.
     ///
     /// # Errors
     /// [`CheckpointError`] names the file that is missing, damaged, or of another version or configuration.
-    pub fn load(&self, flights: u64) -> Result<CheckpointState, CheckpointError> {
+    pub fn load(&self, episodes: u64) -> Result<CheckpointState, CheckpointError> {
         self.load_from(&Place {
-            flights,
-            path: checkpoint_directory(&self.directory, flights),
+            episodes,
+            path: checkpoint_directory(&self.directory, episodes),
         })
     }
 
@@ -172,21 +172,21 @@ impl CheckpointStore {
         }
         let state = files::read(&place.path, &manifest)?;
         for (what, found) in [
-            ("the directory's name", place.flights),
-            ("the manifest", manifest.flights()),
+            ("the directory's name", place.episodes),
+            ("the manifest", manifest.episodes()),
         ] {
-            if found != state.progress.flights {
+            if found != state.progress.episodes {
                 return Err(CheckpointError::Content {
                     path: place.path.clone(),
-                    problem: format!("it is of flight {}, but {what} says {found}", state.progress.flights),
+                    problem: format!("it is of episode {}, but {what} says {found}", state.progress.episodes),
                 });
             }
         }
-        let window = self.config.evaluation.window_flights;
+        let window = self.config.evaluation.window_episodes;
         if !state.progress.metrics.windows.are_over(window as usize) {
             return Err(CheckpointError::Content {
                 path: place.path.clone(),
-                problem: format!("its averages are not over evaluation.window_flights = {window} flights"),
+                problem: format!("its averages are not over evaluation.window_episodes = {window} episodes"),
             });
         }
         Ok(state)
@@ -245,13 +245,13 @@ impl CheckpointStore {
             if place.path == checkpoint_directory(&self.directory, newest) {
                 continue;
             }
-            let superfluous = place.flights >= newest || sound.len() >= self.keep || sound.contains(&place.flights);
+            let superfluous = place.episodes >= newest || sound.len() >= self.keep || sound.contains(&place.episodes);
             if superfluous {
                 self.retire(&place.path)?;
                 continue;
             }
             if is_sound(&place.path) {
-                sound.insert(place.flights);
+                sound.insert(place.episodes);
             }
         }
         Ok(())

@@ -11,18 +11,18 @@ use skein_protocol::transition::Outcome;
 
 use super::*;
 use crate::disk::Disk;
-use crate::flight::samples::{flight, with_images};
+use crate::episode::samples::{episode, with_images};
 use crate::metrics::{EventFile, Windows};
 use crate::replay::Replay;
 use crate::state::TensorValues;
 
 /// With bit patterns that only survive a copy: a negative zero, the smallest number, a NaN with a payload.
-fn state(flights: u64) -> CheckpointState {
+fn state(episodes: u64) -> CheckpointState {
     let mut replay = Replay::new(&Config::default());
     for number in 0..4 {
-        let mut flight = with_images(flight(number, 3, Outcome::Collided));
-        flight.level_up[1] = true;
-        replay.insert(flight).unwrap();
+        let mut episode = with_images(episode(number, 3, Outcome::Collided));
+        episode.level_up[1] = true;
+        replay.insert(episode).unwrap();
     }
     let mut windows = Windows::new(50);
     windows.walls_passed.push(3.0);
@@ -41,7 +41,7 @@ fn state(flights: u64) -> CheckpointState {
     };
     CheckpointState {
         progress: Progress {
-            flights,
+            episodes,
             epochs: 7,
             version: 9,
             policy_sha256: "0123".into(),
@@ -55,24 +55,24 @@ fn state(flights: u64) -> CheckpointState {
                 keep: Keep::Depth,
             }],
             evaluations: 1,
-            evaluation_flights: 5,
+            evaluation_episodes: 5,
             latest_candidate: Some(5),
             best: Some(BestSnapshot {
                 policy_version: 6,
-                flights: 60,
+                episodes: 60,
                 window_walls_passed: 0.1,
                 confirmed_walls_passed: 2.5,
             }),
             trained: Some(skein_protocol::summary::Trained {
                 rate: 0.92,
-                flights: 60,
+                episodes: 60,
                 steps: 11,
                 updates: 2,
                 wall_secs: 0.5,
             }),
             metrics: MetricsState {
-                flights,
-                flights_extent: crate::metrics::FlightsExtent::empty(),
+                episodes,
+                episodes_extent: crate::metrics::EpisodesExtent::empty(),
                 events: vec![EventFile {
                     name: "events.out.tfevents.1.skein.000000".into(),
                     bytes: 77,
@@ -242,7 +242,7 @@ fn another_configuration_is_refused_by_key_with_both_values() {
     config.sac.discount = 0.5;
     let other = CheckpointStore::new(store.directory(), &config);
     let error = other.load_newest(|_| Ok(()), |_| {}).unwrap_err().to_string();
-    for part in ["flight-500", "sac.discount = 0.99 there, 0.5 here"] {
+    for part in ["episode-500", "sac.discount = 0.99 there, 0.5 here"] {
         assert!(error.contains(part), "`{error}` does not mention `{part}`");
     }
     assert!(!error.contains("batch_size"), "{error}");
@@ -268,15 +268,15 @@ fn another_format_is_refused_before_anything_else_is_believed() {
 #[test]
 fn a_run_whose_checkpoints_are_all_damaged_is_not_begun_anew() {
     let (_directory, store) = store(2);
-    for flights in [500, 1000] {
-        let place = store.save(&state(flights), &[]).unwrap();
+    for episodes in [500, 1000] {
+        let place = store.save(&state(episodes), &[]).unwrap();
         fs::write(place.join("progress.bin"), "").unwrap();
     }
     let error = store.load_newest(|_| Ok(()), |_| {}).unwrap_err().to_string();
     for part in [
         "none of the 2 checkpoints",
-        "flight-1000/progress.bin",
-        "remove that folder and flights.csv",
+        "episode-1000/progress.bin",
+        "remove that folder and episodes.csv",
     ] {
         assert!(error.contains(part), "`{error}` does not mention `{part}`");
     }
@@ -296,24 +296,27 @@ fn nobody_else_can_read_a_checkpoint() {
 #[test]
 fn only_the_newest_few_are_kept_and_nothing_else_remains() {
     let (_directory, store) = store(2);
-    for flights in [500, 1000, 1500] {
-        store.save(&state(flights), &[]).unwrap();
+    for episodes in [500, 1000, 1500] {
+        store.save(&state(episodes), &[]).unwrap();
     }
-    assert_eq!(names(store.directory()), ["flight-1000", "flight-1500"]);
+    assert_eq!(names(store.directory()), ["episode-1000", "episode-1500"]);
     assert_eq!(store.list().unwrap(), [1500, 1000]);
 }
 
 #[test]
 fn a_damaged_checkpoint_does_not_count_among_those_kept() {
     let (_directory, store) = store(2);
-    for flights in [500, 1000] {
-        store.save(&state(flights), &[]).unwrap();
+    for episodes in [500, 1000] {
+        store.save(&state(episodes), &[]).unwrap();
     }
-    fs::write(store.directory().join("flight-1000/progress.bin"), "").unwrap();
+    fs::write(store.directory().join("episode-1000/progress.bin"), "").unwrap();
     store.save(&state(1500), &[]).unwrap();
-    assert_eq!(names(store.directory()), ["flight-1000", "flight-1500", "flight-500"]);
+    assert_eq!(
+        names(store.directory()),
+        ["episode-1000", "episode-1500", "episode-500"]
+    );
     store.save(&state(2000), &[]).unwrap();
-    assert_eq!(names(store.directory()), ["flight-1500", "flight-2000"]);
+    assert_eq!(names(store.directory()), ["episode-1500", "episode-2000"]);
 }
 
 #[test]
@@ -321,30 +324,35 @@ fn a_checkpoint_that_is_written_again_is_never_missed() {
     let (_directory, store) = store(1);
     let place = store.save(&state(500), &[]).unwrap();
     // The first half of the exchange, then a death.
-    let replaced = store.directory().join("flight-500.replaced");
+    let replaced = store.directory().join("episode-500.replaced");
     fs::rename(&place, &replaced).unwrap();
     assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
     assert_eq!(store.list().unwrap(), [500]);
     // The second half, then damage to the new one.
     let place = store.save(&state(500), &[]).unwrap();
-    assert_eq!(names(store.directory()), ["flight-500"]);
+    assert_eq!(names(store.directory()), ["episode-500"]);
     fs::rename(&place, &replaced).unwrap();
     fs::create_dir(&place).unwrap();
     fs::write(place.join("progress.bin"), "").unwrap();
     assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
     store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
-    assert_eq!(names(store.directory()), ["flight-500"]);
+    assert_eq!(names(store.directory()), ["episode-500"]);
 }
 
 #[test]
-fn a_damaged_newest_is_passed_over_and_replaced_when_its_flight_is_reached_again() {
+fn a_damaged_newest_is_passed_over_and_replaced_when_its_episode_is_reached_again() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     let newest = store.save(&state(1000), &[]).unwrap();
     fs::write(newest.join("progress.bin"), "").unwrap();
     assert_eq!(
-        store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap().progress.flights,
+        store
+            .load_newest(|_| Ok(()), |_| {})
+            .unwrap()
+            .unwrap()
+            .progress
+            .episodes,
         500
     );
     store.save(&state(1000), &[]).unwrap();
@@ -356,7 +364,7 @@ fn checkpoints_of_an_abandoned_future_do_not_push_out_the_present() {
     let (_directory, store) = store(1);
     store.save(&state(1000), &[]).unwrap();
     store.save(&state(600), &[]).unwrap();
-    assert_eq!(names(store.directory()), ["flight-600"]);
+    assert_eq!(names(store.directory()), ["episode-600"]);
 }
 
 #[test]
@@ -367,7 +375,7 @@ fn what_an_interrupted_write_left_is_never_read_and_then_cleared() {
     fs::rename(interrupted, store.directory().join(".writing")).unwrap();
     assert!(store.load_newest(|_| Ok(()), |_| {}).unwrap().is_none());
     let place = store.save(&state(500), &[]).unwrap();
-    assert_eq!(names(store.directory()), ["flight-500"]);
+    assert_eq!(names(store.directory()), ["episode-500"]);
     assert_eq!(
         names(&place),
         [
@@ -391,12 +399,12 @@ fn a_run_without_checkpoints_has_none() {
 fn the_writing_thread_has_everything_on_disk_when_it_is_finished() {
     let (_directory, store) = store(3);
     let mut writer = writer(store.clone());
-    for flights in [500, 1000] {
-        writer.save(state(flights), Vec::new()).unwrap();
+    for episodes in [500, 1000] {
+        writer.save(state(episodes), Vec::new()).unwrap();
     }
     writer.finish().unwrap();
-    for flights in [500, 1000] {
-        assert_same(&store.load(flights).unwrap(), &state(flights));
+    for episodes in [500, 1000] {
+        assert_same(&store.load(episodes).unwrap(), &state(episodes));
     }
 }
 
@@ -420,7 +428,7 @@ fn a_failed_write_is_told_by_the_next_save_or_the_end() {
 #[test]
 fn what_a_checkpoint_relies_on_must_be_there() {
     let (directory, store) = store(2);
-    let rows = directory.path().join("flights.csv");
+    let rows = directory.path().join("episodes.csv");
     store.save(&state(500), std::slice::from_ref(&rows)).unwrap_err();
     assert!(store.list().unwrap().is_empty());
     fs::write(&rows, "").unwrap();
@@ -470,7 +478,12 @@ fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop
     writer.save(state(600), Vec::new()).unwrap();
     wait_for(|| disk.waiting().is_some());
     assert_eq!(
-        store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap().progress.flights,
+        store
+            .load_newest(|_| Ok(()), |_| {})
+            .unwrap()
+            .unwrap()
+            .progress
+            .episodes,
         500
     );
     fs::remove_file(&ballast).unwrap();
@@ -500,10 +513,10 @@ fn one_that_does_not_fit_what_lies_beside_it_is_passed_over_and_told() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     store.save(&state(1000), &[]).unwrap();
-    let check = |state: &CheckpointState| match state.progress.flights {
+    let check = |state: &CheckpointState| match state.progress.episodes {
         1000 => Err(CheckpointError::Unfit {
-            flights: 1000,
-            problem: "flights.csv ends after 3 bytes".to_owned(),
+            episodes: 1000,
+            problem: "episodes.csv ends after 3 bytes".to_owned(),
         }),
         _ => Ok(()),
     };
@@ -512,7 +525,7 @@ fn one_that_does_not_fit_what_lies_beside_it_is_passed_over_and_told() {
     assert_same(&newest.unwrap(), &state(500));
     assert_eq!(
         told,
-        ["the checkpoint of flight 1000 does not fit: flights.csv ends after 3 bytes"]
+        ["the checkpoint of episode 1000 does not fit: episodes.csv ends after 3 bytes"]
     );
 }
 
@@ -520,11 +533,11 @@ fn one_that_does_not_fit_what_lies_beside_it_is_passed_over_and_told() {
 fn files_among_the_checkpoints_are_in_nobodys_way() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
-    for name in ["flight-9999", ".writing", ".removing", "notes.txt"] {
+    for name in ["episode-9999", ".writing", ".removing", "notes.txt"] {
         fs::write(store.directory().join(name), "").unwrap();
     }
     store.save(&state(1000), &[]).unwrap();
     store.save(&state(1500), &[]).unwrap();
     assert_eq!(store.list().unwrap(), [1500, 1000]);
-    assert!(store.directory().join("flight-9999").exists());
+    assert!(store.directory().join("episode-9999").exists());
 }

@@ -22,7 +22,7 @@ const NAME: &str = "events.out.tfevents.";
 /// Appends scalars to an event file of its own.
 #[derive(Debug)]
 pub struct EventWriter {
-    /// Files of earlier lives, then the present one.
+    /// Files of earlier incarnations, then the present one.
     files: Vec<EventFile>,
     path: PathBuf,
     file: BufWriter<Patient<File>>,
@@ -49,7 +49,7 @@ pub struct EventError {
 }
 
 impl EventWriter {
-    /// Starts a new event file in `directory`, after cutting back those there are to `files`: what lies beyond is of flights whose learning was lost.
+    /// Starts a new event file in `directory`, after cutting back those there are to `files`: what lies beyond is of episodes whose learning was lost.
     /// TensorBoard reads all files of a directory as one; of earlier ones it drops what lies at `first_step` or later.
     ///
     /// A file that has lost a part of `files`, or all of it, is named in a warning: its curves then have a hole, which is no reason not to train.
@@ -328,9 +328,9 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let mut writer = create(directory.path(), first_step);
         writer
-            .scalars(7, &[("flight/return", -1.5), ("flight/steps", 12.0)])
+            .scalars(7, &[("episode/return", -1.5), ("episode/steps", 12.0)])
             .unwrap();
-        writer.scalars(8, &[("flight/return", 0.0)]).unwrap();
+        writer.scalars(8, &[("episode/return", 0.0)]).unwrap();
         writer.flush().unwrap();
         std::fs::read(&writer.path).unwrap()
     }
@@ -356,10 +356,10 @@ mod tests {
                 event::What::FileVersion("brain.Event:2".to_owned()),
                 event::What::SessionLog(SessionLog { status: SESSION_START }),
                 event::What::Summary(Summary {
-                    value: vec![value("flight/return", -1.5), value("flight/steps", 12.0)]
+                    value: vec![value("episode/return", -1.5), value("episode/steps", 12.0)]
                 }),
                 event::What::Summary(Summary {
-                    value: vec![value("flight/return", 0.0)]
+                    value: vec![value("episode/return", 0.0)]
                 }),
             ]
         );
@@ -408,7 +408,7 @@ mod tests {
     }
 
     #[test]
-    fn a_later_life_has_a_file_of_a_later_name_even_when_the_clock_went_back() {
+    fn a_later_incarnation_has_a_file_of_a_later_name_even_when_the_clock_went_back() {
         let directory = tempfile::tempdir().unwrap();
         let ahead = format!("{NAME}99999999999.skein.000000");
         fs::write(directory.path().join(&ahead), "0123456789").unwrap();

@@ -1,10 +1,10 @@
-//! What a training run tells about itself: `flights.csv`, TensorBoard curves, averages over the latest flights.
+//! What a training run tells about itself: `episodes.csv`, TensorBoard curves, averages over the latest episodes.
 //!
-//! All three are keyed by committed flight, not by time: two runs of one configuration have the same curves whatever machines flew them, and a
+//! All three are keyed by committed episode, not by time: two runs of one configuration have the same curves whatever machines flew them, and a
 //! resumed run continues where its checkpoint was taken.
 
+mod episodes;
 mod events;
-mod flights;
 mod scalars;
 mod window;
 
@@ -14,14 +14,14 @@ use serde::{Deserialize, Serialize};
 use skein_protocol::run::RunDirectory;
 
 use crate::disk::Disk;
-use crate::flight::CommittedFlight;
+use crate::episode::CommittedEpisode;
 
+pub use episodes::{EpisodeRow, EpisodesCsv, EpisodesError, EpisodesExtent};
 pub use events::{EventError, EventFile, EventWriter};
-pub use flights::{FlightRow, FlightsCsv, FlightsError, FlightsExtent};
 pub use scalars::Scalar;
 pub use window::MovingAverage;
 
-/// Averages over the latest training flights; part of a checkpoint.
+/// Averages over the latest training episodes; part of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Windows {
     /// Of the return.
@@ -31,52 +31,52 @@ pub struct Windows {
 }
 
 impl Windows {
-    /// Empty ones over `flights` flights.
-    pub fn new(flights: usize) -> Self {
+    /// Empty ones over `episodes` episodes.
+    pub fn new(episodes: usize) -> Self {
         Self {
-            total_reward: MovingAverage::new(flights),
-            walls_passed: MovingAverage::new(flights),
+            total_reward: MovingAverage::new(episodes),
+            walls_passed: MovingAverage::new(episodes),
         }
     }
 
-    /// Whether they are over `flights` flights, see [`MovingAverage::is_over`].
-    pub fn are_over(&self, flights: usize) -> bool {
-        self.total_reward.is_over(flights) && self.walls_passed.is_over(flights)
+    /// Whether they are over `episodes` episodes, see [`MovingAverage::is_over`].
+    pub fn are_over(&self, episodes: usize) -> bool {
+        self.total_reward.is_over(episodes) && self.walls_passed.is_over(episodes)
     }
 }
 
 /// How far the metrics of a run are; part of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MetricsState {
-    /// Rows in `flights.csv`.
-    pub flights: u64,
+    /// Rows in `episodes.csv`.
+    pub episodes: u64,
     /// What those rows are.
-    pub flights_extent: FlightsExtent,
+    pub episodes_extent: EpisodesExtent,
     /// Event files with their lengths.
     pub events: Vec<EventFile>,
-    /// Averages over the latest flights.
+    /// Averages over the latest episodes.
     pub windows: Windows,
 }
 
 impl MetricsState {
-    /// Of a new run, averaged over `window_flights` flights.
-    pub fn new(window_flights: usize) -> Self {
+    /// Of a new run, averaged over `window_episodes` episodes.
+    pub fn new(window_episodes: usize) -> Self {
         Self {
-            flights: 0,
-            flights_extent: FlightsExtent::empty(),
+            episodes: 0,
+            episodes_extent: EpisodesExtent::empty(),
             events: Vec::new(),
-            windows: Windows::new(window_flights),
+            windows: Windows::new(window_episodes),
         }
     }
 }
 
 impl MetricsState {
-    /// Checks that `flights.csv` of `run` is what was written when this state was taken, or more.
+    /// Checks that `episodes.csv` of `run` is what was written when this state was taken, or more.
     ///
     /// # Errors
-    /// [`MetricsError::Flights`] says what is wrong with it.
+    /// [`MetricsError::Episodes`] says what is wrong with it.
     pub fn check(&self, run: &RunDirectory) -> Result<(), MetricsError> {
-        Ok(self.flights_extent.check(&run.flights_csv(), self.flights)?)
+        Ok(self.episodes_extent.check(&run.episodes_csv(), self.episodes)?)
     }
 }
 
@@ -85,7 +85,7 @@ impl MetricsState {
 pub struct Metrics {
     run: RunDirectory,
     rows: u64,
-    flights: FlightsCsv,
+    episodes: EpisodesCsv,
     events: EventWriter,
     windows: Windows,
 }
@@ -93,9 +93,9 @@ pub struct Metrics {
 /// Why metrics cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum MetricsError {
-    /// `flights.csv`.
+    /// `episodes.csv`.
     #[error(transparent)]
-    Flights(#[from] FlightsError),
+    Episodes(#[from] EpisodesError),
     /// The event file.
     #[error(transparent)]
     Events(#[from] EventError),
@@ -105,20 +105,20 @@ impl Metrics {
     /// Continues where the metrics were in `state`. What was written since is dropped, so that nothing is told twice; of a new run that is everything.
     ///
     /// # Errors
-    /// [`MetricsError`] names the file; `flights.csv` must be what was written when `state` was taken, or more.
+    /// [`MetricsError`] names the file; `episodes.csv` must be what was written when `state` was taken, or more.
     pub fn resume(run: &RunDirectory, state: MetricsState, disk: &Disk) -> Result<Self, MetricsError> {
         state.check(run)?;
         let MetricsState {
-            flights,
-            flights_extent: _,
+            episodes,
+            episodes_extent: _,
             events,
             windows,
         } = state;
         Ok(Self {
             run: run.clone(),
-            rows: flights,
-            flights: FlightsCsv::resume(&run.flights_csv(), flights, disk)?,
-            events: EventWriter::resume(&run.tensorboard(), events, flights, disk)?,
+            rows: episodes,
+            episodes: EpisodesCsv::resume(&run.episodes_csv(), episodes, disk)?,
+            events: EventWriter::resume(&run.tensorboard(), events, episodes, disk)?,
             windows,
         })
     }
@@ -126,8 +126,8 @@ impl Metrics {
     /// How far the metrics are. It holds of the files once they are [flushed](Metrics::flush).
     pub fn state(&self) -> MetricsState {
         MetricsState {
-            flights: self.rows,
-            flights_extent: self.flights.extent(),
+            episodes: self.rows,
+            episodes_extent: self.episodes.extent(),
             events: self.events.files().to_vec(),
             windows: self.windows.clone(),
         }
@@ -139,28 +139,28 @@ impl Metrics {
         let events = self.events.files().iter().map(|file| folder.join(&file.name));
         // One that was lost can no longer be counted on.
         let events = events.filter(|path| path.exists());
-        std::iter::once(self.run.flights_csv()).chain(events).collect()
+        std::iter::once(self.run.episodes_csv()).chain(events).collect()
     }
 
-    /// Takes in a committed training flight; called in flight order.
+    /// Takes in a committed training episode; called in episode order.
     ///
     /// # Errors
     /// [`MetricsError`] names the file.
-    pub fn flight(&mut self, flight: &CommittedFlight) -> Result<(), MetricsError> {
-        let row = FlightRow::from(flight);
-        self.flights.write(&row)?;
+    pub fn episode(&mut self, episode: &CommittedEpisode) -> Result<(), MetricsError> {
+        let row = EpisodeRow::from(episode);
+        self.episodes.write(&row)?;
         self.rows += 1;
         self.windows.total_reward.push(row.total_reward);
         self.windows.walls_passed.push(f32::from(row.walls_passed));
         let term = |index: usize| {
-            flight
+            episode
                 .reward_terms
                 .iter()
                 .map(|terms| f64::from(terms[index]))
                 .sum::<f64>()
         };
         self.scalars(
-            row.flight,
+            row.episode,
             &[
                 (Scalar::Return, row.total_reward.into()),
                 (Scalar::WallsPassed, row.walls_passed.into()),
@@ -181,13 +181,13 @@ impl Metrics {
         )
     }
 
-    /// Appends a point to each of some curves, at training flight `flight`.
+    /// Appends a point to each of some curves, at training episode `episode`.
     ///
     /// # Errors
     /// [`MetricsError`] names the file.
-    pub fn scalars(&mut self, flight: u64, values: &[(Scalar, f64)]) -> Result<(), MetricsError> {
+    pub fn scalars(&mut self, episode: u64, values: &[(Scalar, f64)]) -> Result<(), MetricsError> {
         let values: Vec<_> = values.iter().map(|&(scalar, value)| (scalar.tag(), value)).collect();
-        Ok(self.events.scalars(flight, &values)?)
+        Ok(self.events.scalars(episode, &values)?)
     }
 
     /// Hands everything written to the operating system; called once an epoch, and before a checkpoint that counts on it.
@@ -195,11 +195,11 @@ impl Metrics {
     /// # Errors
     /// [`MetricsError`] names the file.
     pub fn flush(&mut self) -> Result<(), MetricsError> {
-        self.flights.flush()?;
+        self.episodes.flush()?;
         Ok(self.events.flush()?)
     }
 
-    /// Averages over the latest flights.
+    /// Averages over the latest episodes.
     pub fn windows(&self) -> &Windows {
         &self.windows
     }
@@ -210,7 +210,7 @@ mod tests {
     use skein_protocol::transition::Outcome;
 
     use super::*;
-    use crate::flight::samples;
+    use crate::episode::samples;
 
     fn run() -> (tempfile::TempDir, RunDirectory) {
         let directory = tempfile::tempdir().unwrap();
@@ -218,11 +218,11 @@ mod tests {
         (directory, run)
     }
 
-    fn feed(metrics: &mut Metrics, flights: std::ops::Range<u64>) {
-        for number in flights {
-            let mut flight = samples::flight(number, 4, Outcome::Collided);
-            flight.walls_passed = (number % 4) as u8;
-            metrics.flight(&flight).unwrap();
+    fn feed(metrics: &mut Metrics, episodes: std::ops::Range<u64>) {
+        for number in episodes {
+            let mut episode = samples::episode(number, 4, Outcome::Collided);
+            episode.walls_passed = (number % 4) as u8;
+            metrics.episode(&episode).unwrap();
         }
         metrics.flush().unwrap();
     }
@@ -256,7 +256,7 @@ mod tests {
         let at_checkpoint = first.state();
         feed(&mut first, 12..17);
         drop(first);
-        // A life that leaves no checkpoint leaves no point.
+        // An incarnation that leaves no checkpoint leaves no point.
         let mut lost = metrics(&resumed_run, at_checkpoint.clone());
         feed(&mut lost, 12..19);
         drop(lost);
@@ -265,21 +265,21 @@ mod tests {
 
         assert_eq!(last.windows(), whole.windows());
         assert_eq!(whole.windows().walls_passed.mean(), Some(9.0 / 5.0));
-        let read = |run: &RunDirectory| std::fs::read_to_string(run.flights_csv()).unwrap();
+        let read = |run: &RunDirectory| std::fs::read_to_string(run.episodes_csv()).unwrap();
         assert_eq!(read(&resumed_run), read(&whole_run));
         assert_eq!(read(&whole_run).lines().count(), 21);
         assert_eq!(points(&resumed_run), points(&whole_run));
-        assert_eq!(last.files().len(), 3, "flights.csv, and two event files");
+        assert_eq!(last.files().len(), 3, "episodes.csv, and two event files");
     }
 
     #[test]
-    fn a_life_that_died_before_its_first_checkpoint_leaves_nothing() {
+    fn an_incarnation_that_died_before_its_first_checkpoint_leaves_nothing() {
         let (_directory, run) = run();
         feed(&mut metrics(&run, new()), 0..7);
         std::fs::write(run.tensorboard().join("notes.txt"), "not ours").unwrap();
         let mut anew = metrics(&run, new());
         anew.flush().unwrap();
-        assert_eq!(std::fs::read_to_string(run.flights_csv()).unwrap(), "");
+        assert_eq!(std::fs::read_to_string(run.episodes_csv()).unwrap(), "");
         assert_eq!(
             std::fs::read_dir(run.tensorboard()).unwrap().count(),
             2,

@@ -2,7 +2,7 @@
 
 macro_rules! scalars {
     ($($(#[$doc:meta])* $name:ident => $tag:literal),* $(,)?) => {
-        /// A curve in the TensorBoard event files. Every curve's horizontal axis is the number of committed training flights.
+        /// A curve in the TensorBoard event files. Every curve's horizontal axis is the number of committed training episodes.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         pub enum Scalar { $($(#[$doc])* $name),* }
 
@@ -19,12 +19,12 @@ macro_rules! scalars {
 }
 
 scalars! {
-    /// Sum of a flight's rewards. The paper's Fig. 9.
-    Return => "flight/return",
-    /// Walls passed in a flight.
-    WallsPassed => "flight/walls_passed",
-    /// Steps of a flight.
-    Steps => "flight/steps",
+    /// Sum of an episode's rewards. The paper's Fig. 9.
+    Return => "episode/return",
+    /// Walls passed in an episode.
+    WallsPassed => "episode/walls_passed",
+    /// Steps of an episode.
+    Steps => "episode/steps",
     /// What collisions contributed to the return.
     RewardCollision => "reward/collision",
     /// What level-ups contributed to the return.
@@ -61,11 +61,11 @@ scalars! {
     StepsPerSec => "rate/steps_per_sec",
     /// Policy updates per second of wall time spent updating.
     UpdatesPerSec => "rate/updates_per_sec",
-    /// Walls passed in the flights that confirmed a candidate for the best snapshot, on average.
+    /// Walls passed in the episodes that confirmed a candidate for the best snapshot, on average.
     EvaluationWallsPassed => "evaluation/walls_passed",
     /// Tickets issued again because records of a later one came first, since the learner's start.
     ReissuedSkipped => "reissued/skipped",
-    /// Tickets issued again because a record of their flight got lost.
+    /// Tickets issued again because a record of their episode got lost.
     ReissuedHole => "reissued/hole",
     /// Tickets issued again because what came of them makes no sense, or the simulator broke down.
     ReissuedFailed => "reissued/failed",
@@ -73,7 +73,7 @@ scalars! {
     ReissuedLate => "reissued/late",
     /// Tickets issued again because their actor fell silent.
     ReissuedSilent => "reissued/silent",
-    /// Tickets issued again because their actor began another life.
+    /// Tickets issued again because their actor began another incarnation.
     ReissuedRestarted => "reissued/restarted",
     /// Tickets issued again because their actor left.
     ReissuedLeft => "reissued/left",
@@ -83,15 +83,15 @@ scalars! {
     RefusedNoTicket => "refused/no_ticket",
     /// Records refused because they do not follow the one before.
     RefusedOutOfOrder => "refused/out_of_order",
-    /// Records refused because a field has a value that no flight gives it.
+    /// Records refused because a field has a value that no episode gives it.
     RefusedImpossible => "refused/impossible",
     /// Records refused because a number is infinite or none.
     RefusedNotFinite => "refused/not_finite",
-    /// Records refused because a number, an action or the flight is too large.
+    /// Records refused because a number, an action or the episode is too large.
     RefusedTooLarge => "refused/too_large",
     /// Records refused because they contradict themselves or those before.
     RefusedContradiction => "refused/contradiction",
-    /// Signs of life refused.
+    /// Signs of incarnation refused.
     RefusedStatus => "refused/status",
 }
 

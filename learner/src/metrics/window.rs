@@ -1,4 +1,4 @@
-//! Averages over the latest flights.
+//! Averages over the latest episodes.
 
 use std::collections::VecDeque;
 

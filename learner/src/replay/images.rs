@@ -1,8 +1,8 @@
 //! Depth images of stored transitions, kept while the VAE is trained, or for ever where the policy learns from them.
 //!
-//! A flight's images are taken over in the block the flight brought them in, not copied. Images are numbered in order of arrival, so the image of a step's
+//! An episode's images are taken over in the block the episode brought them in, not copied. Images are numbered in order of arrival, so the image of a step's
 //! next observation is the following number, the closing image included. For the VAE nothing is dropped before the end: a transition that the ring overwrites
-//! leaves its images behind as training material, and no row can ever point at an image of another flight; what bounds the store is that the VAE is frozen
+//! leaves its images behind as training material, and no row can ever point at an image of another episode; what bounds the store is that the VAE is frozen
 //! after a configured number of steps. For a policy, images that no row needs are [swept out](ImageStore::keep_only) now and then, and the others numbered anew, in the
 //! same order.
 
@@ -14,8 +14,8 @@ use skein_protocol::{IMAGE_PIXELS, LatentCode};
 /// Images, by number.
 #[derive(Debug)]
 pub(super) struct ImageStore {
-    /// One block a flight, shared with a checkpoint being written: `[steps + 1, 72, 128]`.
-    flights: Vec<Arc<Vec<u8>>>,
+    /// One block an episode, shared with a checkpoint being written: `[steps + 1, 72, 128]`.
+    episodes: Vec<Arc<Vec<u8>>>,
     /// Number of each block's first image.
     first: Vec<u32>,
     len: usize,
@@ -27,7 +27,7 @@ impl ImageStore {
     pub(super) fn new(limit: usize) -> Self {
         // Numbers are 32 bits; the configuration's largest limit is far below.
         Self {
-            flights: Vec::new(),
+            episodes: Vec::new(),
             first: Vec::new(),
             len: 0,
             limit: limit.min(u32::MAX as usize),
@@ -49,21 +49,21 @@ impl ImageStore {
         self.len + images <= self.limit
     }
 
-    /// Takes over a flight's images; returns the number of the first. The caller made sure of [`ImageStore::has_room`].
+    /// Takes over an episode's images; returns the number of the first. The caller made sure of [`ImageStore::has_room`].
     pub(super) fn push(&mut self, images: Arc<Vec<u8>>) -> u32 {
         let first = self.len as u32;
         self.len += images.len() / IMAGE_PIXELS;
         self.first.push(first);
-        self.flights.push(images);
+        self.episodes.push(images);
         first
     }
 
-    /// Appends images to the last flight's block; returns the number of the image before the first of them. The caller made sure of [`ImageStore::has_room`], and
+    /// Appends images to the last episode's block; returns the number of the image before the first of them. The caller made sure of [`ImageStore::has_room`], and
     /// that there is a block.
     pub(super) fn extend(&mut self, images: &[u8]) -> u32 {
         let before = self.len as u32 - 1;
         self.len += images.len() / IMAGE_PIXELS;
-        if let Some(block) = self.flights.last_mut() {
+        if let Some(block) = self.episodes.last_mut() {
             let block = Arc::make_mut(block);
             block.reserve_exact(images.len());
             block.extend_from_slice(images);
@@ -73,12 +73,12 @@ impl ImageStore {
 
     /// Gives up all images but those `needed`, `[len]`; returns the new number of each image, one that means nothing of those that are gone.
     ///
-    /// Of a flight that is needed in part, the needed images are copied into a block of their own. Two neighbours that are kept remain neighbours.
+    /// Of an episode that is needed in part, the needed images are copied into a block of their own. Two neighbours that are kept remain neighbours.
     pub(super) fn keep_only(&mut self, needed: &[bool]) -> Vec<u32> {
         let mut numbers = Vec::with_capacity(needed.len());
-        let (flights, first) = (std::mem::take(&mut self.flights), std::mem::take(&mut self.first));
+        let (episodes, first) = (std::mem::take(&mut self.episodes), std::mem::take(&mut self.first));
         self.len = 0;
-        for (block, first) in flights.into_iter().zip(first) {
+        for (block, first) in episodes.into_iter().zip(first) {
             let needed = &needed[first as usize..][..block.len() / IMAGE_PIXELS];
             let before = self.len as u32;
             numbers.extend(needed.iter().scan(before, |next, &needed| {
@@ -98,8 +98,8 @@ impl ImageStore {
     }
 
     /// The blocks, in order.
-    pub(super) fn flights(&self) -> &[Arc<Vec<u8>>] {
-        &self.flights
+    pub(super) fn episodes(&self) -> &[Arc<Vec<u8>>] {
+        &self.episodes
     }
 
     /// Draws `count` images uniformly with replacement into `into`, `[count, 72, 128]`.
@@ -110,7 +110,7 @@ impl ImageStore {
         }
     }
 
-    /// The latent code of every image, by number. `encode` sees `chunk` images at a time, the last time what remains, whatever the flights' lengths:
+    /// The latent code of every image, by number. `encode` sees `chunk` images at a time, the last time what remains, whatever the episodes' lengths:
     /// a store restored from a checkpoint is encoded in the same pieces.
     pub(super) fn encode<E>(
         &self,
@@ -120,9 +120,9 @@ impl ImageStore {
         let mut latents = Vec::with_capacity(self.len);
         let mut images = Vec::with_capacity(chunk.min(self.len) * IMAGE_PIXELS);
         let mut pending = self
-            .flights
+            .episodes
             .iter()
-            .flat_map(|flight| flight.chunks_exact(IMAGE_PIXELS))
+            .flat_map(|episode| episode.chunks_exact(IMAGE_PIXELS))
             .peekable();
         while pending.peek().is_some() {
             images.clear();
@@ -141,19 +141,19 @@ impl ImageStore {
         Ok(latents)
     }
 
-    /// The number of the first image of the flight that image `number` is of.
-    pub(super) fn first_of_flight(&self, number: u32) -> u32 {
-        self.first[self.flight_of(number)]
+    /// The number of the first image of the episode that image `number` is of.
+    pub(super) fn first_of_episode(&self, number: u32) -> u32 {
+        self.first[self.episode_of(number)]
     }
 
-    fn flight_of(&self, number: u32) -> usize {
+    fn episode_of(&self, number: u32) -> usize {
         self.first.partition_point(|&first| first <= number) - 1
     }
 
     /// The image of this number, `[72, 128]`.
     pub(super) fn image(&self, number: u32) -> &[u8] {
-        let flight = self.flight_of(number);
-        let start = (number - self.first[flight]) as usize * IMAGE_PIXELS;
-        &self.flights[flight][start..start + IMAGE_PIXELS]
+        let episode = self.episode_of(number);
+        let start = (number - self.first[episode]) as usize * IMAGE_PIXELS;
+        &self.episodes[episode][start..start + IMAGE_PIXELS]
     }
 }

@@ -1,8 +1,8 @@
 //! The split replay buffer (paper, section 3.5).
 //!
 //! Successful avoidance is rare in the beginning and would drown among everything else, so it has a part of its own with a fixed share of every
-//! minibatch. (With a share of nought there is one part for all, the ordinary buffer.) Each part is a [`ring`] of self-contained rows. Whole flights go in, in flight order, or their legs, and nothing here is random but what the
-//! caller's seeded generator draws: the content is a function of the flights, and a minibatch one of content and seed.
+//! minibatch. (With a share of zero there is one part for all, the ordinary buffer.) Each part is a [`ring`] of self-contained rows. Whole episodes go in, in episode order, or their segments, and nothing here is random but what the
+//! caller's seeded generator draws: the content is a function of the episodes, and a minibatch one of content and seed.
 //!
 //! While the VAE is trained, the depth [`images`] of stored transitions are kept: the VAE learns from them, and when it is frozen the latent codes of all
 //! rows, each made by the encoder of its day, are made anew with the final one. Then the images go. Where the encoder is trained end to end they stay: a minibatch
@@ -19,10 +19,10 @@ use std::sync::Arc;
 
 use rand::{Rng, RngExt};
 use skein_protocol::config::{Config, EncoderTraining, ReplaySection, View};
-use skein_protocol::ids::FlightId;
+use skein_protocol::ids::EpisodeId;
 use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode};
 
-use crate::flight::{CommittedFlight, FlightFault};
+use crate::episode::{CommittedEpisode, EpisodeFault};
 use images::ImageStore;
 use ring::{Ring, RowLayout};
 
@@ -43,8 +43,8 @@ pub struct Replay {
     encoder: EncoderTraining,
     /// Images from which on those that no transition needs are looked for, where a policy learns from them.
     sweep_above: usize,
-    /// The flight that was stored last, and how many steps of it: what a later leg must follow. In no checkpoint, as those lie between flights.
-    last: Option<(FlightId, usize)>,
+    /// The episode that was stored last, and how many steps of it: what a later segment must follow. In no checkpoint, as those lie between episodes.
+    last: Option<(EpisodeId, usize)>,
 }
 
 /// A minibatch of transitions in flat buffers that are reused from draw to draw.
@@ -62,7 +62,7 @@ pub struct Minibatch {
     pub true_states: Vec<f32>,
     /// The same after the action.
     pub next_true_states: Vec<f32>,
-    /// `[batch]`: 1 where the flight ended in a state without a future, else 0. A flight's last step before the time limit is 0: it bootstraps.
+    /// `[batch]`: 1 where the episode ended in a state without a future, else 0. An episode's last step before the time limit is 0: it bootstraps.
     pub terminated: Vec<f32>,
     /// Depth images of the observations, `[batch, 72, 128]`, where the encoder is trained end to end; else empty.
     pub images: Vec<u8>,
@@ -72,31 +72,31 @@ pub struct Minibatch {
     slots: Vec<usize>,
 }
 
-/// Why a flight cannot be stored. Nothing of it is.
+/// Why an episode cannot be stored. Nothing of it is.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InsertError {
     /// Its parts do not belong together.
     #[error(transparent)]
-    Fault(#[from] FlightFault),
-    /// It is a leg, and what was stored last is not what was flown before it.
-    #[error("a leg of flight {flight} from its step {first_step} on cannot follow what was stored before it")]
+    Fault(#[from] EpisodeFault),
+    /// It is a segment, and what was stored last is not what was flown before it.
+    #[error("a segment of episode {episode} from its step {first_step} on cannot follow what was stored before it")]
     OutOfPlace {
-        /// The flight.
-        flight: FlightId,
+        /// The episode.
+        episode: EpisodeId,
         /// Steps flown before.
         first_step: usize,
     },
     /// It came without depth images while they are learned from.
-    #[error("flight {flight} has no depth images, but images are still learned from")]
+    #[error("episode {episode} has no depth images, but images are still learned from")]
     NoImages {
-        /// The flight.
-        flight: FlightId,
+        /// The episode.
+        episode: EpisodeId,
     },
     /// The images have no room.
-    #[error("{found} depth images of flight {flight} exceed the {limit} that can be needed, {held} of them held")]
+    #[error("{found} depth images of episode {episode} exceed the {limit} that can be needed, {held} of them held")]
     TooManyImages {
-        /// The flight.
-        flight: FlightId,
+        /// The episode.
+        episode: EpisodeId,
         /// Its images.
         found: usize,
         /// Images held.
@@ -144,38 +144,40 @@ impl Replay {
         self.images.as_ref().map(ImageStore::len)
     }
 
-    /// Stores all transitions of `flight`, in order, each in the part the success rule says. Its depth images are taken over while they are learned from, and
-    /// dropped after. Of a later leg the first image is the last one of the leg before, and is not stored twice.
+    /// Stores all transitions of `episode`, in order, each in the part the success rule says. Its depth images are taken over while they are learned from, and
+    /// dropped after. Of a later segment the first image is the last one of the segment before, and is not stored twice.
     ///
     /// # Errors
     /// [`InsertError`]; the buffer is as before.
-    pub fn insert(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
-        flight.check()?;
-        self.check_place(&flight)?;
-        let first_image = self.take_images(&mut flight)?;
-        let success = success_steps(&flight.level_up, &self.section);
-        let last = flight.steps() - 1;
+    pub fn insert(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
+        episode.check()?;
+        self.check_place(&episode)?;
+        let first_image = self.take_images(&mut episode)?;
+        let success = success_steps(&episode.level_up, &self.section);
+        let last = episode.steps() - 1;
         for (step, &success) in success.iter().enumerate() {
             let ring = if success { &mut self.success } else { &mut self.regular };
             let row = ring.claim(first_image.map(|first| first + step as u32));
-            flight.write_observation(step, &self.view, row.observation);
-            flight.write_observation(step + 1, &self.view, row.next_observation);
-            flight.write_true_state(step, row.true_state);
-            flight.write_true_state(step + 1, row.next_true_state);
-            row.action.copy_from_slice(&flight.actions[step]);
-            *row.reward = flight.rewards[step];
-            *row.terminated = f32::from(step == last && flight.terminated());
+            episode.write_observation(step, &self.view, row.observation);
+            episode.write_observation(step + 1, &self.view, row.next_observation);
+            episode.write_true_state(step, row.true_state);
+            episode.write_true_state(step + 1, row.next_true_state);
+            row.action.copy_from_slice(&episode.actions[step]);
+            *row.reward = episode.rewards[step];
+            *row.terminated = f32::from(step == last && episode.terminated());
         }
-        self.last = Some((flight.flight, flight.first_step + flight.steps()));
+        self.last = Some((episode.episode, episode.first_step + episode.steps()));
         Ok(())
     }
 
-    /// Whether a later leg follows the one before it.
-    fn check_place(&self, flight: &CommittedFlight) -> Result<(), InsertError> {
-        let CommittedFlight { flight, first_step, .. } = *flight;
-        match first_step == 0 || self.last == Some((flight, first_step)) {
+    /// Whether a later segment follows the one before it.
+    fn check_place(&self, episode: &CommittedEpisode) -> Result<(), InsertError> {
+        let CommittedEpisode {
+            episode, first_step, ..
+        } = *episode;
+        match first_step == 0 || self.last == Some((episode, first_step)) {
             true => Ok(()),
-            false => Err(InsertError::OutOfPlace { flight, first_step }),
+            false => Err(InsertError::OutOfPlace { episode, first_step }),
         }
     }
 
@@ -206,7 +208,7 @@ impl Replay {
     pub fn sample_images(&self, rng: &mut impl Rng, count: usize, into: &mut Vec<u8>) {
         let images = self.images.as_ref().filter(|images| images.len() > 0);
         images
-            .expect("the VAE is trained only before it is frozen and after flights came in")
+            .expect("the VAE is trained only before it is frozen and after episodes came in")
             .sample(rng, count, into);
     }
 
@@ -230,21 +232,21 @@ impl Replay {
         if let Some(images) = &self.images {
             let latents = images.encode(chunk, encode)?;
             for ring in [&mut self.success, &mut self.regular] {
-                ring.replace_latents(&self.view, &latents, |image| images.first_of_flight(image));
+                ring.replace_latents(&self.view, &latents, |image| images.first_of_episode(image));
             }
         }
         Ok(())
     }
 
-    /// Hands the flight's images to the store; the number of the first, if images are stored.
-    fn take_images(&mut self, flight: &mut CommittedFlight) -> Result<Option<u32>, InsertError> {
+    /// Hands the episode's images to the store; the number of the first, if images are stored.
+    fn take_images(&mut self, episode: &mut CommittedEpisode) -> Result<Option<u32>, InsertError> {
         if self.images.is_none() {
             return Ok(None);
         }
-        let id = flight.flight;
-        let images = flight.depth.take().ok_or(InsertError::NoImages { flight: id })?;
-        let is_later_leg = flight.first_step > 0;
-        let found = flight.steps() + usize::from(!is_later_leg);
+        let id = episode.episode;
+        let images = episode.depth.take().ok_or(InsertError::NoImages { episode: id })?;
+        let is_later_segment = episode.first_step > 0;
+        let found = episode.steps() + usize::from(!is_later_segment);
         self.sweep_images(found);
         let Some(store) = &mut self.images else {
             return Ok(None);
@@ -252,20 +254,20 @@ impl Replay {
         if !store.has_room(found) {
             let (held, limit) = (store.len(), store.limit());
             return Err(InsertError::TooManyImages {
-                flight: id,
+                episode: id,
                 found,
                 held,
                 limit,
             });
         }
-        Ok(Some(match is_later_leg {
+        Ok(Some(match is_later_segment {
             true => store.extend(&images[IMAGE_PIXELS..]),
             false => store.push(Arc::new(images)),
         }))
     }
 
     /// Gives up the images of transitions that are overwritten, if a policy learns from images and there would be too many with so many more. When that is follows from
-    /// how many are held, so that a buffer restored from a checkpoint does the same. The newest transition's images stay: a leg may follow it.
+    /// how many are held, so that a buffer restored from a checkpoint does the same. The newest transition's images stay: a segment may follow it.
     fn sweep_images(&mut self, more: usize) {
         let Some(store) = &mut self.images else { return };
         if self.encoder == EncoderTraining::Vae || store.len() + more <= self.sweep_above {
@@ -328,7 +330,7 @@ fn capacities(section: &ReplaySection) -> (usize, usize) {
 }
 
 /// Images that can be needed. The VAE's training can leave behind: before the epoch in which it is frozen, fewer than `vae.train_steps` steps were flown, with at
-/// most as many closing images; then come the flights of one epoch. Their mirror images come on top. A policy needs those of the transitions held, two each at most, and of the flight that comes in.
+/// most as many closing images; then come the episodes of one epoch. Their mirror images come on top. A policy needs those of the transitions held, two each at most, and of the episode that comes in.
 fn image_limit(config: &Config) -> usize {
     let steps = match config.learning.encoder {
         EncoderTraining::Vae => config.vae.train_steps,
@@ -337,9 +339,9 @@ fn image_limit(config: &Config) -> usize {
     2 * steps * config.learning.times_stored() + epoch_images(config)
 }
 
-/// Images of an epoch's flights at most.
+/// Images of an epoch's episodes at most.
 fn epoch_images(config: &Config) -> usize {
-    config.learning.flights_per_epoch as usize
-        * config.transport.max_records_per_flight
+    config.learning.episodes_per_epoch as usize
+        * config.transport.max_records_per_episode
         * config.learning.times_stored()
 }

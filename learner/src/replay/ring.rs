@@ -191,22 +191,22 @@ impl Ring {
         self.images = Vec::new();
     }
 
-    /// Rewrites the latent parts of both observations of every row from `latents`, one per image. `first_of_flight` says which image of an image's flight was the
+    /// Rewrites the latent parts of both observations of every row from `latents`, one per image. `first_of_episode` says which image of an image's episode was the
     /// first.
     pub(super) fn replace_latents(
         &mut self,
         view: &View,
         latents: &[LatentCode],
-        first_of_flight: impl Fn(u32) -> u32,
+        first_of_episode: impl Fn(u32) -> u32,
     ) {
         for (values, &image) in self.rows.chunks_exact_mut(self.layout.width()).zip(&self.images) {
             let row = self.layout.row_mut(values);
-            let first = first_of_flight(image);
-            let (flight, step) = (&latents[first as usize..], (image - first) as usize);
+            let first = first_of_episode(image);
+            let (episode, step) = (&latents[first as usize..], (image - first) as usize);
             for (step, observation) in [(step, row.observation), (step + 1, row.next_observation)] {
                 let moments = observation.chunks_exact_mut(view.moment_len());
                 for (moment, seen) in view.moments(step).zip(moments) {
-                    view.write_code(&flight[moment], seen);
+                    view.write_code(&episode[moment], seen);
                 }
             }
         }

@@ -16,7 +16,7 @@ pub struct ReplayState {
     pub success: RingState,
     /// The regular part.
     pub regular: RingState,
-    /// Depth images, one block a flight, `[images, 72, 128]`; `None` once the VAE is frozen. Shared with the buffer, not copied.
+    /// Depth images, one block an episode, `[images, 72, 128]`; `None` once the VAE is frozen. Shared with the buffer, not copied.
     pub images: Option<Vec<Arc<Vec<u8>>>>,
 }
 
@@ -36,7 +36,7 @@ impl Replay {
         ReplayState {
             success: self.success.state(),
             regular: self.regular.state(),
-            images: self.images.as_ref().map(|images| images.flights().to_vec()),
+            images: self.images.as_ref().map(|images| images.episodes().to_vec()),
         }
     }
 
@@ -70,7 +70,7 @@ fn fill(store: &mut ImageStore, blocks: &[Arc<Vec<u8>>]) -> Result<(), String> {
         let images = block.len() / IMAGE_PIXELS;
         if block.len() % IMAGE_PIXELS != 0 || !store.has_room(images) {
             return Err(format!(
-                "a flight's {} bytes are no whole images of {IMAGE_PIXELS}, or more than the {} images that may be held",
+                "an episode's {} bytes are no whole images of {IMAGE_PIXELS}, or more than the {} images that may be held",
                 block.len(),
                 store.limit()
             ));

@@ -7,7 +7,7 @@ use tch::Tensor;
 
 /// Soft Bellman targets, `[n]` (eq. 2 and 3): r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')), a' drawn from the policy.
 ///
-/// A flight that was cut off (truncated) is not terminated: its last state still has a future, and its value is bootstrapped.
+/// An episode that was cut off (truncated) is not terminated: its last state still has a future, and its value is bootstrapped.
 /// `rewards`, `terminated`, `next_values` (the smaller Q̄) and `next_log_prob`: `[n]`; `temperature`: α, `[1]`.
 pub fn soft_targets(
     rewards: &Tensor,
@@ -69,8 +69,8 @@ mod tests {
     }
 
     #[test]
-    fn truncated_flight_still_bootstraps() {
-        // The same last step twice: once the flight crashed, once its step limit cut it off. Only the crash has no future.
+    fn truncated_episode_still_bootstraps() {
+        // The same last step twice: once the episode crashed, once its step limit cut it off. Only the crash has no future.
         let (crashed, truncated) = (1.0, 0.0);
         let targets = soft_targets(
             &numbers(&[-1.0, -1.0]),

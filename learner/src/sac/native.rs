@@ -57,14 +57,14 @@ struct Work {
     /// Of the actions replayed, then of those drawn.
     critic: CriticLayers,
     /// Of the actions replayed.
-    critic_flowing: CriticLayers,
+    critic_grad: CriticLayers,
     /// Of the values of the actions drawn, `[rows, 2]`.
-    drawn_flowing: Vec<f32>,
+    drawn_grad: Vec<f32>,
     /// `[rows, 2]`.
     action_gradient: Vec<f32>,
     /// Of the states alone.
     policy: Layers,
-    policy_flowing: Layers,
+    policy_grad: Layers,
 }
 
 impl NativeSac {
@@ -119,14 +119,14 @@ impl NativeSac {
 
     /// The critic's gradient: what the state after the action is worth says the slow critic (eq. 3), and both estimates are drawn towards
     /// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')) (eq. 5). Returns the loss and the mean of the smaller estimate.
-    fn criticise(&mut self, team: &mut Team, columns: Columns<'_>, temperature: f32) -> [f32; 2] {
+    fn critic_gradient(&mut self, team: &mut Team, columns: Columns<'_>, temperature: f32) -> [f32; 2] {
         let Work {
             rows,
             sample,
             joined,
             target_values,
             critic: given,
-            critic_flowing,
+            critic_grad,
             ..
         } = &mut self.work;
         let (next_actions, next_log_prob) = (&sample.actions[..*rows * ACTION], &sample.log_prob[..*rows]);
@@ -139,35 +139,35 @@ impl NativeSac {
         self.critic.forward(team, critic, joined, given);
         let (mut loss, mut value) = (0.0, 0.0);
         let share = 1.0 / *rows as f32;
-        let flowing = &mut critic_flowing.values;
+        let grad = &mut critic_grad.values;
         for row in 0..*rows {
             let soft_value = smaller(pair(target_values, row)) - temperature * next_log_prob[row];
             let target = columns.rewards[row] + (1.0 - columns.terminated[row]) * soft_value * self.discount;
             let values = pair(&given.values, row);
-            for (value, flowing) in values.iter().zip(&mut flowing[row * ESTIMATES..]) {
+            for (value, grad) in values.iter().zip(&mut grad[row * ESTIMATES..]) {
                 let error = value - target;
                 loss += 0.5 * f64::from(error * error);
-                *flowing = error * share;
+                *grad = error * share;
             }
             value += f64::from(smaller(values));
         }
         let into = &mut self.critic_parameters.gradient;
-        self.critic.gradient(team, critic, joined, given, critic_flowing, into);
+        self.critic.gradient(team, critic, joined, given, critic_grad, into);
         [loss, value].map(|sum| (sum / *rows as f64) as f32)
     }
 
     /// The policy's gradient: it moves towards actions of higher value, as far as its entropy is worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7). Returns the mean of
     /// that, and of log π.
-    fn improve(&mut self, team: &mut Team, columns: Columns<'_>, temperature: f32) -> [f32; 2] {
+    fn policy_gradient(&mut self, team: &mut Team, columns: Columns<'_>, temperature: f32) -> [f32; 2] {
         let Work {
             rows,
             sample,
             joined,
             critic: given,
-            drawn_flowing,
+            drawn_grad,
             action_gradient,
             policy: policy_given,
-            policy_flowing,
+            policy_grad,
             ..
         } = &mut self.work;
         let (policy, critic) = (&self.policy_parameters.values, &self.critic_parameters.values);
@@ -180,18 +180,18 @@ impl NativeSac {
             let values = pair(&given.values, row);
             log_prob_sum += f64::from(log_prob);
             loss += f64::from(temperature * log_prob - smaller(values));
-            drawn_flowing[row * ESTIMATES..][..ESTIMATES]
+            drawn_grad[row * ESTIMATES..][..ESTIMATES]
                 .copy_from_slice(&share_of_smaller(values).map(|part| -share * part));
         }
         let action = self.inputs.critic..self.inputs.critic + ACTION;
         self.critic
-            .backward_through(team, critic, given, drawn_flowing, action, action_gradient);
+            .backward_through(team, critic, given, drawn_grad, action, action_gradient);
         // Back through the drawing and the policy.
-        sample.backward(*rows, temperature * share, action_gradient, output_mut(policy_flowing));
-        self.policy.backward(team, policy, policy_given, policy_flowing);
+        sample.backward(*rows, temperature * share, action_gradient, output_mut(policy_grad));
+        self.policy.backward(team, policy, policy_given, policy_grad);
         let into = &mut self.policy_parameters.gradient;
         self.policy
-            .gradient(team, columns.observations, policy_given, policy_flowing, into);
+            .gradient(team, columns.observations, policy_given, policy_grad, into);
         [loss, log_prob_sum].map(|sum| (sum / *rows as f64) as f32)
     }
 
@@ -205,11 +205,11 @@ impl NativeSac {
             joined: numbers(rows, self.inputs.critic + ACTION),
             target_values: numbers(rows, ESTIMATES),
             critic: self.critic.places(rows),
-            critic_flowing: self.critic.places(rows),
-            drawn_flowing: numbers(rows, ESTIMATES),
+            critic_grad: self.critic.places(rows),
+            drawn_grad: numbers(rows, ESTIMATES),
             action_gradient: numbers(rows, ACTION),
             policy: self.policy.places(rows),
-            policy_flowing: self.policy.places(rows),
+            policy_grad: self.policy.places(rows),
         }
     }
 
@@ -258,8 +258,8 @@ impl Algorithm for NativeSac {
         }
         let temperature = exp(self.log_temperature.values[0]);
         self.draw(team, columns, noise);
-        let [critic_loss, mean_value] = self.criticise(team, columns, temperature);
-        let [policy_loss, log_prob] = self.improve(team, columns, temperature);
+        let [critic_loss, mean_value] = self.critic_gradient(team, columns, temperature);
+        let [policy_loss, log_prob] = self.policy_gradient(team, columns, temperature);
         // The temperature rises while the policy is more certain than asked for, and falls otherwise: the gradient of -α (log π + H̄) by log α is itself (eq. 18).
         self.log_temperature.gradient[0] = -temperature * (log_prob + self.target_entropy);
 

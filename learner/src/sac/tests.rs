@@ -131,9 +131,9 @@ fn an_update_that_is_not_finite_changes_nothing() {
 }
 
 #[test]
-fn truncated_flight_still_bootstraps() {
+fn truncated_episode_still_bootstraps() {
     for engine in ENGINES {
-        // What the critic learns of one transition, the last of its flight, when the state after it is another.
+        // What the critic learns of one transition, the last of its episode, when the state after it is another.
         let learned = |terminated: f32, next: f32| {
             let mut sac = sac(engine, &small(), 1);
             let mut last = Transitions::guessing(OBSERVATION, 1, &mut Noise::new(1));

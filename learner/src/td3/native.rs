@@ -45,11 +45,11 @@ struct Work {
     /// `[rows, 2]`.
     target_values: Vec<f32>,
     critic: CriticLayers,
-    critic_flowing: CriticLayers,
+    critic_grad: CriticLayers,
     /// Of the values of the policy's actions, `[rows, 2]`.
-    value_flowing: Vec<f32>,
+    value_grad: Vec<f32>,
     policy: Layers,
-    policy_flowing: Layers,
+    policy_grad: Layers,
 }
 
 impl NativeTd3 {
@@ -79,7 +79,7 @@ impl NativeTd3 {
 
     /// The critic's gradient: both estimates are drawn towards r + γ (1 - terminated) min Q̄(s', a'), where a' is what the target policy would do, give or take some noise (eq. 14 and 15).
     /// Returns the loss and the mean of the smaller estimate.
-    fn criticise(&mut self, team: &mut Team, columns: Columns<'_>, noise: &mut Noise) -> [f32; 2] {
+    fn critic_gradient(&mut self, team: &mut Team, columns: Columns<'_>, noise: &mut Noise) -> [f32; 2] {
         let Td3Section {
             discount,
             target_noise,
@@ -94,7 +94,7 @@ impl NativeTd3 {
             joined,
             target_values,
             critic: given,
-            critic_flowing,
+            critic_grad,
             ..
         } = &mut self.work;
         self.policy
@@ -112,33 +112,33 @@ impl NativeTd3 {
         self.critic.forward(team, critic, joined, given);
         let (mut loss, mut value) = (0.0, 0.0);
         let share = 1.0 / *rows as f32;
-        let flowing = &mut critic_flowing.values;
+        let grad = &mut critic_grad.values;
         for row in 0..*rows {
             let next = (1.0 - columns.terminated[row]) * smaller(pair(target_values, row));
             let target = columns.rewards[row] + next * discount as f32;
             let values = pair(&given.values, row);
-            for (value, flowing) in values.iter().zip(&mut flowing[row * ESTIMATES..]) {
+            for (value, grad) in values.iter().zip(&mut grad[row * ESTIMATES..]) {
                 let error = value - target;
                 loss += 0.5 * f64::from(error * error);
-                *flowing = error * share;
+                *grad = error * share;
             }
             value += f64::from(smaller(values));
         }
         let into = &mut self.critic_parameters.gradient;
-        self.critic.gradient(team, critic, joined, given, critic_flowing, into);
+        self.critic.gradient(team, critic, joined, given, critic_grad, into);
         [loss, value].map(|sum| (sum / *rows as f64) as f32)
     }
 
     /// The policy's gradient: it moves towards actions of which the first estimate thinks more (the deterministic policy gradient, eq. 1). Returns its loss, -Q₁.
-    fn improve(&mut self, team: &mut Team, columns: Columns<'_>) -> f32 {
+    fn policy_gradient(&mut self, team: &mut Team, columns: Columns<'_>) -> f32 {
         let Work {
             rows,
             actions,
             joined,
             critic: given,
-            value_flowing,
+            value_grad,
             policy: policy_given,
-            policy_flowing,
+            policy_grad,
             ..
         } = &mut self.work;
         let (policy, critic) = (&self.policy_parameters.values, &self.critic_parameters.values);
@@ -150,23 +150,20 @@ impl NativeTd3 {
         self.critic.forward(team, critic, joined, given);
         let share = 1.0 / *rows as f32;
         let mut loss = 0.0;
-        for (row, flowing) in value_flowing.chunks_exact_mut(ESTIMATES).enumerate() {
+        for (row, grad) in value_grad.chunks_exact_mut(ESTIMATES).enumerate() {
             loss -= f64::from(pair(&given.values, row)[0]);
-            flowing.copy_from_slice(&[-share, 0.0]);
+            grad.copy_from_slice(&[-share, 0.0]);
         }
-        let (action, flowing) = (
-            self.inputs.critic..self.inputs.critic + ACTION,
-            output_mut(policy_flowing),
-        );
+        let (action, grad) = (self.inputs.critic..self.inputs.critic + ACTION, output_mut(policy_grad));
         self.critic
-            .backward_through(team, critic, given, value_flowing, action, flowing);
-        for (flowing, action) in flowing.iter_mut().zip(actions) {
-            *flowing *= 1.0 - *action * *action;
+            .backward_through(team, critic, given, value_grad, action, grad);
+        for (grad, action) in grad.iter_mut().zip(actions) {
+            *grad *= 1.0 - *action * *action;
         }
-        self.policy.backward(team, policy, policy_given, policy_flowing);
+        self.policy.backward(team, policy, policy_given, policy_grad);
         let into = &mut self.policy_parameters.gradient;
         self.policy
-            .gradient(team, columns.observations, policy_given, policy_flowing, into);
+            .gradient(team, columns.observations, policy_given, policy_grad, into);
         (loss / *rows as f64) as f32
     }
 
@@ -180,10 +177,10 @@ impl NativeTd3 {
             joined: numbers(rows, self.inputs.critic + ACTION),
             target_values: numbers(rows, ESTIMATES),
             critic: self.critic.places(rows),
-            critic_flowing: self.critic.places(rows),
-            value_flowing: numbers(rows, ESTIMATES),
+            critic_grad: self.critic.places(rows),
+            value_grad: numbers(rows, ESTIMATES),
             policy: self.policy.places(rows),
-            policy_flowing: self.policy.places(rows),
+            policy_grad: self.policy.places(rows),
         }
     }
 
@@ -208,14 +205,14 @@ impl Algorithm for NativeTd3 {
             self.work = self.places(rows);
         }
         let improves = (self.updates() + 1).is_multiple_of(self.settings.policy_period);
-        let [critic_loss, value] = self.criticise(team, columns, noise);
+        let [critic_loss, value] = self.critic_gradient(team, columns, noise);
         let mut numbers = vec![
             ("critic loss", critic_loss),
             ("mean value", value),
             ("critic gradient", self.norm(&self.critic_parameters)),
         ];
         if improves {
-            numbers.push(("policy loss", self.improve(team, columns)));
+            numbers.push(("policy loss", self.policy_gradient(team, columns)));
             numbers.push(("policy gradient", self.norm(&self.policy_parameters)));
         }
         must_be_finite(self.updates() + 1, numbers)?;

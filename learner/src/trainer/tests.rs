@@ -7,10 +7,10 @@ use skein_protocol::transition::Outcome;
 
 use super::*;
 use crate::checkpoint::{CheckpointState, CheckpointStore};
-use crate::flight::samples::{flight, shade, with_images};
+use crate::episode::samples::{episode, shade, with_images};
 
-/// Flights of an epoch, each of 10 steps.
-const FLIGHTS: u64 = 2;
+/// Episodes of an epoch, each of 10 steps.
+const EPISODES: u64 = 2;
 /// Steps of an epoch.
 const STEPS: usize = 20;
 
@@ -20,7 +20,7 @@ fn config() -> Config {
     config.run.learner_threads = 1;
     config.learning.warmup_steps = STEPS + 1;
     config.learning.updates_per_step = 0.25;
-    config.learning.flights_per_epoch = FLIGHTS;
+    config.learning.episodes_per_epoch = EPISODES;
     config.sac.hidden_width = 16;
     config.sac.batch_size = 8;
     config.vae.train_steps = 3 * STEPS;
@@ -31,10 +31,10 @@ fn config() -> Config {
     config
 }
 
-/// One epoch as the training loop does it. With a lag, `keep` is what was needed when its flights were ordered.
+/// One epoch as the training loop does it. With a lag, `keep` is what was needed when its episodes were ordered.
 fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
-    for number in epoch * FLIGHTS..(epoch + 1) * FLIGHTS {
-        let mut flown = flight(number, STEPS / FLIGHTS as usize, Outcome::Collided);
+    for number in epoch * EPISODES..(epoch + 1) * EPISODES {
+        let mut flown = episode(number, STEPS / EPISODES as usize, Outcome::Collided);
         flown.level_up[4] = true;
         // Rewards that a critic of such few updates does not run away from.
         flown.rewards.iter_mut().for_each(|reward| *reward = reward.sin());
@@ -65,20 +65,20 @@ fn end_to_end(algorithm: AlgorithmName) -> Config {
     config.learning.algorithm = algorithm;
     config.td3.hidden_width = 16;
     config.td3.batch_size = 8;
-    config.transport.max_records_per_flight = 12;
+    config.transport.max_records_per_episode = 12;
     config
 }
 
 fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
     CheckpointState {
         progress: Progress {
-            flights: epochs * FLIGHTS,
+            episodes: epochs * EPISODES,
             epochs,
             version: epochs,
             environment_steps: trainer.steps(),
             vae_steps: trainer.vae_updates(),
             policy_updates: trainer.updates(),
-            ..Progress::start(config().evaluation.window_flights as usize)
+            ..Progress::start(config().evaluation.window_episodes as usize)
         },
         tensors: trainer.tensors(),
         replay: trainer.replay().state(),
@@ -104,7 +104,7 @@ fn resumed(trainer: &mut Trainer, epochs: u64) -> Trainer {
 /// Six epochs, resumed after each of `resumed_after`.
 fn train(config: &Config, lag: u64, resumed_after: &[u64]) -> CheckpointState {
     let mut trainer = Trainer::new(config).unwrap();
-    // What was needed of the flights of the first epochs, when they were ordered.
+    // What was needed of the episodes of the first epochs, when they were ordered.
     let mut keep = vec![trainer.keep(); lag as usize];
     for epoch in 0..6 {
         keep.push(trainer.keep());
@@ -150,7 +150,7 @@ fn what_learns_end_to_end_goes_on_bit_for_bit_too_and_keeps_its_images_to_the_en
             .flatten()
             .map(|block| block.len())
             .sum();
-        let flown = (environment_steps + 6 * FLIGHTS) as usize * IMAGE_PIXELS;
+        let flown = (environment_steps + 6 * EPISODES) as usize * IMAGE_PIXELS;
         assert!(0 < images && images < flown, "{images} bytes of {flown} flown are held");
         for after in [&[2][..], &[1, 2, 3, 4, 5]] {
             let resumed = train(&config, 1, after);
@@ -189,7 +189,7 @@ fn what_flies_is_the_average_of_the_policy_where_that_is_asked_for_and_learns_li
     let undisturbed = train(&averaged, 0, &[]);
     assert!(train(&averaged, 0, &[2, 4]) == undisturbed, "resumed");
 
-    // The same flights teach the same, whatever flies.
+    // The same episodes teach the same, whatever flies.
     let after = |averaged: usize| {
         let mut config = config();
         config.learning.average_updates = averaged;
@@ -278,7 +278,7 @@ fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
 }
 
 #[test]
-fn flights_are_stored_a_second_time_as_seen_in_a_mirror() {
+fn episodes_are_stored_a_second_time_as_seen_in_a_mirror() {
     let mut config = config();
     config.learning.mirror = true;
     config.learning.observation = Observation::LatentVelocityAction;
@@ -307,7 +307,7 @@ fn flights_are_stored_a_second_time_as_seen_in_a_mirror() {
     let count = to_the_left.count();
     assert!(
         (150..=250).contains(&count),
-        "{count} of 400 go to the left, as all flights do that were flown"
+        "{count} of 400 go to the left, as all episodes do that were flown"
     );
 }
 
@@ -326,9 +326,9 @@ fn while_the_vae_is_trained_stored_codes_are_made_anew_as_often_as_asked_for() {
 fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
     let precision = trainer.config.vae.encoder_precision;
     let network = Network::new(&trainer.snapshot(PolicyVersion(epochs)), &trainer.layout, precision);
-    let code = |(flight, step)| network.encode(&[shade(flight, step); IMAGE_PIXELS], &mut Scratch::default());
-    let codes: Vec<_> = (0..epochs * FLIGHTS)
-        .flat_map(|flight| (0..=STEPS / FLIGHTS as usize).map(move |step| (flight, step)))
+    let code = |(episode, step)| network.encode(&[shade(episode, step); IMAGE_PIXELS], &mut Scratch::default());
+    let codes: Vec<_> = (0..epochs * EPISODES)
+        .flat_map(|episode| (0..=STEPS / EPISODES as usize).map(move |step| (episode, step)))
         .map(code)
         .collect();
     let mut drawn = Minibatch::default();

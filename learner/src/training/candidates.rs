@@ -1,4 +1,4 @@
-//! Evaluation flights in a run: those that confirm a candidate for the best snapshot, and those that show in the end what it can do.
+//! Evaluation episodes in a run: those that confirm a candidate for the best snapshot, and those that show in the end what it can do.
 
 use std::ops::Range;
 
@@ -13,13 +13,13 @@ use super::{Training, TrainingError};
 use crate::best::{is_better, is_candidate};
 use crate::checkpoint::BestSnapshot;
 use crate::curriculum;
+use crate::episode::CommittedEpisode;
+use crate::episodes::assembly::Keep;
 use crate::evaluation;
-use crate::flight::CommittedFlight;
-use crate::flights::assembly::Keep;
 use crate::metrics::Scalar;
 
 impl Training<'_> {
-    /// Confirms the newest snapshot by evaluation flights if it is a candidate; keeps it if it is the best. The last one always is a candidate.
+    /// Confirms the newest snapshot by evaluation episodes if it is a candidate; keeps it if it is the best. The last one always is a candidate.
     ///
     /// It depends on the state alone and does nothing the second time: a run that was stopped here looks again when it is resumed.
     pub(super) fn look_for_best(&mut self) -> Result<(), TrainingError> {
@@ -32,28 +32,28 @@ impl Training<'_> {
         let flown = self.evaluate(tickets, Keep::Latents)?;
         pass(FaultPoint::LearnerCandidateFlown);
         self.note_trained(&flown);
-        let passed: f64 = flown.iter().map(|flight| f64::from(flight.walls_passed)).sum();
+        let passed: f64 = flown.iter().map(|episode| f64::from(episode.walls_passed)).sum();
         let candidate = BestSnapshot {
             policy_version: version.0,
-            flights: self.progress.flights,
+            episodes: self.progress.episodes,
             window_walls_passed: self.metrics.windows().walls_passed.mean().unwrap_or_default(),
             confirmed_walls_passed: passed / flown.len() as f64,
         };
         self.metrics.scalars(
-            self.last_flight(),
+            self.last_episode(),
             &[(Scalar::EvaluationWallsPassed, candidate.confirmed_walls_passed)],
         )?;
         let best = self.progress.best.as_ref();
         tracing::info!(
             version = candidate.policy_version,
-            flights = candidate.flights,
+            episodes = candidate.episodes,
             walls_passed = candidate.confirmed_walls_passed,
             window_walls_passed = candidate.window_walls_passed,
             best_version = best.map(|best| best.policy_version),
             best_walls_passed = best.map(|best| best.confirmed_walls_passed),
             "candidate for the best snapshot flown"
         );
-        self.progress.latest_candidate = Some(self.progress.flights);
+        self.progress.latest_candidate = Some(self.progress.episodes);
         if is_better(&candidate, best) {
             self.progress.best = Some(candidate);
             self.save_snapshot(version, &self.directory.best_snapshot())?;
@@ -63,22 +63,22 @@ impl Training<'_> {
     }
 
     /// Writes down what it took, the first time that `flown` show a policy that does what it was trained for.
-    fn note_trained(&mut self, flown: &[CommittedFlight]) {
-        let sum = |of: fn(&CommittedFlight) -> u8| flown.iter().map(|flight| f64::from(of(flight))).sum::<f64>();
-        let rate = sum(|flight| flight.walls_passed) / sum(|flight| flight.course_walls);
+    fn note_trained(&mut self, flown: &[CommittedEpisode]) {
+        let sum = |of: fn(&CommittedEpisode) -> u8| flown.iter().map(|episode| f64::from(of(episode))).sum::<f64>();
+        let rate = sum(|episode| episode.walls_passed) / sum(|episode| episode.course_walls);
         if self.progress.trained.is_some() || rate < self.config.evaluation.trained_rate {
             return;
         }
         let trained = Trained {
             rate,
-            flights: self.progress.flights,
+            episodes: self.progress.episodes,
             steps: self.trainer.steps(),
             updates: self.trainer.updates(),
             wall_secs: self.progress.spent.wall_secs + self.started.elapsed().as_secs_f64(),
         };
         tracing::info!(
             rate,
-            flights = trained.flights,
+            episodes = trained.episodes,
             steps = trained.steps,
             secs = trained.wall_secs,
             "trained"
@@ -88,45 +88,46 @@ impl Training<'_> {
 
     fn is_candidate(&self) -> bool {
         let progress = &self.progress;
-        let last = progress.flights == self.config.run.flights && progress.latest_candidate != Some(progress.flights);
+        let last =
+            progress.episodes == self.config.run.episodes && progress.latest_candidate != Some(progress.episodes);
         last || is_candidate(
             &self.config.evaluation,
-            progress.flights,
+            progress.episodes,
             progress.latest_candidate,
             &self.metrics.windows().walls_passed,
             progress.best.as_ref(),
         )
     }
 
-    /// Flies `flights` evaluation flights on each of `courses` with a published snapshot.
+    /// Flies `episodes` evaluation episodes on each of `courses` with a published snapshot.
     fn evaluate_on(
         &mut self,
         version: PolicyVersion,
         courses: Range<u32>,
-        flights: u64,
+        episodes: u64,
         keep: Keep,
-    ) -> Result<Vec<CommittedFlight>, TrainingError> {
+    ) -> Result<Vec<CommittedEpisode>, TrainingError> {
         let (run, number) = (self.identity.run, self.progress.evaluations);
-        let tickets = curriculum::evaluation(self.config, run, number, version, courses, flights);
+        let tickets = curriculum::evaluation(self.config, run, number, version, courses, episodes);
         self.evaluate(tickets, keep)
     }
 
     /// Flies `tickets` of the next evaluation, whose snapshot is published.
-    fn evaluate(&mut self, tickets: Vec<Ticket>, keep: Keep) -> Result<Vec<CommittedFlight>, TrainingError> {
+    fn evaluate(&mut self, tickets: Vec<Ticket>, keep: Keep) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         let total = tickets.len() as u64;
         self.reporter.update(|progress| {
             progress.phase = Phase::Evaluating;
-            progress.evaluation_flights = (0, total);
+            progress.evaluation_episodes = (0, total);
         });
-        let mut batch = self.reception.fly(Epoch(self.progress.epochs), keep, tickets)?;
+        let mut batch = self.receiver.fly(Epoch(self.progress.epochs), keep, tickets)?;
         let mut flown = Vec::with_capacity(batch.remaining());
-        while let Some(flight) = batch.next(self.stop)? {
-            self.reporter.update(|progress| progress.evaluation_flights.0 += 1);
-            flown.push(flight);
+        while let Some(episode) = batch.next(self.stop)? {
+            self.reporter.update(|progress| progress.evaluation_episodes.0 += 1);
+            flown.push(episode);
         }
         self.progress.evaluations += 1;
-        self.progress.evaluation_flights += total;
+        self.progress.evaluation_episodes += total;
         self.timer.lap(Stage::Evaluate, total);
         Ok(flown)
     }
@@ -144,9 +145,9 @@ impl Training<'_> {
         };
         let best = self.kept_snapshot(version)?;
         let sha256 = best.sha256();
-        self.reception.publish(best)?;
+        self.receiver.publish(best)?;
         let courses = self.config.courses.evaluation.len() as u32;
-        let flown = self.evaluate_on(version, 0..courses, self.config.evaluation.flights, Keep::Latents)?;
+        let flown = self.evaluate_on(version, 0..courses, self.config.evaluation.episodes, Keep::Latents)?;
         let pictured = self.evaluate_on(version, 0..1, 1, Keep::Depth)?;
         pass(FaultPoint::LearnerEvaluated);
         Ok(self.disk.with_room(self.directory.root(), || {

@@ -1,8 +1,8 @@
-//! What the curves of an epoch are drawn from, gathered over its legs and told at its end.
+//! What the curves of an epoch are drawn from, gathered over its segments and told at its end.
 
 use std::time::Duration;
 
-use crate::flights::reception::Shared;
+use crate::episodes::receiver::Shared;
 use crate::metrics::Scalar;
 use crate::replay::Replay;
 use crate::trainer::Means;
@@ -24,13 +24,13 @@ pub(super) struct EpochCurves {
 
 impl EpochCurves {
     /// The points of an epoch that took so `long`.
-    pub(super) fn points(self, long: Duration, replay: &Replay, reception: &Shared) -> Vec<(Scalar, f64)> {
+    pub(super) fn points(self, long: Duration, replay: &Replay, receiver: &Shared) -> Vec<(Scalar, f64)> {
         let mut points = vec![
             (Scalar::ReplayTransitions, replay.len() as f64),
             (Scalar::ReplaySuccess, replay.success_len() as f64),
             (Scalar::StepsPerSec, self.steps as f64 / long.as_secs_f64()),
         ];
-        points.extend(reception.faults().scalars());
+        points.extend(receiver.faults().scalars());
         if let Some(vae) = self.vae {
             points.extend([
                 (Scalar::VaeLoss, vae.loss.into()),

@@ -8,8 +8,8 @@ use skein_protocol::snapshot::SnapshotError;
 use crate::UpdateError;
 use crate::checkpoint::CheckpointError;
 use crate::device::DeviceError;
+use crate::episodes::receiver::ReceiverError;
 use crate::evaluation::EvaluationError;
-use crate::flights::reception::ReceptionError;
 use crate::metrics::MetricsError;
 use crate::replay::InsertError;
 use crate::trainer::TrainerRestoreError;
@@ -21,7 +21,7 @@ pub enum TrainingError {
     #[error(transparent)]
     Device(#[from] DeviceError),
     #[error(transparent)]
-    Reception(#[from] ReceptionError),
+    EpisodeReceiver(#[from] ReceiverError),
     #[error(transparent)]
     Insert(#[from] InsertError),
     #[error(transparent)]
@@ -43,57 +43,57 @@ pub enum TrainingError {
         source: io::Error,
     },
     /// A checkpoint is undamaged, and still makes no sense.
-    #[error("the checkpoint of flight {flights} cannot be resumed: {source}")]
+    #[error("the checkpoint of episode {episodes} cannot be resumed: {source}")]
     Restore {
-        flights: u64,
+        episodes: u64,
         #[source]
         source: TrainerRestoreError,
     },
     /// A checkpoint lacks what it should hold.
-    #[error("the checkpoint of flight {flights} cannot be resumed: its snapshot {version} {problem}")]
+    #[error("the checkpoint of episode {episodes} cannot be resumed: its snapshot {version} {problem}")]
     RestoredSnapshot {
-        flights: u64,
+        episodes: u64,
         version: u64,
         problem: &'static str,
     },
     /// There is no checkpoint where there must have been one.
     #[error(
-        "{} has {rows} flights, and yet there is no checkpoint in {}, or no such folder; one is written each {first_after} flights: put the checkpoints back; or, to train anew from the first flight, remove flights.csv", flights_csv.display(), checkpoints.display()
+        "{} has {rows} episodes, and yet there is no checkpoint in {}, or no such folder; one is written each {first_after} episodes: put the checkpoints back; or, to train anew from the first episode, remove episodes.csv", episodes_csv.display(), checkpoints.display()
     )]
     CheckpointsLost {
-        flights_csv: PathBuf,
+        episodes_csv: PathBuf,
         rows: u64,
         checkpoints: PathBuf,
         first_after: u64,
     },
-    /// It was told to stop and did not wait for the end of an epoch's updates, or of the flight that it was learning from.
+    /// It was told to stop and did not wait for the end of an epoch's updates, or of the episode that it was learning from.
     #[error("stopped amid an epoch")]
     Abandoned,
 }
 
 impl TrainingError {
-    /// Whether a new life of the learner may get further: the transport failed, and nothing that was computed is at fault. Anything else would come again.
+    /// Whether a new incarnation of the learner may get further: the transport failed, and nothing that was computed is at fault. Anything else would come again.
     pub fn is_of_the_transport(&self) -> bool {
-        matches!(self, Self::Reception(ReceptionError::Transport(_)))
+        matches!(self, Self::EpisodeReceiver(ReceiverError::Transport(_)))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use skein_protocol::ids::FlightId;
+    use skein_protocol::ids::EpisodeId;
 
     use super::*;
-    use crate::flights::desk::HopelessFlight;
+    use crate::episodes::dispatcher::HopelessEpisode;
 
     #[test]
-    fn only_a_failed_transport_is_worth_another_life() {
-        let hopeless = HopelessFlight {
-            flight: FlightId(3),
+    fn only_a_failed_transport_is_worth_another_incarnation() {
+        let hopeless = HopelessEpisode {
+            episode: EpisodeId(3),
             failures: 3,
             why: "the simulator broke down".to_owned(),
         };
-        let error = |error: ReceptionError| TrainingError::from(error);
-        assert!(error(ReceptionError::Transport("no memory".to_owned())).is_of_the_transport());
+        let error = |error: ReceiverError| TrainingError::from(error);
+        assert!(error(ReceiverError::Transport("no memory".to_owned())).is_of_the_transport());
         assert!(!error(hopeless.into()).is_of_the_transport());
         let diverged = UpdateError::NonFinite {
             tensor: "critic loss",

@@ -11,7 +11,7 @@ use skein_protocol::config::Config;
 use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::progress::{self, Phase};
-use skein_protocol::run::{Life, RunDirectory, RunIdentity};
+use skein_protocol::run::{LearnerIncarnation, RunDirectory, RunIdentity};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{Ending, Summary};
@@ -19,19 +19,19 @@ use skein_protocol::summary::{Ending, Summary};
 use super::{EpochCurves, StopWatch, Training, TrainingError};
 use crate::checkpoint::{CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, Progress};
 use crate::disk::Disk;
-use crate::flights::reception::Reception;
-use crate::lives::begin_life;
+use crate::episodes::receiver::EpisodeReceiver;
+use crate::incarnations::begin_incarnation;
 use crate::metrics::{Metrics, MetricsError};
 use crate::report::{Reporter, tell};
 use crate::threads;
 use crate::trainer::Trainer;
 
 impl<'a> Training<'a> {
-    /// A training at its newest undamaged checkpoint, or at its start if it has none. The flights that were in the air are ordered again.
+    /// A training at its newest undamaged checkpoint, or at its start if it has none. The episodes that were in the air are ordered again.
     pub(super) fn begin(
         directory: &'a RunDirectory,
         identity: &'a RunIdentity,
-        life: Life,
+        incarnation: LearnerIncarnation,
         config: &'a Config,
         stop: &'a Arc<AtomicBool>,
     ) -> Result<Self, TrainingError> {
@@ -42,7 +42,7 @@ impl<'a> Training<'a> {
         let fits = |state: &CheckpointState| {
             let metrics = &state.progress.metrics;
             metrics.check(directory).map_err(|problem| CheckpointError::Unfit {
-                flights: state.progress.flights,
+                episodes: state.progress.episodes,
                 problem: problem.to_string(),
             })
         };
@@ -51,25 +51,25 @@ impl<'a> Training<'a> {
         })?;
         let (saved, snapshots) = match newest {
             Some(checkpoint) => {
-                tell(&format!("going on after flight {}", checkpoint.progress.flights));
+                tell(&format!("going on after episode {}", checkpoint.progress.episodes));
                 restore(&mut trainer, checkpoint)?
             }
-            // A life that died before its first checkpoint may have left files: they are dropped as if they came after flight 0.
+            // An incarnation that died before its first checkpoint may have left files: they are dropped as if they came after episode 0.
             None => {
                 refuse_lost_checkpoints(directory, config)?;
                 (start(config, &trainer), BTreeMap::new())
             }
         };
-        let reception = Reception::start(identity, life, config)?;
+        let receiver = EpisodeReceiver::start(identity, incarnation, config)?;
         // Before anything is written: if that has to wait for room on the disk, it is told.
-        let reporter = Reporter::start(first_line(config, &saved), reception.shared(), disk.clone())
+        let reporter = Reporter::start(first_line(config, &saved), receiver.shared(), disk.clone())
             .map_err(TrainingError::Thread)?;
-        let lives = directory.lives_csv();
+        let incarnations = directory.incarnations_csv();
         let resumes = disk
-            .with_room(&lives, || begin_life(&lives, saved.flights))
-            .map_err(file_error(&lives))?;
-        if resumes > 0 && saved.flights == 0 {
-            tell("there is no checkpoint yet: beginning from the first flight");
+            .with_room(&incarnations, || begin_incarnation(&incarnations, saved.episodes))
+            .map_err(file_error(&incarnations))?;
+        if resumes > 0 && saved.episodes == 0 {
+            tell("there is no checkpoint yet: beginning from the first episode");
         }
         let metrics = resume_metrics(directory, &saved, &disk)?;
         let mut training = Self {
@@ -81,7 +81,7 @@ impl<'a> Training<'a> {
             layout: SnapshotLayout::of(config),
             trainer,
             reporter,
-            reception,
+            receiver,
             metrics,
             checkpoints: CheckpointWriter::start(store, disk.clone())?,
             disk,
@@ -104,9 +104,9 @@ impl<'a> Training<'a> {
     /// Publishes what was published and orders what was ordered when the checkpoint was taken.
     fn take_up(&mut self) -> Result<(), TrainingError> {
         let orders = std::mem::take(&mut self.progress.in_the_air);
-        if let Some(flights) = (self.progress.epochs > 0).then_some(self.progress.flights) {
+        if let Some(episodes) = (self.progress.epochs > 0).then_some(self.progress.episodes) {
             tracing::info!(
-                flights,
+                episodes,
                 epochs = self.progress.epochs,
                 resumes = self.resumes,
                 "resumed from a checkpoint"
@@ -117,7 +117,7 @@ impl<'a> Training<'a> {
             let version = PolicyVersion(order.policy_version);
             if version < self.progress.version() {
                 let snapshot = self.kept_snapshot(version)?;
-                self.reception.publish(snapshot)?;
+                self.receiver.publish(snapshot)?;
             }
         }
         for order in orders {
@@ -126,7 +126,7 @@ impl<'a> Training<'a> {
         self.publish()
     }
 
-    /// Takes back what an earlier life has written since the checkpoint: it was of a future that is to be flown again.
+    /// Takes back what an earlier incarnation has written since the checkpoint: it was of a future that is to be flown again.
     fn remove_later_results(&mut self) -> Result<(), TrainingError> {
         let best = self
             .progress
@@ -150,7 +150,7 @@ impl<'a> Training<'a> {
     /// A snapshot that is kept.
     pub(super) fn kept_snapshot(&self, version: PolicyVersion) -> Result<Snapshot, TrainingError> {
         let missing = || TrainingError::RestoredSnapshot {
-            flights: self.saved.flights,
+            episodes: self.saved.episodes,
             version: version.0,
             problem: "is missing",
         };
@@ -166,7 +166,7 @@ impl<'a> Training<'a> {
     }
 
     pub(super) fn checkpoint_if_due(&mut self) -> Result<(), TrainingError> {
-        if self.progress.flights - self.saved.flights >= self.config.checkpoints.every_flights {
+        if self.progress.episodes - self.saved.episodes >= self.config.checkpoints.every_episodes {
             self.checkpoint()?;
         }
         Ok(())
@@ -174,8 +174,8 @@ impl<'a> Training<'a> {
 
     /// Hands the state to the writing thread, unless it is that of the newest checkpoint; and keeps the newest snapshot as a file.
     ///
-    /// Only between epochs, and so between flights: then the state follows from the epochs done, whether a candidate was looked at, and what had been ordered
-    /// earlier. What lies in the middle of a flight is in none.
+    /// Only between epochs, and so between episodes: then the state follows from the epochs done, whether a candidate was looked at, and what had been ordered
+    /// earlier. What lies in the middle of an episode is in none.
     pub(super) fn checkpoint(&mut self) -> Result<(), TrainingError> {
         let (now, saved) = (&self.progress, &self.saved);
         if (now.epochs, now.latest_candidate) == (saved.epochs, saved.latest_candidate) {
@@ -211,7 +211,7 @@ impl<'a> Training<'a> {
             spent: self
                 .progress
                 .spent
-                .with_this_life(self.started, self.timer.times(), &self.reception.shared()),
+                .with_this_incarnation(self.started, self.timer.times(), &self.receiver.shared()),
             ..self.progress.clone()
         }
     }
@@ -225,11 +225,11 @@ impl<'a> Training<'a> {
         Ok(self.counted())
     }
 
-    /// Gives up an epoch half done: the files tell what the next life will go on from. Returns how far that is.
+    /// Gives up an epoch half done: the files tell what the next incarnation will go on from. Returns how far that is.
     pub(super) fn go_back(&mut self) -> Result<Progress, TrainingError> {
         tracing::warn!(
-            flights = self.progress.flights,
-            checkpoint = self.saved.flights,
+            episodes = self.progress.episodes,
+            checkpoint = self.saved.episodes,
             "told to stop, and the end of the epoch takes too long: back to the newest checkpoint"
         );
         self.reporter.update(|progress| progress.phase = Phase::Finishing);
@@ -262,7 +262,7 @@ impl<'a> Training<'a> {
                 Err(error)
             }
         };
-        self.reception.finish();
+        self.receiver.finish();
         summed_up
     }
 }
@@ -280,22 +280,22 @@ fn resume_metrics(directory: &RunDirectory, saved: &Progress, disk: &Disk) -> Re
     })
 }
 
-/// A run without checkpoints is not begun anew without a word when it has had some: their folder is gone, or `flights.csv` shows more flights than can be
+/// A run without checkpoints is not begun anew without a word when it has had some: their folder is gone, or `episodes.csv` shows more episodes than can be
 /// flown before the first. What was flown before any is flown again.
 fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<(), TrainingError> {
-    let flights_csv = directory.flights_csv();
-    let content = match fs::read(&flights_csv) {
+    let episodes_csv = directory.episodes_csv();
+    let content = match fs::read(&episodes_csv) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
-        content => content.map_err(file_error(&flights_csv))?,
+        content => content.map_err(file_error(&episodes_csv))?,
     };
     let lines = content.iter().filter(|&&byte| byte == b'\n').count() as u64;
     let rows = lines.saturating_sub(1);
-    let (checkpoints, first_after) = (directory.checkpoints(), config.checkpoints.every_flights);
+    let (checkpoints, first_after) = (directory.checkpoints(), config.checkpoints.every_episodes);
     // A checkpoint is taken at the end of an epoch, and training goes on while it is written: until the next one is to be handed over. Their folder was
     // made with the run's.
-    if rows > 2 * (first_after + config.learning.flights_per_epoch) || rows > 0 && !checkpoints.is_dir() {
+    if rows > 2 * (first_after + config.learning.episodes_per_epoch) || rows > 0 && !checkpoints.is_dir() {
         return Err(TrainingError::CheckpointsLost {
-            flights_csv,
+            episodes_csv,
             rows,
             checkpoints,
             first_after,
@@ -308,7 +308,7 @@ fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<
 fn start(config: &Config, trainer: &Trainer) -> Progress {
     Progress {
         policy_sha256: trainer.snapshot(PolicyVersion(0)).sha256(),
-        ..Progress::start(config.evaluation.window_flights as usize)
+        ..Progress::start(config.evaluation.window_episodes as usize)
     }
 }
 
@@ -323,15 +323,15 @@ fn restore(
         replay,
         snapshots,
     } = checkpoint;
-    let flights = progress.flights;
+    let episodes = progress.episodes;
     trainer
         .restore(&progress, &tensors, replay)
-        .map_err(|source| TrainingError::Restore { flights, source })?;
+        .map_err(|source| TrainingError::Restore { episodes, source })?;
     let version = progress.version();
     // The parameters are there twice, in the tensors and in the snapshot: a restored trainer that would publish another snapshot is not the one stored.
     if trainer.snapshot(version).sha256() != progress.policy_sha256 {
         return Err(TrainingError::RestoredSnapshot {
-            flights,
+            episodes,
             version: version.0,
             problem: "is not that of its tensors",
         });
@@ -343,18 +343,18 @@ fn restore(
     Ok((progress, snapshots))
 }
 
-/// What is reported before anything has happened in this life.
+/// What is reported before anything has happened in this incarnation.
 fn first_line(config: &Config, saved: &Progress) -> progress::Progress {
     let windows = &saved.metrics.windows;
     progress::Progress {
-        flights: saved.flights,
+        episodes: saved.episodes,
         steps: saved.environment_steps,
         updates: saved.policy_updates,
         vae_updates: saved.vae_steps,
         walls_passed: windows.walls_passed.mean(),
         mean_return: windows.total_reward.mean(),
         elapsed_secs: saved.spent.wall_secs,
-        ..progress::Progress::start(config.run.flights)
+        ..progress::Progress::start(config.run.episodes)
     }
 }
 
@@ -370,11 +370,11 @@ fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &P
         best_version: best.map(|best| PolicyVersion(best.policy_version)),
         best_confirmed_walls_passed: best.map(|best| best.confirmed_walls_passed),
         trained: progress.trained,
-        flights: progress.flights,
+        episodes: progress.episodes,
         steps: progress.environment_steps,
         updates: progress.policy_updates,
         vae_updates: progress.vae_steps,
-        evaluation_flights: progress.evaluation_flights,
+        evaluation_episodes: progress.evaluation_episodes,
         tickets_reissued: progress.spent.tickets_reissued.values().sum(),
         records_refused: progress.spent.records_refused.values().sum(),
         reissued_by_reason: progress.spent.tickets_reissued.clone(),
@@ -408,11 +408,16 @@ mod tests {
         let directory = RunDirectory::new(folder.path());
         fs::create_dir(directory.checkpoints()).unwrap();
         let mut config = Config::default();
-        config.checkpoints.every_flights = 20;
-        config.learning.flights_per_epoch = 5;
+        config.checkpoints.every_episodes = 20;
+        config.learning.episodes_per_epoch = 5;
         refuse_lost_checkpoints(&directory, &config).unwrap();
-        let flown =
-            |flights| fs::write(directory.flights_csv(), format!("header\n{}", "row\n".repeat(flights))).unwrap();
+        let flown = |episodes| {
+            fs::write(
+                directory.episodes_csv(),
+                format!("header\n{}", "row\n".repeat(episodes)),
+            )
+            .unwrap()
+        };
         // The second checkpoint waits until the first is in place, so that many can be flown without one.
         flown(50);
         refuse_lost_checkpoints(&directory, &config).unwrap();
@@ -430,7 +435,7 @@ mod tests {
         fs::create_dir(directory.checkpoints()).unwrap();
         flown(51);
         let error = refuse_lost_checkpoints(&directory, &config).unwrap_err().to_string();
-        for part in ["flights.csv has 51 flights", "checkpoints", "remove flights.csv"] {
+        for part in ["episodes.csv has 51 episodes", "checkpoints", "remove episodes.csv"] {
             assert!(error.contains(part), "`{error}` does not mention `{part}`");
         }
     }

@@ -4,9 +4,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use super::TrainingError;
-use crate::flights::reception::Shared;
+use crate::episodes::receiver::Shared;
 
-/// Time for the rest of an epoch's updates once the run is told to stop, and of a flight in legs that is learned from already. Longer than those of any configuration here take, so that everything learned is
+/// Time for the rest of an epoch's updates once the run is told to stop, and of an episode in segments that is learned from already. Longer than those of any configuration here take, so that everything learned is
 /// saved as a rule; and shorter than the 90 seconds after which the supervisor ends a learner that does not.
 const GRACE: Duration = Duration::from_secs(60);
 
@@ -27,12 +27,12 @@ impl<'a> StopWatch<'a> {
         }
     }
 
-    /// To be asked while the next leg of a flight is waited for: the flight is flown to its end, so that what was learned from it can be saved.
+    /// To be asked while the next segment of an episode is waited for: the episode is flown to its end, so that what was learned from it can be saved.
     ///
     /// # Errors
     /// [`TrainingError::Abandoned`] when that takes too long, or nobody is there to fly it.
-    pub(super) fn amid_flight(&mut self, reception: &Shared) -> Result<(), TrainingError> {
-        if self.stop.load(Ordering::Relaxed) && reception.live_actors().is_empty() {
+    pub(super) fn amid_episode(&mut self, receiver: &Shared) -> Result<(), TrainingError> {
+        if self.stop.load(Ordering::Relaxed) && receiver.live_actors().is_empty() {
             return Err(TrainingError::Abandoned);
         }
         self.after_update()

@@ -70,7 +70,7 @@ fn state(vae: &mut NativeVae) -> Vec<crate::state::NamedTensor> {
 
 #[test]
 fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_precision() {
-    // Seeds of which no sum lies so near nought that rounding takes it across: a ReLU would then be open in one and shut in the other.
+    // Seeds of which no sum lies so near zero that rounding takes it across: a ReLU would then be open in one and shut in the other.
     for (seed, count, latent) in [
         (1, 1, 32),
         (2, 3, 32),
@@ -89,7 +89,7 @@ fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_pr
         let reference = torch.in_double();
         let (expected, expected_gradient) = reference.loss_and_gradient(&images_from_bytes(&images), &noise);
         for (found, expected) in found.iter().zip(expected) {
-            // A divergence near nought is a sum of differences of numbers near one.
+            // A divergence near zero is a sum of differences of numbers near one.
             let error = (f64::from(*found) - expected).abs() / (1.0 + expected);
             assert!(error < 1e-6, "{found} is not {expected}: off by {error}");
         }

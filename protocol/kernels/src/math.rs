@@ -2,7 +2,7 @@
 
 use crate::isa::Isa;
 
-/// e to the power of `x`, within two units in the last place; infinite above 88.72, nought below -87.33. Not a number stays what it is.
+/// e to the power of `x`, within two units in the last place; infinite above 88.72, zero below -87.33. Not a number stays what it is.
 ///
 /// x = n ln 2 + r, |r| ≤ ½ ln 2; e^r by its Taylor polynomial (degree 7: remainder below 1e-8), 2ⁿ by its bits.
 #[inline(always)]

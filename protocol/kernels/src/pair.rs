@@ -79,7 +79,7 @@ impl Halves for Scalar8 {
     }
 }
 
-/// `S` for pairs. The second of a pair is added first, and each product rounds, as the instruction made for it does. (That one takes numbers below 1.2e-38 for nought.)
+/// `S` for pairs. The second of a pair is added first, and each product rounds, as the instruction made for it does. (That one takes numbers below 1.2e-38 for zero.)
 pub struct Apart<S>(S);
 
 impl<S: Halves> Simd for Apart<S> {

@@ -45,7 +45,7 @@ pub enum Finish<'a> {
 /// `output = finish(start + rows · panels)`, `[rows, columns]`; everything row-major.
 ///
 /// Each element is the sum of its terms in order, one fused multiply-add each: the same bits for every instruction set, and however the rows are parted. Of pairs
-/// ([`Pair`](crate::Pair)) the second product is added before the first; the processor's instruction for them takes numbers below 1.2e-38 for nought, the others do not.
+/// ([`Pair`](crate::Pair)) the second product is added before the first; the processor's instruction for them takes numbers below 1.2e-38 for zero, the others do not.
 ///
 /// # Panics
 /// When lengths do not belong together.

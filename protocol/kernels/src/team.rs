@@ -191,7 +191,7 @@ fn help(shared: &Round, member: usize) {
         done += 1;
         let work = shared.work.load(Ordering::Relaxed);
         let outcome = catch_unwind(AssertUnwindSafe(|| {
-            // SAFETY: `run` has set the pointer before the round, and does not return, so that what it points to lives, until `unfinished` is nought.
+            // SAFETY: `run` has set the pointer before the round, and does not return, so that what it points to lives, until `unfinished` is zero.
             let work = unsafe { *work };
             work(member);
         }));

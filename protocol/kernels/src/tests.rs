@@ -123,7 +123,7 @@ proptest! {
         let windows = Windows::new([height, width], channels, [kernel_height, kernel_width], stride);
         let input = numbers(images * windows.image_len(), seed);
         let weights = numbers(outputs * windows.window_len(), seed + 1);
-        let flowing = numbers(images * windows.count() * outputs, seed + 2);
+        let grad = numbers(images * windows.count() * outputs, seed + 2);
         let [_, across] = windows.positions();
         let seen: Vec<Vec<f32>> = input
             .chunks(windows.image_len())
@@ -136,10 +136,10 @@ proptest! {
             .collect();
         let len = windows.window_len();
         let expected = defined(&seen, |term, output| weights[output * len + term], outputs, |_| 0.0);
-        let flowing_columns: Vec<Vec<f32>> = (0..outputs)
-            .map(|output| flowing.iter().skip(output).step_by(outputs).copied().collect())
+        let grad_columns: Vec<Vec<f32>> = (0..outputs)
+            .map(|output| grad.iter().skip(output).step_by(outputs).copied().collect())
             .collect();
-        let expected_gradient = defined(&flowing_columns, |term, number| seen[term][number], len, |_| 0.0);
+        let expected_gradient = defined(&grad_columns, |term, number| seen[term][number], len, |_| 0.0);
         for isa in available() {
             let panels = Panels::of(isa, Matrix::of_rows(&weights, len).transposed());
             let mut output = vec![f32::NAN; expected.len()];
@@ -148,8 +148,8 @@ proptest! {
             }
             prop_assert_eq!(&output, &expected, "{}", isa);
             let mut found = vec![f32::NAN; expected_gradient.len()];
-            let flowing = Matrix::of_rows(&flowing, outputs);
-            gradient(&mut Team::new(1), isa, flowing, Terms::Windows(&windows, &input), &mut found);
+            let grad = Matrix::of_rows(&grad, outputs);
+            gradient(&mut Team::new(1), isa, grad, Terms::Windows(&windows, &input), &mut found);
             prop_assert_eq!(&found, &expected_gradient, "{}", isa);
 
             // What is spread is what is added back of the product, up to the order of sums; and the same with all instructions.
@@ -211,7 +211,7 @@ fn a_single_row_is_its_definition_under_panels_that_are_met_at_once() {
     for (terms, columns) in [(5, 64), (300, 65), (7, 128), (256, 200), (600, 256)] {
         let (left, right) = (numbers(terms, 1), numbers(terms * columns, 2));
         let (bias, mut gate) = (numbers(columns, 3), numbers(columns, 4));
-        // A ReLU that gave nought lets nothing back.
+        // A ReLU that gave zero lets nothing back.
         gate[..3].fill(0.0);
         let at = |term: usize, column: usize| right[term * columns + column];
         let rows = [left.clone()];

@@ -28,7 +28,7 @@ impl Windows {
     /// Windows of `kernel` (height, width) on an image of `size` (height, width) with `channels`, moved by `stride`.
     ///
     /// # Panics
-    /// When the kernel does not fit into the image, or something is nought.
+    /// When the kernel does not fit into the image, or something is zero.
     pub fn new(size: [usize; 2], channels: usize, kernel: [usize; 2], stride: usize) -> Self {
         assert!(
             channels > 0 && stride > 0 && (0..2).all(|axis| (1..=size[axis]).contains(&kernel[axis])),

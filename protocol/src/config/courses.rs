@@ -13,7 +13,7 @@ use super::{Invalid, require};
 pub struct CoursesSection {
     /// The course training flies.
     pub training: PathBuf,
-    /// Share of training flights flown on a generated course instead, a new one each, in [0, 1]. Default 0: the training course only, as in the paper.
+    /// Share of training episodes flown on a generated course instead, a new one each, in [0, 1]. Default 0: the training course only, as in the paper.
     pub generated_share: f64,
     /// The courses of the final evaluation, in the order of its table. The first is the one snapshots are confirmed on.
     pub evaluation: Vec<PathBuf>,
@@ -58,7 +58,7 @@ impl CoursesSection {
             (0.0..=1.0).contains(&self.generated_share),
             "courses.generated_share",
             self.generated_share,
-            "is outside [0, 1]: it is a share of the training flights",
+            "is outside [0, 1]: it is a share of the training episodes",
         )?;
         require(
             !self.evaluation.is_empty(),

@@ -428,39 +428,39 @@ mod tests {
             ),
             ("[sac]\ndiscount = nan", vec![], vec!["sac.discount = NaN"]),
             (
-                "[learning]\nleg_steps = 1",
+                "[learning]\nsegment_steps = 1",
                 vec![],
-                vec!["learning.flights_per_epoch = 10", "leg_steps = 1", "set it to 1"],
+                vec!["learning.episodes_per_epoch = 10", "segment_steps = 1", "set it to 1"],
             ),
             (
-                "[learning]\nleg_steps = 1\nflights_per_epoch = 1",
+                "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1",
                 vec!["learning.policy_lag=1"],
                 vec![
                     "--set learning.policy_lag=1",
                     "learning.policy_lag = 1",
-                    "leg_steps = 1",
+                    "segment_steps = 1",
                     "set it to 0",
                 ],
             ),
             (
-                "[learning]\nleg_steps = 2\nflights_per_epoch = 1\n[replay]\nsuccess = \"approach\"",
+                "[learning]\nsegment_steps = 2\nepisodes_per_epoch = 1\n[replay]\nsuccess = \"approach\"",
                 vec![],
-                vec!["replay.success = approach", "leg_steps = 2", "level-up"],
+                vec!["replay.success = approach", "segment_steps = 2", "level-up"],
             ),
             (
-                "[learning]\nleg_steps = 1\nflights_per_epoch = 1\n[transport]\nmax_records_per_flight = 300",
+                "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1\n[transport]\nmax_records_per_episode = 300",
                 vec![],
-                vec!["transport.max_records_per_flight = 300", "256", "lower it"],
+                vec!["transport.max_records_per_episode = 300", "256", "lower it"],
             ),
             (
-                "[learning]\nleg_steps = 1\nflights_per_epoch = 1\nhistory_steps = [2]",
+                "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1\nhistory_steps = [2]",
                 vec![],
-                vec!["learning.history_steps = [2]", "leg_steps = 1", "name none"],
+                vec!["learning.history_steps = [2]", "segment_steps = 1", "name none"],
             ),
             (
-                "[learning]\nleg_steps = 1\nflights_per_epoch = 1\nmirror = true",
+                "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1\nmirror = true",
                 vec![],
-                vec!["learning.mirror = true", "leg_steps = 1", "set it to false"],
+                vec!["learning.mirror = true", "segment_steps = 1", "set it to false"],
             ),
             (
                 "[learning]\nhistory_steps = [4, 2]",
@@ -545,9 +545,9 @@ mod tests {
                 vec!["[vae]", "unet", "u-net", "plain"],
             ),
             (
-                "[learning]\nleg_steps = 257",
+                "[learning]\nsegment_steps = 257",
                 vec![],
-                vec!["learning.leg_steps = 257", "256"],
+                vec!["learning.segment_steps = 257", "256"],
             ),
             (
                 "",

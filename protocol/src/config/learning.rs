@@ -5,7 +5,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require};
-use crate::leg::MOST_FLOWN;
+use crate::segment::MOST_FLOWN;
 use crate::{ACTION, LatentCode};
 
 /// Policy updates that can be averaged over at most.
@@ -22,27 +22,27 @@ pub struct LearningSection {
     /// What trains the encoder that turns a depth image into the numbers the policy sees: `vae`, or `end-to-end`, where the critic's loss does and `[vae]` has no say but in
     /// the code's length and the encoder's precision. Every transition keeps its images then, 9 KiB each. Default `vae`, as in the paper.
     pub encoder: EncoderTraining,
-    /// Flights flown with one frozen snapshot before the networks are updated. 1 is the paper's delayed learning. Default 10.
-    pub flights_per_epoch: u64,
-    /// Steps after which the networks are updated and the weights refreshed in the middle of a flight, which goes on with them. 0 waits for the flight's end, as
+    /// Episodes flown with one frozen snapshot before the networks are updated. 1 is the paper's delayed learning. Default 10.
+    pub episodes_per_epoch: u64,
+    /// Steps after which the networks are updated and the weights refreshed in the middle of an episode, which goes on with them. 0 waits for the episode's end, as
     /// delayed learning does; 1 is direct updates, which the paper compares that with. One actor flies at a time then. Default 0.
-    pub leg_steps: u64,
+    pub segment_steps: u64,
     /// Epochs a snapshot is behind when it is flown: 0 flies the newest; 1 lets actors fly while the learner updates. Default 0.
     pub policy_lag: u64,
     /// Policy updates per environment step, done at the end of the epoch. Default 0.5.
     pub updates_per_step: f64,
     /// Environment steps flown at random before the first update (paper: 2000). Default 2000.
     pub warmup_steps: usize,
-    /// Flights before training starts from the next level (paper: 10). Default 10.
-    pub flights_per_level: u64,
+    /// Episodes before training starts from the next level (paper: 10). Default 10.
+    pub episodes_per_level: u64,
     /// Start levels that training goes through before it returns to the first (paper: 5); at most the walls of the training course. Default 5.
     pub levels: u8,
     /// What the policy sees of a moment. Default `latent`, as in the paper.
     pub observation: Observation,
-    /// Earlier moments that it sees beside the present one, by how many steps they lie back, rising; before take-off all was as at take-off. What was in view a second ago no longer is when
+    /// Earlier moments that it sees beside the present one, by how many steps they lie back, rising; before reset all was as at reset. What was in view a second ago no longer is when
     /// the drone is in an opening. Default none, as in the paper.
     pub history_steps: Vec<usize>,
-    /// Whether every flight is learned from twice, the second time as seen in a mirror, where left and right change places. Twice the transitions for the same steps
+    /// Whether every episode is learned from twice, the second time as seen in a mirror, where left and right change places. Twice the transitions for the same steps
     /// flown; they fill the replay twice as fast. Default false, as in the paper.
     pub mirror: bool,
     /// Policy updates over which the policy that flies is averaged, exponentially weighted; 0 flies the policy as the last update left it. Default 0, as in the paper.
@@ -56,12 +56,12 @@ impl Default for LearningSection {
         Self {
             algorithm: AlgorithmName::Sac,
             encoder: EncoderTraining::Vae,
-            flights_per_epoch: 10,
-            leg_steps: 0,
+            episodes_per_epoch: 10,
+            segment_steps: 0,
             policy_lag: 0,
             updates_per_step: 0.5,
             warmup_steps: 2000,
-            flights_per_level: 10,
+            episodes_per_level: 10,
             levels: 5,
             observation: Observation::Latent,
             history_steps: Vec::new(),
@@ -75,9 +75,9 @@ impl Default for LearningSection {
 impl LearningSection {
     pub(super) fn validate(&self) -> Result<(), Invalid> {
         require(
-            (1..=10_000).contains(&self.flights_per_epoch),
-            "learning.flights_per_epoch",
-            self.flights_per_epoch,
+            (1..=10_000).contains(&self.episodes_per_epoch),
+            "learning.episodes_per_epoch",
+            self.episodes_per_epoch,
             "is outside 1..=10000: the learner holds an epoch in memory before it learns from it",
         )?;
         require(
@@ -86,7 +86,7 @@ impl LearningSection {
             self.policy_lag,
             "is above 1: flying two epochs behind gains nothing over one, whose updates already overlap the flying",
         )?;
-        self.validate_legs()?;
+        self.validate_segments()?;
         self.validate_encoder()?;
         require(
             (0.0..=100.0).contains(&self.updates_per_step),
@@ -95,16 +95,16 @@ impl LearningSection {
             "is outside [0, 100]",
         )?;
         require(
-            self.flights_per_level >= 1,
-            "learning.flights_per_level",
-            self.flights_per_level,
-            "is below 1: no flight could start",
+            self.episodes_per_level >= 1,
+            "learning.episodes_per_level",
+            self.episodes_per_level,
+            "is below 1: no episode could start",
         )?;
         require(
             self.levels >= 1,
             "learning.levels",
             self.levels,
-            "is below 1: no flight could start",
+            "is below 1: no episode could start",
         )?;
         require(
             self.average_updates <= MOST_AVERAGED,
@@ -127,14 +127,14 @@ impl LearningSection {
         )
     }
 
-    /// How often a flight's transitions are stored: twice if it is seen in a mirror as well.
+    /// How often an episode's transitions are stored: twice if it is seen in a mirror as well.
     pub fn times_stored(&self) -> usize {
         1 + usize::from(self.mirror)
     }
 
-    /// Whether flights are flown in legs, so that the weights are refreshed in the middle of them.
-    pub fn in_legs(&self) -> bool {
-        self.leg_steps > 0
+    /// Whether episodes are flown in segments, so that the weights are refreshed in the middle of them.
+    pub fn in_segments(&self) -> bool {
+        self.segment_steps > 0
     }
 
     /// Whether policy and critic learn from depth images themselves.
@@ -164,44 +164,44 @@ impl LearningSection {
         )
     }
 
-    /// One flight is under way in legs at a time: only then does each leg follow from all that was flown before.
-    fn validate_legs(&self) -> Result<(), Invalid> {
+    /// One episode is under way in segments at a time: only then does each segment follow from all that was flown before.
+    fn validate_segments(&self) -> Result<(), Invalid> {
         require(
-            self.leg_steps <= MOST_FLOWN as u64,
-            "learning.leg_steps",
-            self.leg_steps,
-            format!("is above {MOST_FLOWN}, the longest flight in legs: 0 learns after whole flights"),
+            self.segment_steps <= MOST_FLOWN as u64,
+            "learning.segment_steps",
+            self.segment_steps,
+            format!("is above {MOST_FLOWN}, the longest episode in segments: 0 learns after whole episodes"),
         )?;
         for (key, value, needed) in [
-            ("learning.flights_per_epoch", self.flights_per_epoch, 1),
+            ("learning.episodes_per_epoch", self.episodes_per_epoch, 1),
             ("learning.policy_lag", self.policy_lag, 0),
         ] {
             require(
-                !self.in_legs() || value == needed,
+                !self.in_segments() || value == needed,
                 key,
                 value,
                 format!(
-                    "does not go with learning.leg_steps = {}, which refreshes the weights in the middle of the one flight that is under way: set it to {needed}, or learning.leg_steps to 0",
-                    self.leg_steps
+                    "does not go with learning.segment_steps = {}, which refreshes the weights in the middle of the one episode that is under way: set it to {needed}, or learning.segment_steps to 0",
+                    self.segment_steps
                 ),
             )?;
         }
         require(
-            !self.in_legs() || !self.mirror,
+            !self.in_segments() || !self.mirror,
             "learning.mirror",
             self.mirror,
             format!(
-                "does not go with learning.leg_steps = {}: a leg is stored behind the one before it, where its mirror image would come between; set it to false, or learning.leg_steps to 0",
-                self.leg_steps
+                "does not go with learning.segment_steps = {}: a segment is stored behind the one before it, where its mirror image would come between; set it to false, or learning.segment_steps to 0",
+                self.segment_steps
             ),
         )?;
         require(
-            !self.in_legs() || self.history_steps.is_empty(),
+            !self.in_segments() || self.history_steps.is_empty(),
             "learning.history_steps",
             format!("{:?}", self.history_steps),
             format!(
-                "does not go with learning.leg_steps = {}: who flies a leg has not seen the ones before; name none, or set learning.leg_steps to 0",
-                self.leg_steps
+                "does not go with learning.segment_steps = {}: who flies a segment has not seen the ones before; name none, or set learning.segment_steps to 0",
+                self.segment_steps
             ),
         )
     }
@@ -301,7 +301,7 @@ impl View {
         false
     }
 
-    /// Writes what is seen of a moment: the latent code, `velocity_mps` the vehicle's forward, left and up velocity, `previous_action` zero at take-off.
+    /// Writes what is seen of a moment: the latent code, `velocity_mps` the vehicle's forward, left and up velocity, `previous_action` zero at reset.
     ///
     /// # Panics
     /// When `into` is not [`View::moment_len`] long.
@@ -331,14 +331,14 @@ impl View {
         into[..self.latent].copy_from_slice(&code[..self.latent]);
     }
 
-    /// The moments seen at `step` of a flight, by their steps, in the vector's order; before take-off there was the take-off.
+    /// The moments seen at `step` of an episode, by their steps, in the vector's order; before reset there was the reset.
     pub fn moments(&self, step: usize) -> impl Iterator<Item = usize> {
         std::iter::once(0)
             .chain(self.history_steps.iter().copied())
             .map(move |back| step.saturating_sub(back))
     }
 
-    /// Writes the observation vector at `step` of a flight, of which `write_moment` writes what is seen of a step's moment.
+    /// Writes the observation vector at `step` of an episode, of which `write_moment` writes what is seen of a step's moment.
     ///
     /// # Panics
     /// When `into` is not [`View::len`] long.

@@ -17,7 +17,7 @@ mod vae;
 
 use serde::{Deserialize, Serialize};
 
-use crate::leg::MOST_FLOWN;
+use crate::segment::MOST_FLOWN;
 
 pub use courses::CoursesSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
@@ -48,7 +48,7 @@ pub struct Config {
     pub vae: VaeSection,
     /// Split replay buffer.
     pub replay: ReplaySection,
-    /// Evaluation flights.
+    /// Evaluation episodes.
     pub evaluation: EvaluationSection,
     /// What is stored, and when.
     pub checkpoints: CheckpointSection,
@@ -119,7 +119,7 @@ impl Config {
                 self.replay.capacity
             ),
         )?;
-        self.validate_legs()?;
+        self.validate_segments()?;
         self.validate_encoder()?;
         let (key, batch_size) = self.batch_size_by_key();
         require(
@@ -167,23 +167,25 @@ impl Config {
         Ok(())
     }
 
-    /// What flights in legs ask of other sections.
-    fn validate_legs(&self) -> Result<(), Invalid> {
-        let (leg_steps, longest) = (self.learning.leg_steps, self.transport.max_records_per_flight);
+    /// What episodes in segments ask of other sections.
+    fn validate_segments(&self) -> Result<(), Invalid> {
+        let (segment_steps, longest) = (self.learning.segment_steps, self.transport.max_records_per_episode);
         require(
-            !self.learning.in_legs() || self.replay.success == SuccessRule::LevelUp || self.replay.success_share == 0.0,
+            !self.learning.in_segments()
+                || self.replay.success == SuccessRule::LevelUp
+                || self.replay.success_share == 0.0,
             "replay.success",
             "approach",
             format!(
-                "does not go with learning.leg_steps = {leg_steps}: the steps before a level-up are stored and learned from by then; set it to \"level-up\", or learning.leg_steps to 0"
+                "does not go with learning.segment_steps = {segment_steps}: the steps before a level-up are stored and learned from by then; set it to \"level-up\", or learning.segment_steps to 0"
             ),
         )?;
         require(
-            !self.learning.in_legs() || longest <= MOST_FLOWN,
-            "transport.max_records_per_flight",
+            !self.learning.in_segments() || longest <= MOST_FLOWN,
+            "transport.max_records_per_episode",
             longest,
             format!(
-                "is above {MOST_FLOWN}, and learning.leg_steps = {leg_steps}: the ticket of a leg has no room for more actions flown before; lower it, and simulator.max_steps if need be, or set learning.leg_steps to 0"
+                "is above {MOST_FLOWN}, and learning.segment_steps = {segment_steps}: the ticket of a segment has no room for more actions flown before; lower it, and simulator.max_steps if need be, or set learning.segment_steps to 0"
             ),
         )
     }

@@ -13,8 +13,8 @@ use super::{Invalid, require};
 pub struct RunSection {
     /// Everything random in the run derives from it. Default 1.
     pub seed: u64,
-    /// Training flights in the whole run. Default 2000.
-    pub flights: u64,
+    /// Training episodes in the whole run. Default 2000.
+    pub episodes: u64,
     /// Where the learner computes: `cpu` or `cuda:N`. Default `cpu`.
     pub device: Device,
     /// What computes the learner's networks: `native` or `libtorch`. Part of the result: the two add in different orders. Default: `native` on the
@@ -31,7 +31,7 @@ impl Default for RunSection {
     fn default() -> Self {
         Self {
             seed: 1,
-            flights: 2000,
+            episodes: 2000,
             device: Device::Cpu,
             engine: None,
             learner_threads: 2,
@@ -50,16 +50,16 @@ impl RunSection {
 
     pub(super) fn validate(&self) -> Result<(), Invalid> {
         require(
-            self.flights >= 1,
-            "run.flights",
-            self.flights,
+            self.episodes >= 1,
+            "run.episodes",
+            self.episodes,
             "is below 1: nothing would be flown",
         )?;
         require(
-            self.flights < 1 << 62,
-            "run.flights",
-            self.flights,
-            "is not below 2^62: flight numbers would run out",
+            self.episodes < 1 << 62,
+            "run.episodes",
+            self.episodes,
+            "is not below 2^62: episode numbers would run out",
         )?;
         require(
             self.engine != Some(Engine::Native) || self.device == Device::Cpu,
@@ -150,8 +150,8 @@ impl fmt::Display for Engine {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CheckpointSection {
-    /// Training flights between two checkpoints; one more is written at the end. Default 100.
-    pub every_flights: u64,
+    /// Training episodes between two checkpoints; one more is written at the end. Default 100.
+    pub every_episodes: u64,
     /// Checkpoints kept; older ones are removed. Default 2.
     pub keep: usize,
 }
@@ -159,7 +159,7 @@ pub struct CheckpointSection {
 impl Default for CheckpointSection {
     fn default() -> Self {
         Self {
-            every_flights: 100,
+            every_episodes: 100,
             keep: 2,
         }
     }
@@ -168,10 +168,10 @@ impl Default for CheckpointSection {
 impl CheckpointSection {
     pub(super) fn validate(&self) -> Result<(), Invalid> {
         require(
-            self.every_flights >= 1,
-            "checkpoints.every_flights",
-            self.every_flights,
-            "is below 1: no flight would ever complete the interval",
+            self.every_episodes >= 1,
+            "checkpoints.every_episodes",
+            self.every_episodes,
+            "is below 1: no episode would ever complete the interval",
         )?;
         require(
             self.keep >= 1,

@@ -27,7 +27,7 @@ pub struct Td3Section {
     pub discount: f64,
     /// Share of policy and critic that moves into the target networks when the policy is updated, τ. Default 0.005.
     pub target_rate: f64,
-    /// Standard deviation of the noise added to actions in training flights, each command in [-1, 1]. Default 0.1, as in arXiv:1802.09477.
+    /// Standard deviation of the noise added to actions in training episodes, each command in [-1, 1]. Default 0.1, as in arXiv:1802.09477.
     pub exploration_noise: f64,
     /// Standard deviation of the noise that smooths the targets. Default 0.2, as in arXiv:1802.09477.
     pub target_noise: f64,

@@ -1,7 +1,7 @@
-//! Who a run is, and which life of its learner is the present one.
+//! Who a run is, and which incarnation of its learner is the present one.
 //!
-//! Each start of the learner, the first or one after a death, is a life with a transport of its own: fresh services in a folder and under a prefix that no
-//! life before it had. So nothing that a killed process left half done is ever met again. The learner announces its life by a small file once its
+//! Each start of the learner, the first or one after a death, is an incarnation with a transport of its own: fresh services in a folder and under a prefix that no
+//! incarnation before it had. So nothing that a killed process left half done is ever met again. The learner announces its incarnation by a small file once its
 //! services are open; actors look there, and again whenever they have lost it.
 
 use std::collections::BTreeMap;
@@ -39,26 +39,26 @@ pub struct RunIdentity {
 /// stands twice in the path of a listener's socket.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
-pub struct Life(u32);
+pub struct LearnerIncarnation(u32);
 
-impl fmt::Display for Life {
+impl fmt::Display for LearnerIncarnation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         fmt::Display::fmt(&self.0, f)
     }
 }
 
-impl Life {
-    /// The life after `previous`.
+impl LearnerIncarnation {
+    /// The incarnation after `previous`.
     pub(super) fn after(previous: Option<Self>) -> Self {
-        Self(previous.map_or(1, |life| life.0.saturating_add(1)))
+        Self(previous.map_or(1, |incarnation| incarnation.0.saturating_add(1)))
     }
 
     /// From the name of its folder; `None` for what is none.
     pub(super) fn parse(name: &str) -> Option<Self> {
         /// No run dies as often; and a listener's socket has room for so many digits.
         const MOST: u32 = 9_999_999;
-        let life = name.parse().ok().filter(|&life| life < MOST).map(Self)?;
-        (life.to_string() == name).then_some(life)
+        let incarnation = name.parse().ok().filter(|&incarnation| incarnation < MOST).map(Self)?;
+        (incarnation.to_string() == name).then_some(incarnation)
     }
 }
 
@@ -75,7 +75,7 @@ impl RunIdentity {
         }
     }
 
-    /// Where the run's transport lies; the folder is there while a process of the run lives. Short, because a listener's socket below it may have no
+    /// Where the run's transport lies; the folder is there while a process of the run incarnations. Short, because a listener's socket below it may have no
     /// more than 108 characters.
     pub fn transport_folder(&self) -> PathBuf {
         super::sweep::MACHINE.transport_folder(self.run)
@@ -86,32 +86,32 @@ impl RunIdentity {
         super::sweep::shared_memory_prefix(self.run)
     }
 
-    /// Where iceoryx2 keeps the services of a life.
-    pub(crate) fn life_folder(&self, life: Life) -> PathBuf {
-        self.transport_folder().join(life.to_string())
+    /// Where iceoryx2 keeps the services of an incarnation.
+    pub(crate) fn incarnation_folder(&self, incarnation: LearnerIncarnation) -> PathBuf {
+        self.transport_folder().join(incarnation.to_string())
     }
 
-    /// First characters of every shared-memory segment of a life.
-    pub(crate) fn life_prefix(&self, life: Life) -> String {
-        format!("{}{life}_", self.shared_memory_prefix())
+    /// First characters of every shared-memory segment of an incarnation.
+    pub(crate) fn incarnation_prefix(&self, incarnation: LearnerIncarnation) -> String {
+        format!("{}{incarnation}_", self.shared_memory_prefix())
     }
 
-    /// Takes everybody else's rights to the segments of `life` away: iceoryx2 gives one of them, a counter, to all users of the machine.
+    /// Takes everybody else's rights to the segments of `incarnation` away: iceoryx2 gives one of them, a counter, to all users of the machine.
     ///
     /// # Errors
     /// When the segments cannot be looked at or changed.
-    pub(crate) fn close_to_others(&self, life: Life) -> io::Result<()> {
-        self.segments(life)
+    pub(crate) fn close_to_others(&self, incarnation: LearnerIncarnation) -> io::Result<()> {
+        self.shared_memory(incarnation)
             .try_for_each(|segment| fs::set_permissions(segment, fs::Permissions::from_mode(0o600)))
     }
 
-    /// The shared-memory segments of `life`.
-    pub(crate) fn segments(&self, life: Life) -> impl Iterator<Item = PathBuf> {
-        super::sweep::MACHINE.segments(&self.life_prefix(life))
+    /// The shared-memory segments of `incarnation`.
+    pub(crate) fn shared_memory(&self, incarnation: LearnerIncarnation) -> impl Iterator<Item = PathBuf> {
+        super::sweep::MACHINE.segments(&self.incarnation_prefix(incarnation))
     }
 
     pub(super) fn announcement_file(&self) -> PathBuf {
-        self.transport_folder().join("life")
+        self.transport_folder().join("incarnation")
     }
 
     pub(super) fn learner_lock(&self) -> PathBuf {
@@ -126,7 +126,7 @@ impl RunIdentity {
     ///
     /// # Errors
     /// [`PlaceError`] when the run belongs to another user, or its folder cannot be read.
-    pub fn present_life(&self) -> Result<Option<Announcement>, PlaceError> {
+    pub fn present_incarnation(&self) -> Result<Option<Announcement>, PlaceError> {
         if !is_locked(&self.learner_lock())? {
             return Ok(None);
         }
@@ -142,12 +142,12 @@ impl RunIdentity {
     }
 }
 
-/// What a learner says of its present life: everything in which a process that joins it must not differ.
+/// What a learner says of its present incarnation: everything in which a process that joins it must not differ.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Announcement {
-    /// The life.
-    pub life: Life,
+    /// The incarnation.
+    pub incarnation: LearnerIncarnation,
     /// The learner's process.
     pub pid: u32,
     protocol_version: u32,
@@ -172,10 +172,10 @@ pub struct Difference {
 }
 
 impl Announcement {
-    /// What the learner of `life` says of itself.
-    pub fn new(identity: &RunIdentity, life: Life, config: &Config) -> Self {
+    /// What the learner of `incarnation` says of itself.
+    pub fn new(identity: &RunIdentity, incarnation: LearnerIncarnation, config: &Config) -> Self {
         Self {
-            life,
+            incarnation,
             pid: std::process::id(),
             protocol_version: identity.protocol_version,
             run: identity.run,
@@ -190,7 +190,7 @@ impl Announcement {
     /// # Errors
     /// [`Difference`] says what differs.
     pub fn check(&self, identity: &RunIdentity, config: &Config) -> Result<(), Difference> {
-        let mine = Self::new(identity, self.life, config);
+        let mine = Self::new(identity, self.incarnation, config);
         let digest = |digest: u64| format!("{digest:016x}");
         let same = |what, expected: String, found: String| {
             if expected == found {
@@ -230,11 +230,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_life_is_known_by_the_name_of_its_folder() {
-        let life = Life::after(Some(Life(41)));
-        assert_eq!(Life::parse(&life.to_string()), Some(life));
-        for strange in ["", "life", "-1", "+1", "01", "1f", "../1", "4294967296"] {
-            assert_eq!(Life::parse(strange), None, "{strange}");
+    fn an_incarnation_is_known_by_the_name_of_its_folder() {
+        let incarnation = LearnerIncarnation::after(Some(LearnerIncarnation(41)));
+        assert_eq!(LearnerIncarnation::parse(&incarnation.to_string()), Some(incarnation));
+        for strange in ["", "incarnation", "-1", "+1", "01", "1f", "../1", "4294967296"] {
+            assert_eq!(LearnerIncarnation::parse(strange), None, "{strange}");
         }
     }
 
@@ -243,15 +243,18 @@ mod tests {
         // folder/prefix<number of a port>.event, ended by a zero byte; the number has up to 39 digits.
         const ROOM: usize = 108 - 1 - "/".len() - ".event".len() - 39;
         let identity = RunIdentity::new(&Config::default(), BTreeMap::new());
-        let life = Life(9999);
-        assert!(identity.life_folder(life).as_os_str().len() + identity.life_prefix(life).len() <= ROOM);
+        let incarnation = LearnerIncarnation(9999);
+        assert!(
+            identity.incarnation_folder(incarnation).as_os_str().len() + identity.incarnation_prefix(incarnation).len()
+                <= ROOM
+        );
     }
 
     #[test]
     fn whoever_differs_is_told_in_what() {
         let config = Config::default();
         let identity = RunIdentity::new(&config, BTreeMap::new());
-        let told = Announcement::new(&identity, Life::after(None), &config);
+        let told = Announcement::new(&identity, LearnerIncarnation::after(None), &config);
         assert_eq!(told.check(&identity, &config), Ok(()));
         let refusal = |identity: &RunIdentity, config: &Config| told.check(identity, config).unwrap_err().to_string();
         let other = |change: fn(&mut RunIdentity)| {

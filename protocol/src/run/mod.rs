@@ -2,9 +2,9 @@
 
 mod courses;
 mod identity;
+mod lock;
 mod place;
 mod presence;
-mod seat;
 mod sweep;
 
 use std::fs;
@@ -18,10 +18,10 @@ use crate::config::{Config, ConfigError};
 use crate::durable;
 use crate::ids::ActorId;
 
-pub use identity::{Announcement, Difference, Life, RunIdentity};
+pub use identity::{Announcement, Difference, LearnerIncarnation, RunIdentity};
+pub use lock::{LearnerLock, LockError, SupervisorLock};
 pub use place::PlaceError;
 pub use presence::Presence;
-pub use seat::{LearnerSeat, SeatError, SupervisorSeat};
 pub use sweep::{Swept, sweep_leftovers};
 
 /// Paths within a run's directory.
@@ -56,12 +56,12 @@ impl RunDirectory {
         courses => "courses",
         /// One log file a process.
         logs => "logs",
-        /// Locked by the learner while it lives, see [`LearnerSeat`].
+        /// Locked by the learner while it lives, see [`LearnerLock`].
         learner_lock => "learner.lock",
-        /// One row per start of the learner: life,unix_secs,flights it went on from.
-        lives_csv => "lives.csv",
-        /// One row per committed training flight.
-        flights_csv => "flights.csv",
+        /// One row per start of the learner: incarnation,unix_secs,episodes it went on from.
+        incarnations_csv => "incarnations.csv",
+        /// One row per committed training episode.
+        episodes_csv => "episodes.csv",
         /// TensorBoard event files.
         tensorboard => "tensorboard",
         /// `best.safetensors`, `latest.safetensors`.
@@ -74,8 +74,8 @@ impl RunDirectory {
         checkpoints => "checkpoints",
         /// [`EvaluationReport`](crate::evaluation::EvaluationReport) of the best snapshot.
         evaluation_json => "evaluation.json",
-        /// Where the evaluation flights flew: course,flight,step,x_m,y_m,z_m,outcome.
-        evaluation_paths_csv => "evaluation_paths.csv",
+        /// Where the evaluation episodes flew: course,episode,step,x_m,y_m,z_m,outcome.
+        evaluation_trajectories_csv => "evaluation_trajectories.csv",
         /// Depth images and their reconstructions: `depth` and `reconstruction`, u8 `[n, 72, 128]`.
         reconstructions => "reconstructions.safetensors",
         /// [`Summary`](crate::summary::Summary).
@@ -99,12 +99,12 @@ impl RunDirectory {
         self.root.join("suites").join(format!("{suite}.json"))
     }
 
-    /// Flights committed in the newest of the run's checkpoints, by their names; whether one is sound, only reading it can tell.
+    /// Episodes committed in the newest of the run's checkpoints, by their names; whether one is sound, only reading it can tell.
     pub fn newest_checkpoint(&self) -> Option<u64> {
-        let flights = |entry: fs::DirEntry| entry.file_name().to_str()?.strip_prefix("flight-")?.parse().ok();
+        let episodes = |entry: fs::DirEntry| entry.file_name().to_str()?.strip_prefix("episode-")?.parse().ok();
         fs::read_dir(self.checkpoints())
             .ok()?
-            .filter_map(|entry| flights(entry.ok()?))
+            .filter_map(|entry| episodes(entry.ok()?))
             .max()
     }
 
@@ -201,8 +201,8 @@ struct Versioned {
 impl RunDirectory {
     /// In which keys `config` differs from the configuration of the run, if a checkpoint still tells it.
     fn differences(&self, identity: &RunIdentity, config: &Config) -> String {
-        let known = self.newest_checkpoint().and_then(|flights| {
-            let copy = self.checkpoints().join(format!("flight-{flights}/config.toml"));
+        let known = self.newest_checkpoint().and_then(|episodes| {
+            let copy = self.checkpoints().join(format!("episode-{episodes}/config.toml"));
             fs::read_to_string(copy).ok()
         });
         known
@@ -269,7 +269,7 @@ pub enum RunError {
         differences: String,
     },
     /// A course file is not the one the run was started with.
-    #[error("{} {problem}, and flights through another course would be learned from as if it were the same; put the file back as it was, or start a new run", path.display())]
+    #[error("{} {problem}, and episodes through another course would be learned from as if it were the same; put the file back as it was, or start a new run", path.display())]
     CourseChanged {
         /// The course file.
         path: PathBuf,
@@ -324,7 +324,7 @@ mod tests {
         };
         assert!(refusal().contains("its digest is"), "{}", refusal());
         // What a checkpoint says of the run's configuration tells the key.
-        let checkpoint = run.checkpoints().join("flight-20");
+        let checkpoint = run.checkpoints().join("episode-20");
         fs::create_dir(&checkpoint).unwrap();
         fs::write(checkpoint.join("config.toml"), before.portable()).unwrap();
         assert!(refusal().contains("run.seed = 1 there, 2 here"), "{}", refusal());

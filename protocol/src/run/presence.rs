@@ -1,4 +1,4 @@
-//! That a process of a run lives.
+//! That a process of a run incarnations.
 
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};

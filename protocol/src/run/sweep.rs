@@ -10,7 +10,7 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use super::identity::Life;
+use super::identity::LearnerIncarnation;
 use super::place::{is_still_at, make_folder, open_folder, open_private, run_of, user};
 use crate::ids::RunId;
 
@@ -30,11 +30,11 @@ pub(super) static MACHINE: Machine = Machine {
 };
 
 const FOLDER_PREFIX: &str = "skein-";
-const SEGMENT_PREFIX: &str = "skein_";
+const SHARED_MEMORY_PREFIX: &str = "skein_";
 
 /// First characters of a run's segments.
 pub(super) fn shared_memory_prefix(run: RunId) -> String {
-    format!("{SEGMENT_PREFIX}{:016x}_", run.0)
+    format!("{SHARED_MEMORY_PREFIX}{:016x}_", run.0)
 }
 
 /// Ends the name of the file in shared memory by which a run's processes are seen where another `/tmp` hides its folder.
@@ -73,7 +73,7 @@ impl Machine {
 
     /// Locked, as the folder is, by every process of the run: containers and services may share the memory and not the folder.
     pub(super) fn presence_file(&self, run: RunId) -> PathBuf {
-        Path::new(self.segments).join(format!("{SEGMENT_PREFIX}{:016x}{PRESENCE}", run.0))
+        Path::new(self.segments).join(format!("{SHARED_MEMORY_PREFIX}{:016x}{PRESENCE}", run.0))
     }
 
     fn sweep(&self) -> Swept {
@@ -95,7 +95,7 @@ impl Machine {
             (about.is_dir() && name.len() == length).then_some(RunId(run))
         });
         let segments = own_entries(Path::new(self.segments)).filter_map(|(name, about)| {
-            let (run, length) = run_of(&name, SEGMENT_PREFIX)?;
+            let (run, length) = run_of(&name, SHARED_MEMORY_PREFIX)?;
             let rest = &name.as_encoded_bytes()[length..];
             let is_its = rest.first() == Some(&b'_') || rest == PRESENCE.as_bytes();
             (about.is_file() && is_its).then_some(RunId(run))
@@ -131,7 +131,7 @@ impl Machine {
         Ok(true)
     }
 
-    /// The lock of a run's presence in shared memory, had alone; `None` when a process of the run lives.
+    /// The lock of a run's presence in shared memory, had alone; `None` when a process of the run incarnations.
     fn lock_presence(&self, run: RunId) -> io::Result<Option<File>> {
         let path = self.presence_file(run);
         let presence = open_private(&path)?;
@@ -141,11 +141,16 @@ impl Machine {
 
     /// Removes everything of `run`. For who holds the locks of its folder and its presence alone.
     pub(super) fn remove(&self, run: RunId) {
-        self.remove_lives(run);
+        self.remove_incarnations(run);
         let folder = self.transport_folder(run);
         // The locks' files come last: by them a folder is known as ours, should this process die on the way.
         let [learner, supervisor] = [learner_lock(&folder), supervisor_lock(&folder)];
-        for file in [folder.join("life.new"), folder.join("life"), learner, supervisor] {
+        for file in [
+            folder.join("incarnation.new"),
+            folder.join("incarnation"),
+            learner,
+            supervisor,
+        ] {
             told(&file, fs::remove_file(&file));
         }
         told(&folder, fs::remove_dir(&folder));
@@ -153,18 +158,18 @@ impl Machine {
         told(&presence, fs::remove_file(&presence));
     }
 
-    /// Removes all lives of `run`: segments and folders. For who holds the lock of its learner.
-    pub(super) fn remove_lives(&self, run: RunId) {
+    /// Removes all incarnations of `run`: segments and folders. For who holds the lock of its learner.
+    pub(super) fn remove_incarnations(&self, run: RunId) {
         for segment in self.segments(&shared_memory_prefix(run)) {
             told(&segment, fs::remove_file(&segment));
         }
         let folder = self.transport_folder(run);
-        let lives = own_entries(&folder).filter_map(|(name, about)| {
-            let life = Life::parse(name.to_str()?)?;
-            about.is_dir().then_some(life)
+        let incarnations = own_entries(&folder).filter_map(|(name, about)| {
+            let incarnation = LearnerIncarnation::parse(name.to_str()?)?;
+            about.is_dir().then_some(incarnation)
         });
-        for life in lives {
-            let path = folder.join(life.to_string());
+        for incarnation in incarnations {
+            let path = folder.join(incarnation.to_string());
             told(&path, fs::remove_dir_all(&path));
         }
     }
@@ -179,7 +184,7 @@ impl Machine {
 }
 
 /// Whether a folder is one of this version: empty, or with a lock in it. Those of version 0.1 hold no lock, so that it cannot be told
-/// whether their run lives.
+/// whether their run incarnations.
 fn is_ours(folder: &Path) -> io::Result<bool> {
     let has_lock = learner_lock(folder).exists() || supervisor_lock(folder).exists();
     Ok(has_lock || fs::read_dir(folder)?.next().is_none())
@@ -238,10 +243,10 @@ mod tests {
     /// What a killed run leaves.
     fn leave(machine: &Machine) -> PathBuf {
         let folder = machine.transport_folder(RUN);
-        let life = folder.join(Life::after(None).to_string());
-        fs::create_dir_all(life.join("nodes/7")).unwrap();
-        fs::write(life.join("nodes/7/details"), "").unwrap();
-        fs::write(folder.join("life"), "{}").unwrap();
+        let incarnation = folder.join(LearnerIncarnation::after(None).to_string());
+        fs::create_dir_all(incarnation.join("nodes/7")).unwrap();
+        fs::write(incarnation.join("nodes/7/details"), "").unwrap();
+        fs::write(folder.join("incarnation"), "{}").unwrap();
         fs::write(learner_lock(&folder), "1\n").unwrap();
         segment(machine, &format!("{}0123_connection", shared_memory_prefix(RUN)));
         folder
@@ -345,7 +350,7 @@ mod tests {
             });
             for _ in 0..300 {
                 let presence = Presence::enter_on(machine, RUN).unwrap();
-                let file = machine.transport_folder(RUN).join("life");
+                let file = machine.transport_folder(RUN).join("incarnation");
                 fs::write(&file, "").unwrap();
                 std::thread::yield_now();
                 assert!(file.exists());

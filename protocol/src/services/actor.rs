@@ -16,8 +16,8 @@ use super::opening::{Manner, Opener};
 use super::{Ipc, ServiceError, failed, node, wait};
 use crate::config::Config;
 use crate::ids::RunId;
-use crate::leg::LegRecord;
-use crate::run::{Life, RunIdentity};
+use crate::run::{LearnerIncarnation, RunIdentity};
+use crate::segment::SegmentRecord;
 use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 use crate::status::StatusRecord;
 use crate::ticket::{ControlRecord, Message};
@@ -31,12 +31,12 @@ const LOANED_RECORDS: usize = 2;
 #[derive(Debug)]
 pub struct ActorPorts {
     run: RunId,
-    life: Life,
+    incarnation: LearnerIncarnation,
     layout: SnapshotLayout,
     transitions: Publisher<Ipc, TransitionRecord, ()>,
     status: Publisher<Ipc, StatusRecord, ()>,
     control: Subscriber<Ipc, ControlRecord, ()>,
-    legs: Subscriber<Ipc, LegRecord, ()>,
+    segments: Subscriber<Ipc, SegmentRecord, ()>,
     weights: Subscriber<Ipc, [u8], SnapshotHeader>,
     wake: Listener<Ipc>,
     wake_learner: Notifier<Ipc>,
@@ -50,18 +50,18 @@ impl ActorPorts {
     /// # Errors
     /// [`JoinError::NoLearner`] when there is none to join at this moment; [`JoinError::Difference`] when this process and the learner's do not fit.
     pub fn join(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
-        let life = learner_of(identity, config)?.life;
-        let ports = Self::open(identity, life, config)?;
-        reserve(identity, life)?;
+        let incarnation = learner_of(identity, config)?.incarnation;
+        let ports = Self::open(identity, incarnation, config)?;
+        reserve(identity, incarnation)?;
         Ok(ports)
     }
 
-    fn open(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, ServiceError> {
-        let node = node(identity, life, "actor")?;
+    fn open(identity: &RunIdentity, incarnation: LearnerIncarnation, config: &Config) -> Result<Self, ServiceError> {
+        let node = node(identity, incarnation, "actor")?;
         let open = Opener::new(&node, Manner::Join, identity, config)?;
         Ok(Self {
             run: identity.run,
-            life,
+            incarnation,
             layout: SnapshotLayout::of(config),
             transitions: open
                 .transitions(config)?
@@ -82,11 +82,11 @@ impl ActorPorts {
                 .subscriber_builder()
                 .create()
                 .map_err(failed("control", "subscribing"))?,
-            legs: open
-                .legs()?
+            segments: open
+                .segments()?
                 .subscriber_builder()
                 .create()
-                .map_err(failed("legs", "subscribing"))?,
+                .map_err(failed("segments", "subscribing"))?,
             weights: open
                 .weights()?
                 .subscriber_builder()
@@ -111,9 +111,9 @@ impl ActorPorts {
         self.run
     }
 
-    /// The life of the learner that was joined.
-    pub fn life(&self) -> Life {
-        self.life
+    /// The incarnation of the learner that was joined.
+    pub fn incarnation(&self) -> LearnerIncarnation {
+        self.incarnation
     }
 
     /// Waits until the learner has something to say, `timeout` has passed, or a signal has come.
@@ -146,7 +146,7 @@ impl ActorPorts {
         record.send().map(drop).map_err(failed("transitions", "sending"))
     }
 
-    /// Sends a sign of life.
+    /// Sends a heartbeat.
     ///
     /// # Errors
     /// [`ServiceError`] when there is no memory to send it in.
@@ -157,7 +157,7 @@ impl ActorPorts {
             .map_err(failed("status", "sending"))
     }
 
-    /// The next message, if one has arrived. Tickets of legs come after all else.
+    /// The next message, if one has arrived. Tickets of segments come after all else.
     ///
     /// # Errors
     /// [`ServiceError`] when the learner's memory cannot be mapped.
@@ -165,8 +165,8 @@ impl ActorPorts {
         if let Some(sample) = self.control.receive().map_err(failed("control", "receiving"))? {
             return Ok(Some(Message::Control(*sample)));
         }
-        let sample = self.legs.receive().map_err(failed("legs", "receiving"))?;
-        Ok(sample.map(|sample| Message::Leg(Box::new(*sample))))
+        let sample = self.segments.receive().map_err(failed("segments", "receiving"))?;
+        Ok(sample.map(|sample| Message::Segment(Box::new(*sample))))
     }
 
     /// The next snapshot, if one has arrived; the inner result says whether it can be flown.
@@ -201,7 +201,9 @@ impl ActorPorts {
         self.control
             .update_connections()
             .map_err(failed("control", "connecting"))?;
-        self.legs.update_connections().map_err(failed("legs", "connecting"))?;
+        self.segments
+            .update_connections()
+            .map_err(failed("segments", "connecting"))?;
         self.weights
             .update_connections()
             .map_err(failed("weights", "connecting"))?;

@@ -15,24 +15,24 @@ use iceoryx2::prelude::*;
 use iceoryx2_bb_posix::unique_system_id::UniqueSystemId;
 
 use super::{Ipc, ServiceError, failed};
-use crate::run::{Life, RunIdentity};
+use crate::run::{LearnerIncarnation, RunIdentity};
 
-/// Nobody takes as long to come, from the first file of its node to the lock by which others see that it lives. Who was stopped meanwhile finds its files
+/// Nobody takes as long to come, from the first file of its node to the lock by which others see that it incarnations. Who was stopped meanwhile finds its files
 /// gone, fails to join, and tries again.
 const LONGEST_COMING: Duration = Duration::from_secs(10);
 
-/// Takes back what the dead held in the transport of a life.
+/// Takes back what the dead held in the transport of an incarnation.
 #[derive(Debug)]
 pub(super) struct Reclaimer {
     identity: RunIdentity,
-    life: Life,
+    incarnation: LearnerIncarnation,
 }
 
 impl Reclaimer {
-    pub(super) fn new(identity: &RunIdentity, life: Life) -> Self {
+    pub(super) fn new(identity: &RunIdentity, incarnation: LearnerIncarnation) -> Self {
         Self {
             identity: identity.clone(),
-            life,
+            incarnation,
         }
     }
 
@@ -51,7 +51,7 @@ impl Reclaimer {
             CallbackProgression::Continue
         })
         .map_err(failed("all", "listing the nodes"))?;
-        for path in self.files().into_iter().chain(self.segments()) {
+        for path in self.files().into_iter().chain(self.shared_memory()) {
             if processes_in(&path).any(|process| !living.contains(&process)) && is_old(&path) {
                 remove(&path);
             }
@@ -65,7 +65,7 @@ impl Reclaimer {
         let tags = entries(self.nodes().join(dead.id().value().to_string()));
         let half_made_tags = tags.filter(|tag| mode(tag) & 0o200 != 0);
         let segments = self
-            .segments()
+            .shared_memory()
             .filter(|path| processes_in(path).any(|of| of == process));
         let half_made_segments = segments.filter(|segment| mode(segment) & 0o400 == 0);
         half_made_tags.chain(half_made_segments).for_each(|path| remove(&path));
@@ -73,17 +73,17 @@ impl Reclaimer {
     }
 
     fn nodes(&self) -> PathBuf {
-        self.identity.life_folder(self.life).join("nodes")
+        self.identity.incarnation_folder(self.incarnation).join("nodes")
     }
 
     /// Listeners' sockets, nodes' locks, and nodes' folders.
     fn files(&self) -> Vec<PathBuf> {
-        let sockets = entries(self.identity.life_folder(self.life));
+        let sockets = entries(self.identity.incarnation_folder(self.incarnation));
         sockets.chain(entries(self.nodes())).collect()
     }
 
-    fn segments(&self) -> impl Iterator<Item = PathBuf> {
-        self.identity.segments(self.life)
+    fn shared_memory(&self) -> impl Iterator<Item = PathBuf> {
+        self.identity.shared_memory(self.incarnation)
     }
 }
 
@@ -94,7 +94,7 @@ fn process_of(id: u128) -> u32 {
 
 /// The processes that made the nodes and ports that `path` is called after: two where it is a connection, none where it belongs to all.
 fn processes_in(path: &Path) -> impl Iterator<Item = u32> {
-    /// Ids are large: the life's number, the run's and digests, in hexadecimal, are not taken for one.
+    /// Ids are large: the incarnation's number, the run's and digests, in hexadecimal, are not taken for one.
     const DIGITS: std::ops::RangeInclusive<usize> = 20..=39;
     let name = path.file_name().and_then(std::ffi::OsStr::to_str).unwrap_or_default();
     let ids = name.split(['_', '.']).filter(|word| DIGITS.contains(&word.len()));
@@ -146,14 +146,16 @@ mod tests {
     #[test]
     fn what_names_a_process_that_is_gone_is_removed_once_it_is_old_and_nothing_else_is() {
         let run = Run::with(|_| {});
-        let learner = LearnerPorts::open(&run.identity, run.seat.life(), &run.config).unwrap();
-        let _living = node(&run.identity, run.seat.life(), "living").unwrap();
+        let learner = LearnerPorts::open(&run.identity, run.lock.incarnation(), &run.config).unwrap();
+        let _living = node(&run.identity, run.lock.incarnation(), "living").unwrap();
         learner.maintain().unwrap();
-        let life = run.identity.life_folder(run.seat.life());
-        let prefix = run.identity.life_prefix(run.seat.life());
+        let incarnation = run.identity.incarnation_folder(run.lock.incarnation());
+        let prefix = run.identity.incarnation_prefix(run.lock.incarnation());
         let listed = || -> BTreeSet<PathBuf> {
-            let files = entries(life.clone()).chain(entries(life.join("nodes")));
-            files.chain(run.identity.segments(run.seat.life())).collect()
+            let files = entries(incarnation.clone()).chain(entries(incarnation.join("nodes")));
+            files
+                .chain(run.identity.shared_memory(run.lock.incarnation()))
+                .collect()
         };
         let before = listed();
         before.iter().for_each(|path| age(path));
@@ -165,9 +167,11 @@ mod tests {
         let (id, living) = (made_by(gone.id()), made_by(std::process::id()));
         assert_eq!(process_of(id), gone.id());
         let left = [
-            life.join("nodes").join(id.to_string()),
-            life.join("nodes").join(format!("{prefix}{id}.node_monitor_context")),
-            life.join(format!("{prefix}{id}.event")),
+            incarnation.join("nodes").join(id.to_string()),
+            incarnation
+                .join("nodes")
+                .join(format!("{prefix}{id}.node_monitor_context")),
+            incarnation.join(format!("{prefix}{id}.event")),
             format!("/dev/shm/{prefix}{}_{id}.data", "a".repeat(40)).into(),
             format!("/dev/shm/{prefix}{}_{living}_{id}.connection", "a".repeat(40)).into(),
         ];

@@ -1,4 +1,4 @@
-//! Joining a run: its services are there while its learner lives.
+//! Joining a run: its services are there while its learner incarnations.
 
 use super::ServiceError;
 use crate::config::Config;
@@ -36,7 +36,7 @@ impl JoinError {
 /// The learner to join, which this process fits.
 pub(super) fn learner_of(identity: &RunIdentity, config: &Config) -> Result<Announcement, JoinError> {
     let learner = identity
-        .present_life()?
+        .present_incarnation()?
         .ok_or_else(|| JoinError::NoLearner(identity.clone()))?;
     learner.check(identity, config)?;
     Ok(learner)

@@ -18,8 +18,8 @@ use super::opening::{Manner, Opener, control_slots};
 use super::{Ipc, ServiceError, failed, node, wait};
 use crate::config::Config;
 use crate::fault::{FaultPoint, pass};
-use crate::leg::LegRecord;
-use crate::run::{Announcement, Life, RunIdentity};
+use crate::run::{Announcement, LearnerIncarnation, RunIdentity};
+use crate::segment::SegmentRecord;
 use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 use crate::status::StatusRecord;
 use crate::ticket::{ControlRecord, Message};
@@ -35,15 +35,15 @@ pub(super) const SNAPSHOT_SLOTS: usize = 8;
 #[derive(Debug)]
 pub struct LearnerPorts {
     identity: RunIdentity,
-    life: Life,
+    incarnation: LearnerIncarnation,
     dead: Reclaimer,
     /// What of it lies in shared memory from its start to its end.
-    segments: Vec<PathBuf>,
+    shared_memory: Vec<PathBuf>,
     layout: SnapshotLayout,
     transitions: Subscriber<Ipc, TransitionRecord, ()>,
     status: Subscriber<Ipc, StatusRecord, ()>,
     control: Publisher<Ipc, ControlRecord, ()>,
-    legs: Publisher<Ipc, LegRecord, ()>,
+    segments: Publisher<Ipc, SegmentRecord, ()>,
     weights: Publisher<Ipc, [u8], SnapshotHeader>,
     wake: Listener<Ipc>,
     wake_actors: Notifier<Ipc>,
@@ -58,24 +58,24 @@ pub struct LearnerWaker {
 }
 
 impl LearnerPorts {
-    /// Opens the learner's ends of every service for its new `life`, on the thread that will use them, and announces it. For who holds the
-    /// [`LearnerSeat`](crate::run::LearnerSeat).
+    /// Opens the learner's ends of every service for its new `incarnation`, on the thread that will use them, and announces it. For who holds the
+    /// [`LearnerLock`](crate::run::LearnerLock).
     ///
     /// # Errors
     /// [`JoinError`] says which service and why.
-    pub fn open(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, JoinError> {
-        let mut ports = Self::create(identity, life, config)?;
-        reserve(identity, life)?;
-        ports.segments = identity.segments(life).collect();
+    pub fn open(identity: &RunIdentity, incarnation: LearnerIncarnation, config: &Config) -> Result<Self, JoinError> {
+        let mut ports = Self::create(identity, incarnation, config)?;
+        reserve(identity, incarnation)?;
+        ports.shared_memory = identity.shared_memory(incarnation).collect();
         pass(FaultPoint::LearnerStarted);
-        identity.announce(&Announcement::new(identity, life, config))?;
+        identity.announce(&Announcement::new(identity, incarnation, config))?;
         Ok(ports)
     }
 
-    fn create(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, ServiceError> {
-        let node = node(identity, life, "learner")?;
+    fn create(identity: &RunIdentity, incarnation: LearnerIncarnation, config: &Config) -> Result<Self, ServiceError> {
+        let node = node(identity, incarnation, "learner")?;
         identity
-            .close_to_others(life)
+            .close_to_others(incarnation)
             .map_err(failed("all", "closing shared memory to other users"))?;
         let open = Opener::new(&node, Manner::Create, identity, config)?;
         let layout = SnapshotLayout::of(config);
@@ -83,9 +83,9 @@ impl LearnerPorts {
         let messages = control_slots(&config.transport);
         Ok(Self {
             identity: identity.clone(),
-            life,
-            dead: Reclaimer::new(identity, life),
-            segments: Vec::new(),
+            incarnation,
+            dead: Reclaimer::new(identity, incarnation),
+            shared_memory: Vec::new(),
             transitions: open
                 .transitions(config)?
                 .subscriber_builder()
@@ -104,13 +104,13 @@ impl LearnerPorts {
                 .override_sample_preallocation(move |worst_case| worst_case.min(messages))
                 .create()
                 .map_err(failed("control", "publishing"))?,
-            legs: open
-                .legs()?
+            segments: open
+                .segments()?
                 .publisher_builder()
                 .max_loaned_samples(1)
                 .backpressure_strategy(BackpressureStrategy::DiscardData)
                 .create()
-                .map_err(failed("legs", "publishing"))?,
+                .map_err(failed("segments", "publishing"))?,
             weights: weights_factory
                 .publisher_builder()
                 .initial_max_slice_len(layout.values() * size_of::<f32>())
@@ -167,11 +167,11 @@ impl LearnerPorts {
     pub fn send(&self, message: &Message) -> Result<(), ServiceError> {
         match message {
             Message::Control(record) => self.send_control(*record),
-            Message::Leg(record) => self
-                .legs
+            Message::Segment(record) => self
+                .segments
                 .send_copy(**record)
                 .map(drop)
-                .map_err(failed("legs", "sending")),
+                .map_err(failed("segments", "sending")),
         }
     }
 
@@ -239,7 +239,9 @@ impl LearnerPorts {
         self.weights
             .update_connections()
             .map_err(failed("weights", "connecting"))?;
-        self.legs.update_connections().map_err(failed("legs", "connecting"))?;
+        self.segments
+            .update_connections()
+            .map_err(failed("segments", "connecting"))?;
         self.control
             .update_connections()
             .map_err(failed("control", "connecting"))
@@ -249,11 +251,11 @@ impl LearnerPorts {
     fn check_findable(&self) -> Result<(), ServiceError> {
         let present = self
             .identity
-            .present_life()
+            .present_incarnation()
             .map_err(failed("all", "looking at what actors need"))?;
-        let folder = self.identity.life_folder(self.life);
-        let is_announced = present.is_some_and(|found| found.life == self.life);
-        let gone = match self.segments.iter().find(|segment| !segment.exists()) {
+        let folder = self.identity.incarnation_folder(self.incarnation);
+        let is_announced = present.is_some_and(|found| found.incarnation == self.incarnation);
+        let gone = match self.shared_memory.iter().find(|segment| !segment.exists()) {
             Some(segment) => segment,
             None if !is_announced || !folder.is_dir() => &self.identity.transport_folder(),
             None => return Ok(()),
@@ -272,8 +274,12 @@ impl LearnerWaker {
     ///
     /// # Errors
     /// [`ServiceError`] says which service and why.
-    pub fn open(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, ServiceError> {
-        let node = node(identity, life, "learner-waker")?;
+    pub fn open(
+        identity: &RunIdentity,
+        incarnation: LearnerIncarnation,
+        config: &Config,
+    ) -> Result<Self, ServiceError> {
+        let node = node(identity, incarnation, "learner-waker")?;
         let open = Opener::new(&node, Manner::Join, identity, config)?;
         let wake_learner = open
             .event("wake-learner", open.actors, 1)?

@@ -10,11 +10,11 @@ use rustix::fs::FallocateFlags;
 use rustix::mm::{Advice, madvise};
 
 use super::learner::SNAPSHOT_SLOTS;
-use super::opening::{control_buffer, control_slots, leg_slots, transition_buffer};
+use super::opening::{control_buffer, control_slots, segment_slots, transition_buffer};
 use super::{ServiceError, failed};
 use crate::config::Config;
-use crate::leg::LegRecord;
-use crate::run::{Life, RunIdentity};
+use crate::run::{LearnerIncarnation, RunIdentity};
+use crate::segment::SegmentRecord;
 use crate::snapshot::SnapshotLayout;
 use crate::ticket::ControlRecord;
 use crate::transition::TransitionRecord;
@@ -32,10 +32,10 @@ const SLOT_OVERHEAD: usize = 3 << 10;
 pub fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
     let snapshot = SnapshotLayout::of(config).values() * size_of::<f32>() + SAMPLE_OVERHEAD;
     let control = control_slots(&config.transport) * (size_of::<ControlRecord>() + SAMPLE_OVERHEAD / 2);
-    let legs = leg_slots(&config.transport) * (size_of::<LegRecord>() + SAMPLE_OVERHEAD / 2);
+    let segments = segment_slots(&config.transport) * (size_of::<SegmentRecord>() + SAMPLE_OVERHEAD / 2);
     let slots = config.transport.max_actors * SLOT_OVERHEAD;
-    let learner = SNAPSHOT_SLOTS * snapshot + control + legs + slots + LEARNER_OVERHEAD;
-    // Flights of all tickets, and what either side has in hand.
+    let learner = SNAPSHOT_SLOTS * snapshot + control + segments + slots + LEARNER_OVERHEAD;
+    // Episodes of all tickets, and what either side has in hand.
     let records = transition_buffer(&config.transport) + 8;
     // A queue of eight bytes a message there and back, and one byte to say who has it.
     let queues = 2 * 8 * control_buffer(&config.transport) + control_slots(&config.transport);
@@ -43,12 +43,12 @@ pub fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
     (learner + actors * actor) as u64
 }
 
-/// Reserves the memory of all segments of `life`.
+/// Reserves the memory of all segments of `incarnation`.
 ///
 /// # Errors
 /// [`ServiceError`] when there is not enough.
-pub(super) fn reserve(identity: &RunIdentity, life: Life) -> Result<(), ServiceError> {
-    for segment in identity.segments(life) {
+pub(super) fn reserve(identity: &RunIdentity, incarnation: LearnerIncarnation) -> Result<(), ServiceError> {
+    for segment in identity.shared_memory(incarnation) {
         match reserve_segment(&segment) {
             // Its owner has removed it meanwhile.
             Err(error) if error.kind() == io::ErrorKind::NotFound => {}
@@ -153,9 +153,9 @@ mod tests {
                 config.transport.max_actors = max_actors;
                 config.sac.hidden_width = width;
             });
-            let learner = LearnerPorts::open(&run.identity, run.seat.life(), &run.config).unwrap();
+            let learner = LearnerPorts::open(&run.identity, run.lock.incarnation(), &run.config).unwrap();
             let taken = || -> u64 {
-                let segments = run.identity.segments(run.seat.life());
+                let segments = run.identity.shared_memory(run.lock.incarnation());
                 segments.map(|path| fs::metadata(path).unwrap().blocks() * 512).sum()
             };
             let mut actors = Vec::new();

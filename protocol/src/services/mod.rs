@@ -4,16 +4,16 @@
 //! |---|---|---|---|
 //! | `transitions` | publish-subscribe | actors → learner | [`TransitionRecord`], rendered into the loaned sample |
 //! | `status` | publish-subscribe | actors → learner | [`StatusRecord`] |
-//! | `control` | publish-subscribe | learner → actors | [`ControlRecord`]: tickets, signs of life, the stop |
-//! | `legs` | publish-subscribe | learner → actors | [`LegRecord`]: tickets of legs |
+//! | `control` | publish-subscribe | learner → actors | [`ControlRecord`]: tickets, heartbeats, the stop |
+//! | `segments` | publish-subscribe | learner → actors | [`SegmentRecord`]: tickets of segments |
 //! | `weights` | publish-subscribe | learner → actors | snapshots' bytes behind a [`SnapshotHeader`] |
 //! | `wake-learner`, `wake-actors` | event | both | that there is something to read |
 //!
 //! Nothing here blocks and nothing here is trusted to arrive: iceoryx2 loses samples silently when a peer dies or has not connected yet. Tickets bound
-//! what is in flight, so no buffer can overflow but that of a process that was stopped, which misses what does not fit; a flight with a hole is discarded
+//! what is outstanding, so no buffer can overflow but that of a process that was stopped, which misses what does not fit; an episode with a hole is discarded
 //! and its ticket issued again; every wait has a deadline.
 //!
-//! Each life of a learner has services of its own, see [`Life`]. Only the learner creates them; everybody else joins those that it has announced.
+//! Each incarnation of a learner has services of its own, see [`LearnerIncarnation`]. Only the learner creates them; everybody else joins those that it has announced.
 //!
 //! Services carry protocol version, run, configuration and snapshot layout as attributes: a process that differs in one of them is refused on opening.
 
@@ -35,8 +35,8 @@ use iceoryx2::node::Node;
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::prelude::*;
 
-use crate::leg::LegRecord;
-use crate::run::{Life, RunIdentity};
+use crate::run::{LearnerIncarnation, RunIdentity};
+use crate::segment::SegmentRecord;
 use crate::snapshot::SnapshotHeader;
 use crate::status::StatusRecord;
 use crate::ticket::ControlRecord;
@@ -67,7 +67,7 @@ pub struct ServiceError {
 }
 
 impl ServiceError {
-    /// Whether trying again cannot help, with this learner or its next life: the two programs differ.
+    /// Whether trying again cannot help, with this learner or its next incarnation: the two programs differ.
     fn is_final(&self) -> bool {
         self.cause.contains("Incompatible")
     }
@@ -98,17 +98,17 @@ fn failed<E: Debug>(service: &'static str, operation: &'static str) -> impl FnOn
     }
 }
 
-/// iceoryx2's settings for one life of a run's learner. Called before anything else of iceoryx2 is.
-fn transport_config(identity: &RunIdentity, life: Life) -> Result<IceoryxConfig, ServiceError> {
+/// iceoryx2's settings for one incarnation of a run's learner. Called before anything else of iceoryx2 is.
+fn transport_config(identity: &RunIdentity, incarnation: LearnerIncarnation) -> Result<IceoryxConfig, ServiceError> {
     // Everything iceoryx2 would print goes wrong again, with our words, in the errors returned here.
     set_log_level(LogLevel::Fatal);
     let mut config = IceoryxConfig::default();
-    let root = identity.life_folder(life);
+    let root = identity.incarnation_folder(incarnation);
     config
         .global
         .set_root_path(&Path::new(root.as_os_str().as_bytes()).map_err(failed("all", "setting the root path"))?);
-    config.global.prefix =
-        FileName::new(identity.life_prefix(life).as_bytes()).map_err(failed("all", "setting the prefix"))?;
+    config.global.prefix = FileName::new(identity.incarnation_prefix(incarnation).as_bytes())
+        .map_err(failed("all", "setting the prefix"))?;
     // The learner alone cleans up after the dead, at its heartbeats. Of an actor that is killed while it does, iceoryx2 could not tell whether it still
     // does, and nobody would go on with it.
     config.global.node.cleanup_dead_nodes_on_creation = false;
@@ -120,17 +120,17 @@ fn transport_config(identity: &RunIdentity, life: Life) -> Result<IceoryxConfig,
 /// What the records that cross the transport look like; equal in processes that can read each other's.
 pub(crate) fn record_layout() -> String {
     format!(
-        "transition {} control {} leg {} status {} snapshot header {}",
+        "transition {} control {} segment {} status {} snapshot header {}",
         size_of::<TransitionRecord>(),
         size_of::<ControlRecord>(),
-        size_of::<LegRecord>(),
+        size_of::<SegmentRecord>(),
         size_of::<StatusRecord>(),
         size_of::<SnapshotHeader>(),
     )
 }
 
-fn node(identity: &RunIdentity, life: Life, name: &str) -> Result<Node<Ipc>, ServiceError> {
-    let config = transport_config(identity, life)?;
+fn node(identity: &RunIdentity, incarnation: LearnerIncarnation, name: &str) -> Result<Node<Ipc>, ServiceError> {
+    let config = transport_config(identity, incarnation)?;
     NodeBuilder::new()
         .name(&NodeName::new(name).map_err(failed("all", "naming the node"))?)
         .signal_handling_mode(SignalHandlingMode::Disabled)

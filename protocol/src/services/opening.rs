@@ -7,8 +7,8 @@ use iceoryx2::service::port_factory::event;
 use super::{Ipc, ServiceError, failed};
 use crate::PROTOCOL_VERSION;
 use crate::config::{Config, TransportSection};
-use crate::leg::LegRecord;
 use crate::run::RunIdentity;
+use crate::segment::SegmentRecord;
 use crate::snapshot::{SnapshotHeader, SnapshotLayout};
 use crate::status::StatusRecord;
 use crate::ticket::ControlRecord;
@@ -18,8 +18,8 @@ use crate::transition::TransitionRecord;
 const BORROWED_RECORDS: usize = 2;
 /// Snapshots a late joiner still gets: with policy lag 1 two versions are in use, and an evaluation adds a third.
 pub(super) const SNAPSHOT_HISTORY: usize = 4;
-/// Tickets of legs that may wait for an actor.
-const LEG_BUFFER: usize = 1;
+/// Tickets of segments that may wait for an actor.
+const SEGMENT_BUFFER: usize = 1;
 /// How services come to be.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Manner {
@@ -102,7 +102,7 @@ impl<'a> Opener<'a> {
                 .max_publishers(self.actors)
                 .max_subscribers(1)
                 .max_nodes(self.nodes())
-                // Every flight an actor holds a ticket for fits whole, so a record is never refused for want of room.
+                // Every episode an actor holds a ticket for fits whole, so a record is never refused for want of room.
                 .subscriber_max_buffer_size(transition_buffer(&config.transport))
                 .subscriber_max_borrowed_samples(BORROWED_RECORDS)
                 .history_size(0)
@@ -127,7 +127,7 @@ impl<'a> Opener<'a> {
                 .subscriber_max_borrowed_samples(1)
                 // A late joiner of a learner, or a restarted one, hears of its actors at once.
                 .history_size(1)
-                // Only the newest signs of life matter.
+                // Only the newest heartbeats matter.
                 .enable_safe_overflow(true)
         };
         opened!(self, "status", builder())
@@ -154,24 +154,25 @@ impl<'a> Opener<'a> {
         opened!(self, "control", builder())
     }
 
-    pub(super) fn legs(
+    pub(super) fn segments(
         &self,
-    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, LegRecord, ()>, ServiceError> {
-        let name = service_name("legs")?;
+    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, SegmentRecord, ()>, ServiceError>
+    {
+        let name = service_name("segments")?;
         let builder = || {
             self.node
                 .service_builder(&name)
-                .publish_subscribe::<LegRecord>()
+                .publish_subscribe::<SegmentRecord>()
                 .max_publishers(1)
                 .max_subscribers(self.actors)
                 .max_nodes(self.nodes())
-                .subscriber_max_buffer_size(LEG_BUFFER)
+                .subscriber_max_buffer_size(SEGMENT_BUFFER)
                 .subscriber_max_borrowed_samples(1)
                 .history_size(0)
-                // One flight is under way in legs at a time, and one leg of it: of tickets for legs the newest counts.
+                // One episode is under way in segments at a time, and one segment of it: of tickets for segments the newest counts.
                 .enable_safe_overflow(true)
         };
-        opened!(self, "legs", builder())
+        opened!(self, "segments", builder())
     }
 
     pub(super) fn weights(
@@ -216,9 +217,9 @@ impl<'a> Opener<'a> {
     }
 }
 
-/// Records of an actor that may wait for the learner: every flight it holds a ticket for fits whole.
+/// Records of an actor that may wait for the learner: every episode it holds a ticket for fits whole.
 pub(super) fn transition_buffer(transport: &TransportSection) -> usize {
-    transport.max_records_per_flight * transport.tickets_per_actor
+    transport.max_records_per_episode * transport.tickets_per_actor
 }
 
 /// Messages that may wait for an actor. All tickets pass by every actor: room for everyone's, some of them twice, while this one flies.
@@ -232,9 +233,9 @@ pub(super) fn control_slots(transport: &TransportSection) -> usize {
     16 * control_buffer(transport)
 }
 
-/// Tickets of legs that exist at once: one that waits for each actor, one that it looks at, and one that is written.
-pub(super) fn leg_slots(transport: &TransportSection) -> usize {
-    2 * transport.max_actors * (LEG_BUFFER + 1) + 1
+/// Tickets of segments that exist at once: one that waits for each actor, one that it looks at, and one that is written.
+pub(super) fn segment_slots(transport: &TransportSection) -> usize {
+    2 * transport.max_actors * (SEGMENT_BUFFER + 1) + 1
 }
 
 fn service_name(name: &'static str) -> Result<ServiceName, ServiceError> {

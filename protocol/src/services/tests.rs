@@ -6,15 +6,15 @@ use std::time::Duration;
 use super::opening::{Manner, Opener};
 use super::*;
 use crate::config::Config;
-use crate::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion, RunId};
-use crate::run::{LearnerSeat, RunDirectory};
+use crate::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion, RunId};
+use crate::run::{LearnerLock, RunDirectory};
 use crate::snapshot::{Snapshot, SnapshotLayout};
 use crate::ticket::{CourseChoice, Exploration, Ticket};
 
 pub(super) struct Run {
     pub(super) identity: RunIdentity,
     pub(super) config: Config,
-    pub(super) seat: LearnerSeat,
+    pub(super) lock: LearnerLock,
     _directory: tempfile::TempDir,
 }
 
@@ -33,7 +33,7 @@ impl Run {
         run.create(&config).unwrap();
         let (identity, config) = run.open().unwrap();
         Self {
-            seat: LearnerSeat::take(&run, &identity).unwrap(),
+            lock: LearnerLock::take(&run, &identity).unwrap(),
             identity,
             config,
             _directory: directory,
@@ -41,7 +41,7 @@ impl Run {
     }
 
     fn learner(&self) -> Result<LearnerPorts, JoinError> {
-        LearnerPorts::open(&self.identity, self.seat.life(), &self.config)
+        LearnerPorts::open(&self.identity, self.lock.incarnation(), &self.config)
     }
 
     fn actor(&self) -> Result<ActorPorts, JoinError> {
@@ -52,14 +52,14 @@ impl Run {
 fn ticket(run: RunId) -> Ticket {
     Ticket {
         run,
-        flight: FlightId(1),
+        episode: EpisodeId(1),
         attempt: Attempt(0),
         policy_version: PolicyVersion(0),
         course: CourseChoice::Training,
         start_level: 1,
         exploration: Exploration::Uniform,
         seed: 7,
-        leg: None,
+        segment: None,
     }
 }
 
@@ -70,7 +70,7 @@ fn the_image_written_into_the_loan_is_the_image_received() {
     learner.maintain().unwrap();
     let ticket = ticket(run.identity.run);
     let mut record = actor.loan_transition().unwrap();
-    record.begin(&ticket, ActorId(0), Incarnation(1), 0);
+    record.begin(&ticket, ActorId(0), ActorIncarnation(1), 0);
     record
         .depth
         .iter_mut()
@@ -85,7 +85,7 @@ fn the_image_written_into_the_loan_is_the_image_received() {
     actor.wake_learner().unwrap();
     learner.wait(Duration::from_secs(1)).unwrap();
     let received = learner.receive_transition().unwrap().unwrap();
-    received.check(&ticket, ActorId(0), Incarnation(1), 0).unwrap();
+    received.check(&ticket, ActorId(0), ActorIncarnation(1), 0).unwrap();
     assert!(
         received
             .depth
@@ -117,14 +117,14 @@ fn a_late_actor_gets_the_newest_snapshots() {
 }
 
 #[test]
-fn the_largest_flight_of_every_ticket_fits_unread() {
+fn the_largest_episode_of_every_ticket_fits_unread() {
     let run = Run::new();
     let (learner, actor) = (run.learner().unwrap(), run.actor().unwrap());
     learner.maintain().unwrap();
-    let records = run.config.transport.max_records_per_flight * run.config.transport.tickets_per_actor;
+    let records = run.config.transport.max_records_per_episode * run.config.transport.tickets_per_actor;
     for step in 0..records {
         let mut record = actor.loan_transition().unwrap();
-        record.begin(&ticket(run.identity.run), ActorId(0), Incarnation(1), step as u32);
+        record.begin(&ticket(run.identity.run), ActorId(0), ActorIncarnation(1), step as u32);
         actor.send_transition(record).unwrap();
     }
     for step in 0..records {
@@ -174,7 +174,7 @@ fn services_refuse_what_the_announcement_let_through() {
     let mut run = Run::new();
     let _learner = run.learner().unwrap();
     run.identity.config_digest ^= 1;
-    let node = node(&run.identity, run.seat.life(), "actor").unwrap();
+    let node = node(&run.identity, run.lock.incarnation(), "actor").unwrap();
     let open = Opener::new(&node, Manner::Join, &run.identity, &run.config).unwrap();
     let refusal = open.status().unwrap_err();
     assert!(refusal.is_final());
@@ -193,11 +193,11 @@ fn there_is_nobody_to_join_before_the_services_are_open_and_after_the_learner_is
     assert!(run.identity.is_learner_alive().unwrap());
     assert!(nobody());
     let learner = run.learner().unwrap();
-    assert_eq!(run.actor().unwrap().life(), run.seat.life());
+    assert_eq!(run.actor().unwrap().incarnation(), run.lock.incarnation());
     let Run {
-        identity, config, seat, ..
+        identity, config, lock, ..
     } = run;
-    drop((learner, seat));
+    drop((learner, lock));
     assert!(!identity.is_learner_alive().unwrap());
     assert!(matches!(
         ActorPorts::join(&identity, &config),
@@ -210,11 +210,11 @@ fn there_is_nobody_to_join_before_the_services_are_open_and_after_the_learner_is
 fn everything_of_a_run_is_its_users_alone() {
     let run = Run::new();
     let (_learner, _actor) = (run.learner().unwrap(), run.actor().unwrap());
-    let segments: Vec<_> = run.identity.segments(run.seat.life()).collect();
+    let segments: Vec<_> = run.identity.shared_memory(run.lock.incarnation()).collect();
     assert!(segments.len() > 10, "{segments:?}");
     let folders = [
         run.identity.transport_folder(),
-        run.identity.life_folder(run.seat.life()),
+        run.identity.incarnation_folder(run.lock.incarnation()),
     ];
     for path in segments.iter().chain(&folders) {
         let about = std::fs::metadata(path).unwrap();

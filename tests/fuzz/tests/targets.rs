@@ -100,8 +100,8 @@ fn places_far_beyond_any_course_are_refused() {
 }
 
 #[test]
-fn a_file_of_flights_that_lost_its_last_line_end_is_continued_on_the_next_line() {
-    recall("flights_csv", "last_line_without_end", Verdict::Accepted);
+fn a_file_of_episodes_that_lost_its_last_line_end_is_continued_on_the_next_line() {
+    recall("episodes_csv", "last_line_without_end", Verdict::Accepted);
 }
 
 #[test]
@@ -136,7 +136,7 @@ drive! {
     no_received_snapshot_panics_and_what_is_accepted_is_what_was_sent => "snapshot_received",
     no_checkpoint_file_panics_and_what_is_loaded_can_be_used => "checkpoint",
     no_replay_content_panics_and_what_is_restored_goes_on => "replay",
-    no_flights_csv_panics_and_what_is_continued_can_be_continued_again => "flights_csv",
+    no_episodes_csv_panics_and_what_is_continued_can_be_continued_again => "episodes_csv",
     no_list_of_event_files_reaches_beyond_their_folder => "event_files",
     no_run_identity_panics_and_what_is_accepted_is_of_its_configuration => "run_identity",
     no_announcement_panics_and_what_may_be_joined_is_what_we_would_say => "announcement",

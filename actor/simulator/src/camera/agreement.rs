@@ -142,7 +142,7 @@ proptest! {
 }
 
 #[test]
-fn flight_poses_agree_too() {
+fn episode_poses_agree_too() {
     // As flown: level or tilted by up to the vehicle's limit, with little yaw.
     let course = test_course();
     for step in 0..40 {

@@ -1,6 +1,6 @@
 //! What a layout must satisfy to be a course.
 //!
-//! Every rule exists because the flight would otherwise be impossible or the numbers meaningless; each names what to change.
+//! Every rule exists because the episode would otherwise be impossible or the numbers meaningless; each names what to change.
 
 use super::{
     BODY_CLEARANCE_M, Course, CourseFault, DRONE_WIDTH_M, FRAME_M, MAX_CORNERS, MAX_WALLS, Place, Shape, Wall,

@@ -20,7 +20,7 @@ use super::{
 pub struct GeneratorRanges {
     /// The corridor.
     pub corridor: Corridor,
-    /// Where flights begin.
+    /// Where episodes begin.
     pub start: StartArea,
     /// Front face of each wall, metres; as many walls as entries.
     pub wall_x_m: Vec<f32>,

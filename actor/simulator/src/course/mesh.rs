@@ -15,7 +15,7 @@ pub enum SurfaceKind {
     Corridor,
     /// The wall at the corridor's end: the destination.
     EndWall,
-    /// A wall with an opening, by its place in flight order from 0: front, back and the inside of its opening.
+    /// A wall with an opening, by its place in course order from 0: front, back and the inside of its opening.
     Wall(usize),
 }
 

@@ -1,4 +1,4 @@
-//! The corridor, its walls and their openings, in flight order.
+//! The corridor, its walls and their openings, in episode order.
 //!
 //! A [`Course`] that exists can be flown: [`Course::new`] refuses everything else with the wall, the key and the remedy, so
 //! neither the physics nor the camera has to ask again. The same [`Mesh`] of surfaces is what the drone sees and what it
@@ -31,7 +31,7 @@ pub use opening::{CIRCLE_SIDES, Opening, Shape};
 pub const DRONE_WIDTH_M: f32 = 0.98;
 
 /// Radius about an opening's safe point that must be free, metres: half the diagonal of the drone's cross-section
-/// 0.98 x 0.29 m, which is 0.511 m however the body rolls, and 0.14 m for the pilot's error.
+/// 0.98 x 0.29 m, which is 0.511 m however the body rolls, and 0.14 m for the policy's error.
 pub const BODY_CLEARANCE_M: f32 = 0.65;
 
 /// Least width of the frame that remains around an opening, metres.
@@ -77,7 +77,7 @@ impl Default for Corridor {
     }
 }
 
-/// Where flights begin: this far behind the previous wall's front face, in the middle of the corridor, give or take.
+/// Where episodes begin: this far behind the previous wall's front face, in the middle of the corridor, give or take.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StartArea {
@@ -90,7 +90,7 @@ pub struct StartArea {
 }
 
 impl Default for StartArea {
-    /// 1.5 m clears a wall of 0.3 m by more than the drone's half length; 0.5 m makes every flight another flight.
+    /// 1.5 m clears a wall of 0.3 m by more than the drone's half length; 0.5 m makes every episode another episode.
     fn default() -> Self {
         Self {
             offset_m: 1.5,
@@ -107,11 +107,11 @@ pub struct CourseLayout {
     pub name: String,
     /// The corridor.
     pub corridor: Corridor,
-    /// Where flights begin.
+    /// Where episodes begin.
     pub start: StartArea,
     /// Thickness of every wall along x, metres.
     pub wall_thickness_m: f32,
-    /// Walls in flight order.
+    /// Walls in episode order.
     pub walls: Vec<WallLayout>,
 }
 
@@ -151,7 +151,7 @@ impl Course {
     /// Checks a layout and makes it a course.
     ///
     /// # Errors
-    /// The first [`CourseFault`] found, from the corridor to the walls in flight order.
+    /// The first [`CourseFault`] found, from the corridor to the walls in episode order.
     pub fn new(layout: CourseLayout) -> Result<Self, CourseFault> {
         let mut course = Self::without_walls(layout.name, layout.corridor, layout.start, layout.wall_thickness_m)?;
         check::wall_count(layout.walls.len())?;
@@ -179,7 +179,7 @@ impl Course {
         Ok(course)
     }
 
-    /// Adds the next wall in flight order, unless it cannot be flown.
+    /// Adds the next wall in episode order, unless it cannot be flown.
     fn add_wall(&mut self, layout: WallLayout) -> Result<(), CourseFault> {
         let wall = check::next_wall(self, layout)?;
         self.walls.push(wall);
@@ -221,7 +221,7 @@ impl Course {
         self.corridor
     }
 
-    /// Where flights begin.
+    /// Where episodes begin.
     #[must_use]
     pub fn start(&self) -> StartArea {
         self.start
@@ -233,7 +233,7 @@ impl Course {
         self.wall_thickness_m
     }
 
-    /// The walls in flight order.
+    /// The walls in episode order.
     #[must_use]
     pub fn walls(&self) -> &[Wall] {
         &self.walls
@@ -246,7 +246,7 @@ impl Course {
         self.walls.len() as u8
     }
 
-    /// Draws where a flight of `level` (1 = before the first wall) begins, in the world frame, metres.
+    /// Draws where an episode of `level` (1 = before the first wall) begins, in the world frame, metres.
     ///
     /// # Errors
     /// [`NoSuchLevel`] if the course has fewer walls.

@@ -6,8 +6,8 @@ use rand_pcg::Pcg64Mcg;
 
 use super::{GustSettings, standard_normal};
 
-/// The gusts of one flight: a first-order Gauss-Markov process along each axis of the world, which is what Dryden's model of turbulence is along the
-/// direction of flight.
+/// The gusts of one episode: a first-order Gauss-Markov process along each axis of the world, which is what Dryden's model of turbulence is along the
+/// direction of episode.
 ///
 /// With φ = exp(−Δt / τ), a step is f ← φ f + rms √(1 − φ²) n: the force keeps its rms whatever the step's length, and its correlation over a time t is
 /// exp(−t / τ). Source: MIL-F-8785C, section 3.7; the discrete form is in every text on it.
@@ -22,7 +22,7 @@ pub(crate) struct Gust {
 }
 
 impl Gust {
-    /// The gusts of the flight seeded `seed`, in the middle of which it begins; `None` in calm air.
+    /// The gusts of the episode seeded `seed`, in the middle of which it begins; `None` in calm air.
     pub(crate) fn new(settings: &GustSettings, dt_secs: f32, seed: u64) -> Option<Self> {
         if settings.force_rms_n == 0.0 {
             return None;
@@ -98,13 +98,13 @@ mod tests {
     }
 
     #[test]
-    fn a_flight_begins_in_the_middle_of_a_gust() {
-        // Over many flights, the first force has the rms of all.
-        let flights = 4000;
-        let sum: f32 = (0..flights)
+    fn an_episode_begins_in_the_middle_of_a_gust() {
+        // Over many episodes, the first force has the rms of all.
+        let episodes = 4000;
+        let sum: f32 = (0..episodes)
             .map(|seed| forces(0.3, 5.0, seed, 1)[0].norm_squared())
             .sum();
-        let rms = (sum / (3 * flights) as f32).sqrt();
+        let rms = (sum / (3 * episodes) as f32).sqrt();
         assert!((rms - 0.3).abs() < 0.01, "{rms}");
     }
 

@@ -1,8 +1,8 @@
-//! What a flight meets that the policy did not ask for: a noisy depth camera, gusts, late commands, a drone of another mass.
+//! What an episode meets that the policy did not ask for: a noisy depth camera, gusts, late commands, a drone of another mass.
 //!
-//! Each can be switched on alone, all are off by default, and off they change no bit of a flight. What is drawn is drawn from a generator that
-//! [`Simulator::reset`](crate::simulator::Simulator::reset) takes, so that a disturbed flight is as repeatable as a calm one. Draws do not shift each other:
-//! the mass of a flight is the same whether or not there are gusts.
+//! Each can be switched on alone, all are off by default, and off they change no bit of an episode. What is drawn is drawn from a generator that
+//! [`Simulator::reset`](crate::simulator::Simulator::reset) takes, so that a disturbed episode is as repeatable as a calm one. Draws do not shift each other:
+//! the mass of an episode is the same whether or not there are gusts.
 
 mod delay;
 mod gust;
@@ -18,7 +18,7 @@ pub(crate) use gust::Gust;
 pub(crate) use normal::{mix, scrambled, standard_normal};
 pub use settings::{DepthModel, DepthNoiseSettings, DisturbanceFault, DisturbanceSettings, GustSettings};
 
-/// What was drawn for one flight.
+/// What was drawn for one episode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Drawn {
     /// Whether it is disturbed at all.
@@ -32,7 +32,7 @@ pub(crate) struct Drawn {
 }
 
 impl Drawn {
-    /// Draws for one flight, always as much and in the same order.
+    /// Draws for one episode, always as much and in the same order.
     pub(crate) fn draw(settings: &DisturbanceSettings, rng: &mut impl Rng) -> Self {
         let deviation: f32 = rng.random_range(-1.0..=1.0);
         let [gust_seed, depth_seed] = [rng.random(), rng.random()];

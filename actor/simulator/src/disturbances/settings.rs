@@ -5,14 +5,14 @@ use serde::{Deserialize, Serialize};
 use crate::camera::CameraSettings;
 use crate::vehicle::{Preset, VehicleSettings};
 
-/// What disturbs flights. Section `[simulator.disturbances]`; everything is off by default.
+/// What disturbs episodes. Section `[simulator.disturbances]`; everything is off by default.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DisturbanceSettings {
-    /// Share of flights that are disturbed, 0 to 1, drawn for each; the others are calm in every respect. A pilot that met nothing but disturbed flights would know no calm
+    /// Share of episodes that are disturbed, 0 to 1, drawn for each; the others are calm in every respect. A policy that met nothing but disturbed episodes would know no calm
     /// ones. Default 1.
     pub share: f32,
-    /// Largest deviation of a flight's mass from the nominal one, as a share of it, 0 to 0.5; drawn uniformly for each flight. Inertia goes along; rotors and
+    /// Largest deviation of an episode's mass from the nominal one, as a share of it, 0 to 0.5; drawn uniformly for each episode. Inertia goes along; rotors and
     /// controller know nothing of it and begin trimmed for the nominal mass. Default 0.
     pub mass_spread: f32,
     /// Control periods from an action to its effect, 0 to 8; until the first takes effect nothing is commanded sideways or up. Counted in periods, because
@@ -139,7 +139,7 @@ impl DisturbanceSettings {
     pub fn check(&self, vehicle: &VehicleSettings, camera: &CameraSettings) -> Result<(), DisturbanceFault> {
         let Self { gust, depth, .. } = self;
         for (key, value, least, most, consequence) in [
-            ("share", self.share, 0.0, 1.0, "it is a share of flights"),
+            ("share", self.share, 0.0, 1.0, "it is a share of episodes"),
             (
                 "mass_spread",
                 self.mass_spread,

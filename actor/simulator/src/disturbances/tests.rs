@@ -1,4 +1,4 @@
-//! Disturbed flights: what each disturbance does to the drone, and that none does anything when it is off.
+//! Disturbed episodes: what each disturbance does to the drone, and that none does anything when it is off.
 
 use std::sync::Arc;
 
@@ -37,7 +37,7 @@ fn simulator(preset: Preset, disturbances: DisturbanceSettings) -> Simulator {
     Simulator::new(Arc::new(test_course()), &settings).unwrap()
 }
 
-fn take_off(simulator: &mut Simulator, disturbances_seed: u64) {
+fn reset(simulator: &mut Simulator, disturbances_seed: u64) {
     let [mut start, mut disturbances] = [1, disturbances_seed].map(Pcg64Mcg::seed_from_u64);
     simulator.reset(1, &mut start, &mut disturbances).unwrap();
 }
@@ -48,7 +48,7 @@ fn flown(
     disturbances_seed: u64,
     actions: &[[f32; 2]],
 ) -> Vec<(VehicleState, Box<[u8; IMAGE_PIXELS]>)> {
-    take_off(simulator, disturbances_seed);
+    reset(simulator, disturbances_seed);
     let look = |simulator: &mut Simulator| {
         let mut image = Box::new([0; IMAGE_PIXELS]);
         simulator.render(&mut image);
@@ -63,7 +63,7 @@ fn flown(
 }
 
 #[test]
-fn disturbed_flight_is_a_function_of_its_seeds_whatever_was_flown_before() {
+fn disturbed_episode_is_a_function_of_its_seeds_whatever_was_flown_before() {
     let actions = [[0.5, 0.2]; 8];
     let mut used = simulator(Preset::Airsim, stormy());
     let first = flown(&mut used, 5, &actions);
@@ -75,7 +75,7 @@ fn disturbed_flight_is_a_function_of_its_seeds_whatever_was_flown_before() {
 }
 
 #[test]
-fn share_of_flights_is_disturbed_and_the_others_are_calm_in_every_respect() {
+fn share_of_episodes_is_disturbed_and_the_others_are_calm_in_every_respect() {
     let actions = [[0.5, 0.2]; 4];
     let now_and_then = DisturbanceSettings { share: 0.3, ..stormy() };
     let mut simulators = [DisturbanceSettings::default(), stormy(), now_and_then]
@@ -102,10 +102,10 @@ fn calm_settings_leave_no_trace_of_the_disturbances_generator() {
     }
 }
 
-/// The oracle's flights from seed 1 to where they leave the last wall behind, as they were before there were disturbances: then, flights were equal bit for bit.
+/// The oracle's episodes from seed 1 to where they leave the last wall behind, as they were before there were disturbances: then, episodes were equal bit for bit.
 /// Here positions are held to a millimetre and sums to a part in 10,000, because mathematical functions may differ in the last bit from one system's library to another's.
 #[test]
-fn undisturbed_flights_are_those_from_before_there_were_disturbances() {
+fn undisturbed_episodes_are_those_from_before_there_were_disturbances() {
     let course = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/courses/training.toml");
     let course = Arc::new(Course::load(course).unwrap());
     for (preset, steps, end_m, grey) in RECORDED {
@@ -114,7 +114,7 @@ fn undisturbed_flights_are_those_from_before_there_were_disturbances() {
             ..Default::default()
         };
         let mut simulator = Simulator::new(Arc::clone(&course), &settings).unwrap();
-        take_off(&mut simulator, 3);
+        reset(&mut simulator, 3);
         let mut image = [0; IMAGE_PIXELS];
         let (mut flown, mut sum) = (0, 0.0);
         while simulator.walls_passed() < 5 {
@@ -149,7 +149,7 @@ fn latency_shifts_the_answer_by_exactly_its_periods() {
         flown(&mut simulator(Preset::Airsim, disturbances), 1, actions)
     };
     for periods in [1, 2] {
-        // The same flight as of a prompt drone that waits as long.
+        // The same episode as of a prompt drone that waits as long.
         let waiting = [vec![[0.0, 0.0]; periods as usize], actions.to_vec()].concat();
         assert!(late(periods, &actions) == late(0, &waiting)[..=actions.len()]);
         assert!(late(periods, &actions) != late(0, &actions));
@@ -157,7 +157,7 @@ fn latency_shifts_the_answer_by_exactly_its_periods() {
 }
 
 #[test]
-fn what_was_on_its_way_does_not_reach_the_next_flight() {
+fn what_was_on_its_way_does_not_reach_the_next_episode() {
     let disturbances = DisturbanceSettings {
         latency_periods: 2,
         ..Default::default()
@@ -262,7 +262,7 @@ fn oracle_still_arrives_in_a_storm() {
     let mut simulator = simulator(Preset::Airsim, stormy());
     let arrived = (0..20)
         .filter(|&seed| {
-            take_off(&mut simulator, seed);
+            reset(&mut simulator, seed);
             loop {
                 let action = Oracle::act(simulator.course(), &simulator.state());
                 if let Some(outcome) = simulator.step(action).unwrap().outcome {

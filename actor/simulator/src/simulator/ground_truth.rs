@@ -6,7 +6,7 @@ use crate::vehicle::VehicleState;
 /// A wall is behind the drone once its tail has left the opening; m from the drone's centre to its tail, with some to spare.
 const TAIL_M: f32 = 0.6;
 
-/// What the simulator knows of a moment and no camera sees: for whoever judges a pilot in training, never for the pilot.
+/// What the simulator knows of a moment and no camera sees: for whoever judges a policy in training, never for the policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GroundTruth {
     /// The next two walls that the drone has not left entirely.

@@ -1,7 +1,7 @@
-//! One flight at a time through a course: [`Simulator::reset`] starts it, [`Simulator::step`] lets one control period pass.
+//! One episode at a time through a course: [`Simulator::reset`] starts it, [`Simulator::step`] lets one control period pass.
 //!
-//! A flight is a pure function of course, settings, start, disturbances and actions. Numbers that are not finite never get further than the
-//! step they appear in: it returns [`SimulationError::NonFinite`] and the flight is over.
+//! An episode is a pure function of course, settings, start, disturbances and actions. Numbers that are not finite never get further than the
+//! step they appear in: it returns [`SimulationError::NonFinite`] and the episode is over.
 
 mod ground_truth;
 mod report;
@@ -39,12 +39,12 @@ pub struct Simulator {
     disturbances: DisturbanceSettings,
     commands: Delay,
     gust: Option<Gust>,
-    flight: Flight,
+    episode: Episode,
 }
 
-/// Where a flight stands.
+/// Where an episode stands.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Flight {
+struct Episode {
     phase: Phase,
     steps: u32,
     /// Walls of the course whose back face the drone's centre has left behind, those before its start included.
@@ -52,7 +52,7 @@ struct Flight {
     walls_behind_at_start: usize,
     /// The drone's mass, by its nominal one.
     mass_factor: f32,
-    /// Of what the camera gets wrong; `None` in a calm flight.
+    /// Of what the camera gets wrong; `None` in a calm episode.
     depth_seed: Option<u64>,
 }
 
@@ -63,7 +63,7 @@ enum Phase {
 }
 
 impl Simulator {
-    /// A simulator of `course`, in which no flight is under way yet.
+    /// A simulator of `course`, in which no episode is under way yet.
     ///
     /// # Errors
     /// [`SimulatorError`] names the setting or the course at fault.
@@ -94,7 +94,7 @@ impl Simulator {
             commands: Delay::new(settings.disturbances.latency_periods),
             disturbances: settings.disturbances.clone(),
             gust: None,
-            flight: Flight {
+            episode: Episode {
                 phase: Phase::Over,
                 steps: 0,
                 walls_behind: 0,
@@ -105,7 +105,7 @@ impl Simulator {
         })
     }
 
-    /// Starts a flight: hovering at the start of `level` (1 = before the first wall), jittered by `start` as the course says. Everything that disturbs the flight
+    /// Starts an episode: hovering at the start of `level` (1 = before the first wall), jittered by `start` as the course says. Everything that disturbs the episode
     /// is drawn from `disturbances`; in calm settings it has no influence.
     ///
     /// # Errors
@@ -129,7 +129,7 @@ impl Simulator {
             0
         });
         let walls_behind = self.walls_behind(position_m.x);
-        self.flight = Flight {
+        self.episode = Episode {
             phase: Phase::Flying,
             steps: 0,
             walls_behind,
@@ -142,28 +142,28 @@ impl Simulator {
 
     /// Flies one control period with `action` = `[v_y, v_z]`, m/s in the heading frame, each clamped to [-1, 1]. With latency, `action` is what takes effect later.
     ///
-    /// The flight ends within the step at the physics step that touches something; the state is then the one at that moment.
+    /// The episode ends within the step at the physics step that touches something; the state is then the one at that moment.
     ///
     /// # Errors
-    /// [`SimulationError::NonFinite`] names what is NaN or infinite, be it the action or the physics, and ends the flight;
-    /// [`SimulationError::NotFlying`] after a flight's end.
+    /// [`SimulationError::NonFinite`] names what is NaN or infinite, be it the action or the physics, and ends the episode;
+    /// [`SimulationError::NotFlying`] after an episode's end.
     pub fn step(&mut self, action: [f32; 2]) -> Result<StepReport, SimulationError> {
-        if self.flight.phase == Phase::Over {
+        if self.episode.phase == Phase::Over {
             return Err(SimulationError::NotFlying);
         }
-        self.flight.steps += 1;
-        let walls_behind_before = self.flight.walls_behind;
+        self.episode.steps += 1;
+        let walls_behind_before = self.episode.walls_behind;
 
         let velocity_mps = self.commanded_velocity(action)?;
         let contact = self.fly_until_contact(&velocity_mps)?;
         let outcome = self.outcome(contact);
 
         if outcome.is_some() {
-            self.flight.phase = Phase::Over;
+            self.episode.phase = Phase::Over;
         }
         Ok(StepReport {
             walls_passed: self.walls_passed(),
-            level_up: if self.flight.walls_behind > walls_behind_before {
+            level_up: if self.episode.walls_behind > walls_behind_before {
                 LevelUp::Yes
             } else {
                 LevelUp::No
@@ -176,9 +176,9 @@ impl Simulator {
     /// Draws what the depth camera sees now into `image`, row by row from the top. Its errors belong to the step: looking twice shows the same ones.
     pub fn render(&mut self, image: &mut [u8; IMAGE_PIXELS]) {
         let pose = self.world.state().pose();
-        match self.flight.depth_seed {
+        match self.episode.depth_seed {
             Some(seed) => {
-                let key = seed ^ u64::from(self.flight.steps);
+                let key = seed ^ u64::from(self.episode.steps);
                 self.camera.render_with_noise(&pose, key, image);
             }
             None => self.camera.render(&pose, image),
@@ -201,7 +201,7 @@ impl Simulator {
             ahead: Ahead::next_two(&self.course, &state),
             from_middle_m: [y_m, z_m - corridor.height_m / 2.0],
             to_end_m: corridor.length_m - x_m,
-            mass_factor: self.flight.mass_factor,
+            mass_factor: self.episode.mass_factor,
             latency_periods: self.commands.periods() as f32,
             gust_n: self.gust.as_ref().map_or([0.0; 3], |gust| gust.force_n().into()),
         }
@@ -211,13 +211,13 @@ impl Simulator {
     #[must_use]
     pub fn level(&self) -> u8 {
         // A course has at most `MAX_WALLS` walls.
-        self.flight.walls_behind as u8 + 1
+        self.episode.walls_behind as u8 + 1
     }
 
-    /// Walls passed in this flight so far.
+    /// Walls passed in this episode so far.
     #[must_use]
     pub fn walls_passed(&self) -> u8 {
-        (self.flight.walls_behind - self.flight.walls_behind_at_start) as u8
+        (self.episode.walls_behind - self.episode.walls_behind_at_start) as u8
     }
 
     /// The course flown.
@@ -244,8 +244,8 @@ impl Simulator {
                 return Err(self.break_off("the body's pose or velocity"));
             }
             // A wall passed stays passed, should the drone be blown back.
-            self.flight.walls_behind = self
-                .flight
+            self.episode.walls_behind = self
+                .episode
                 .walls_behind
                 .max(self.walls_behind(self.world.position_x_m()));
             match self.world.contact() {
@@ -260,7 +260,7 @@ impl Simulator {
         match contact {
             Contact::Obstacle => Some(Outcome::Collided),
             Contact::EndWall => Some(Outcome::ReachedEnd),
-            Contact::Nothing if self.flight.steps >= self.max_steps => Some(Outcome::TimedOut),
+            Contact::Nothing if self.episode.steps >= self.max_steps => Some(Outcome::TimedOut),
             Contact::Nothing => None,
         }
     }
@@ -285,10 +285,10 @@ impl Simulator {
     }
 
     fn break_off(&mut self, what: &'static str) -> SimulationError {
-        self.flight.phase = Phase::Over;
+        self.episode.phase = Phase::Over;
         SimulationError::NonFinite {
             what,
-            step: self.flight.steps,
+            step: self.episode.steps,
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Flights from start to end: determinism, counting, outcomes, refusals.
+//! Episodes from start to end: determinism, counting, outcomes, refusals.
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
@@ -26,17 +26,17 @@ fn rng(seed: u64) -> Pcg64Mcg {
     Pcg64Mcg::seed_from_u64(seed)
 }
 
-/// Flies under `pilot` to the end and returns each step's state and report.
+/// Flies under `policy` to the end and returns each step's state and report.
 fn fly(
     simulator: &mut Simulator,
     level: u8,
     seed: u64,
-    pilot: impl Fn(&Course, &VehicleState) -> [f32; 2],
+    policy: impl Fn(&Course, &VehicleState) -> [f32; 2],
 ) -> Vec<(VehicleState, StepReport)> {
     simulator.reset(level, &mut rng(seed), &mut rng(!seed)).unwrap();
     let mut steps = Vec::new();
     loop {
-        let action = pilot(simulator.course(), &simulator.state());
+        let action = policy(simulator.course(), &simulator.state());
         let report = simulator.step(action).unwrap();
         steps.push((simulator.state(), report));
         if report.outcome.is_some() {
@@ -62,10 +62,10 @@ fn bits(steps: &[(VehicleState, StepReport)]) -> Vec<u32> {
 }
 
 #[test]
-fn flight_after_another_flight_is_bit_equal_to_one_in_a_fresh_simulator() {
+fn episode_after_another_episode_is_bit_equal_to_one_in_a_fresh_simulator() {
     for preset in PRESETS {
         let mut used = simulator(preset);
-        // One flight that collides in a wild attitude, one that arrives.
+        // One episode that collides in a wild attitude, one that arrives.
         fly(&mut used, 3, 7, |_, _| [1.0, -1.0]);
         fly(&mut used, 1, 8, Oracle::act);
         let again = fly(&mut used, 2, 9, Oracle::act);
@@ -122,7 +122,7 @@ fn wall_counts_when_the_centre_leaves_its_back_face() {
 }
 
 #[test]
-fn straight_flight_ends_at_the_first_wall_with_the_nose_on_it() {
+fn straight_episode_ends_at_the_first_wall_with_the_nose_on_it() {
     // The test course's first opening is off the middle.
     let steps = fly(&mut simulator(Preset::Point), 1, 1, |_, _| [0.0, 0.0]);
     let (state, last) = steps.last().unwrap();
@@ -150,7 +150,7 @@ fn floor_ceiling_and_sides_are_solid() {
 }
 
 #[test]
-fn step_limit_breaks_the_flight_off_as_timed_out() {
+fn step_limit_breaks_the_episode_off_as_timed_out() {
     let settings = SimulatorSettings {
         max_steps: 3,
         ..Default::default()
@@ -171,7 +171,7 @@ fn actions_beyond_the_range_are_clamped() {
 }
 
 #[test]
-fn action_that_is_not_a_number_ends_the_flight_with_an_error() {
+fn action_that_is_not_a_number_ends_the_episode_with_an_error() {
     let mut simulator = simulator(Preset::Airsim);
     simulator.reset(1, &mut rng(1), &mut rng(2)).unwrap();
     simulator.step([0.0, 0.0]).unwrap();
@@ -187,7 +187,7 @@ fn action_that_is_not_a_number_ends_the_flight_with_an_error() {
 }
 
 #[test]
-fn physics_that_is_not_a_number_ends_the_flight_with_an_error() {
+fn physics_that_is_not_a_number_ends_the_episode_with_an_error() {
     for preset in PRESETS {
         let mut simulator = simulator(preset);
         simulator.reset(1, &mut rng(1), &mut rng(2)).unwrap();
@@ -198,7 +198,7 @@ fn physics_that_is_not_a_number_ends_the_flight_with_an_error() {
         let error = simulator.step([0.0, 0.0]);
         let what = "the body's pose or velocity";
         assert_eq!(error, Err(SimulationError::NonFinite { what, step: 1 }), "{preset:?}");
-        // A new flight starts clean.
+        // A new episode starts clean.
         assert!(!fly(&mut simulator, 1, 1, Oracle::act).is_empty());
     }
 }
@@ -246,7 +246,7 @@ fn level_beyond_the_course_is_refused() {
 }
 
 #[test]
-fn the_ground_truth_tells_what_disturbs_a_flight_and_nothing_of_the_kind_in_a_calm_one() {
+fn the_ground_truth_tells_what_disturbs_an_episode_and_nothing_of_the_kind_in_a_calm_one() {
     let mut settings = SimulatorSettings::default();
     let mut told = |share: f32| {
         settings.disturbances.share = share;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde::Deserialize;
 
-use super::{EntryCourses, MOST_FLIGHTS, MOST_WALLS_TO_ORDER, Suite, SuiteEntry, orders};
+use super::{EntryCourses, MOST_EPISODES, MOST_WALLS_TO_ORDER, Suite, SuiteEntry, orders};
 use crate::course::{Course, CourseError, CourseFault, GeneratorRanges, RangesError};
 use crate::disturbances::DisturbanceSettings;
 use crate::text::read_text;
@@ -64,12 +64,12 @@ pub enum EntryFault {
     /// A seed without anything to generate.
     #[error("has first_seed, but nothing generated: leave it out, or add generated")]
     SeedOfNothing,
-    /// No flights, or too many.
-    #[error("flights = {0} is outside 1 to {MOST_FLIGHTS}")]
-    Flights(u64),
-    /// No number of flights.
-    #[error("has no flights, and the suite has none for all its entries: add flights to either")]
-    NoFlights,
+    /// No episodes, or too many.
+    #[error("episodes = {0} is outside 1 to {MOST_EPISODES}")]
+    Episodes(u64),
+    /// No number of episodes.
+    #[error("has no episodes, and the suite has none for all its entries: add episodes to either")]
+    NoEpisodes,
     /// A course file cannot be flown.
     #[error(transparent)]
     Course(#[from] CourseError),
@@ -102,7 +102,7 @@ pub enum EntryFault {
 struct SuiteFile {
     name: String,
     /// Of every entry that says nothing else.
-    flights: Option<u64>,
+    episodes: Option<u64>,
     #[serde(default)]
     entry: Vec<EntryFile>,
 }
@@ -112,7 +112,7 @@ struct SuiteFile {
 #[serde(deny_unknown_fields)]
 struct EntryFile {
     name: String,
-    flights: Option<u64>,
+    episodes: Option<u64>,
     course: Option<PathBuf>,
     orders_of: Option<PathBuf>,
     generated: Option<GeneratorRanges>,
@@ -158,7 +158,7 @@ impl Suite {
         };
         for written in file.entry {
             let entry = written.name.clone();
-            let read = suite.entry(written, file.flights, folder);
+            let read = suite.entry(written, file.episodes, folder);
             suite.entries.push(read.map_err(|source| SuiteError::Entry {
                 path: path.to_owned(),
                 entry,
@@ -169,16 +169,16 @@ impl Suite {
     }
 
     /// The next entry, if it can be flown beside those already there.
-    fn entry(&self, written: EntryFile, flights: Option<u64>, folder: &Path) -> Result<SuiteEntry, EntryFault> {
+    fn entry(&self, written: EntryFile, episodes: Option<u64>, folder: &Path) -> Result<SuiteEntry, EntryFault> {
         if self.entries.iter().any(|entry| entry.name == written.name) {
             return Err(EntryFault::RepeatedName);
         }
-        let flights = written.flights.or(flights).ok_or(EntryFault::NoFlights)?;
-        if !(1..=MOST_FLIGHTS).contains(&flights) {
-            return Err(EntryFault::Flights(flights));
+        let episodes = written.episodes.or(episodes).ok_or(EntryFault::NoEpisodes)?;
+        if !(1..=MOST_EPISODES).contains(&episodes) {
+            return Err(EntryFault::Episodes(episodes));
         }
         Ok(SuiteEntry {
-            flights,
+            episodes,
             courses: courses(&written, folder)?,
             disturbances: written.disturbances,
             name: written.name,

@@ -1,7 +1,7 @@
-//! Evaluation suites: what a pilot is put to, entry by entry.
+//! Evaluation suites: what a policy is put to, entry by entry.
 //!
-//! An entry names courses (a file, all orders of a file's walls, or generated ones), how many flights are spread over them, and what disturbs them. A suite says all of it
-//! by itself, so that two pilots that were trained on different courses, and with different disturbances, are put to the same.
+//! An entry names courses (a file, all orders of a file's walls, or generated ones), how many episodes are spread over them, and what disturbs them. A suite says all of it
+//! by itself, so that two policies that were trained on different courses, and with different disturbances, are put to the same.
 
 mod file;
 #[cfg(test)]
@@ -14,8 +14,8 @@ pub use file::{EntryFault, SuiteError};
 use crate::course::{Course, GeneratorRanges, RangesError};
 use crate::disturbances::DisturbanceSettings;
 
-/// Most flights of an entry.
-pub const MOST_FLIGHTS: u64 = 1_000_000;
+/// Most episodes of an entry.
+pub const MOST_EPISODES: u64 = 1_000_000;
 /// Most walls of a course of which all orders are flown: 720 courses.
 pub const MOST_WALLS_TO_ORDER: usize = 6;
 
@@ -28,27 +28,27 @@ pub struct Suite {
     pub entries: Vec<SuiteEntry>,
 }
 
-/// Flights of one kind.
+/// Episodes of one kind.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SuiteEntry {
     /// What reports call it.
     pub name: String,
     /// How many.
-    pub flights: u64,
+    pub episodes: u64,
     /// Where.
     pub courses: EntryCourses,
     /// What disturbs them.
     pub disturbances: DisturbanceSettings,
 }
 
-/// The courses of an entry. Flight n flies course n, and begins anew after the last.
+/// The courses of an entry. Episode n flies course n, and begins anew after the last.
 #[derive(Debug, Clone, PartialEq)]
 pub enum EntryCourses {
     /// These; at least one.
     Listed(Vec<Arc<Course>>),
-    /// One for each flight: that of the seed `first_seed` + n.
+    /// One for each episode: that of the seed `first_seed` + n.
     Generated {
-        /// Seed of the first flight's course.
+        /// Seed of the first episode's course.
         first_seed: u64,
         /// What they are drawn from.
         ranges: GeneratorRanges,
@@ -56,24 +56,24 @@ pub enum EntryCourses {
 }
 
 impl EntryCourses {
-    /// Number of the course that flight `flight`, from 0, flies: two flights with one number fly one course.
+    /// Number of the course that episode `episode`, from 0, flies: two episodes with one number fly one course.
     #[must_use]
-    pub fn number_of(&self, flight: u64) -> u64 {
+    pub fn number_of(&self, episode: u64) -> u64 {
         match self {
-            Self::Listed(courses) => flight % courses.len() as u64,
-            Self::Generated { .. } => flight,
+            Self::Listed(courses) => episode % courses.len() as u64,
+            Self::Generated { .. } => episode,
         }
     }
 
-    /// The course of flight `flight`, from 0.
+    /// The course of episode `episode`, from 0.
     ///
     /// # Errors
     /// [`RangesError`] if none can be generated for it.
-    pub fn of_flight(&self, flight: u64) -> Result<Arc<Course>, RangesError> {
+    pub fn of_episode(&self, episode: u64) -> Result<Arc<Course>, RangesError> {
         match self {
-            Self::Listed(courses) => Ok(Arc::clone(&courses[self.number_of(flight) as usize])),
+            Self::Listed(courses) => Ok(Arc::clone(&courses[self.number_of(episode) as usize])),
             Self::Generated { first_seed, ranges } => {
-                Course::generate(first_seed.wrapping_add(flight), ranges).map(Arc::new)
+                Course::generate(first_seed.wrapping_add(episode), ranges).map(Arc::new)
             }
         }
     }

@@ -23,10 +23,10 @@ fn labels(course: &Course) -> Vec<u32> {
 }
 
 #[test]
-fn generalist_suite_is_six_thousand_flights() {
+fn generalist_suite_is_six_thousand_episodes() {
     let suite = generalist();
     assert_eq!(suite.entries.len(), 6);
-    assert!(suite.entries.iter().all(|entry| entry.flights == 1000));
+    assert!(suite.entries.iter().all(|entry| entry.episodes == 1000));
     let disturbed: Vec<_> = suite
         .entries
         .iter()
@@ -49,20 +49,20 @@ fn all_orders_are_flown_alike_often_and_the_first_is_the_files_own() {
     let suite = generalist();
     let orders = entry(&suite, "all 120 orders");
     let flown: Vec<_> = (0..240)
-        .map(|flight| labels(&orders.courses.of_flight(flight).unwrap()))
+        .map(|episode| labels(&orders.courses.of_episode(episode).unwrap()))
         .collect();
     assert_eq!(flown[0], [1, 2, 3, 4, 5]);
     assert_eq!(flown[..120].iter().collect::<HashSet<_>>().len(), 120);
     assert_eq!(flown[..120], flown[120..]);
-    // Few flights are spread over all orders, too.
+    // Few episodes are spread over all orders, too.
     for first in 1..=5 {
         let begun = flown[..20].iter().filter(|order| order[0] == first).count();
         assert!((3..=5).contains(&begun), "{begun} of 20 begin with wall {first}");
     }
     // A wall keeps its opening wherever it stands.
     let training = Course::load(configs().join("courses/training.toml")).unwrap();
-    for flight in [1, 77, 119] {
-        let course = orders.courses.of_flight(flight).unwrap();
+    for episode in [1, 77, 119] {
+        let course = orders.courses.of_episode(episode).unwrap();
         for (wall, place) in course.walls().iter().zip(training.walls()) {
             let same = training.walls().iter().find(|other| other.label() == wall.label());
             assert_eq!(wall.opening(), same.unwrap().opening());
@@ -85,8 +85,8 @@ fn held_out_courses_hold_only_held_out_shapes_with_the_disc_they_name() {
         let kinds: HashSet<_> = ranges.shapes.iter().collect();
         assert_eq!(kinds, GeneratedShape::HELD_OUT.iter().collect());
         let mut outlines = HashSet::new();
-        for flight in 0..100 {
-            let course = held_out.courses.of_flight(flight).unwrap();
+        for episode in 0..100 {
+            let course = held_out.courses.of_episode(episode).unwrap();
             for wall in course.walls() {
                 assert!((wall.clearance_m() - radius_m).abs() < 0.003, "{}", wall.clearance_m());
                 assert!(!matches!(
@@ -96,7 +96,7 @@ fn held_out_courses_hold_only_held_out_shapes_with_the_disc_they_name() {
             }
             outlines.insert(format!("{:?}", course.walls()[0].outline()));
         }
-        assert_eq!(outlines.len(), 100, "every flight has a course of its own");
+        assert_eq!(outlines.len(), 100, "every episode has a course of its own");
     }
 }
 
@@ -114,7 +114,11 @@ fn non_rectangular_gates_are_of_the_held_out_families() {
 fn what_cannot_be_flown_is_refused_by_file_entry_and_key() {
     let path = configs().join("evaluations/x.toml");
     let refusal = |text: &str| Suite::parse(text, &path).unwrap_err().to_string();
-    let of_entry = |keys: &str| refusal(&format!("name = \"x\"\nflights = 2\n[[entry]]\nname = \"one\"\n{keys}"));
+    let of_entry = |keys: &str| {
+        refusal(&format!(
+            "name = \"x\"\nepisodes = 2\n[[entry]]\nname = \"one\"\n{keys}"
+        ))
+    };
     for (told, expected) in [
         (refusal("name = \"x\""), "has 0 [[entry]] tables"),
         (refusal("name = 3"), "line 1: invalid type"),
@@ -133,8 +137,8 @@ fn what_cannot_be_flown_is_refused_by_file_entry_and_key() {
             "has first_seed",
         ),
         (
-            of_entry("course = \"../courses/training.toml\"\nflights = 0"),
-            "flights = 0 is outside",
+            of_entry("course = \"../courses/training.toml\"\nepisodes = 0"),
+            "episodes = 0 is outside",
         ),
         (
             of_entry("generated.clearance_m = [0.3, 0.3]"),
@@ -153,7 +157,7 @@ fn what_cannot_be_flown_is_refused_by_file_entry_and_key() {
         ),
         (
             refusal("name = \"x\"\n[[entry]]\nname = \"one\"\ncourse = \"../courses/training.toml\""),
-            "has no flights",
+            "has no episodes",
         ),
     ] {
         assert!(told.contains(expected), "{told}");

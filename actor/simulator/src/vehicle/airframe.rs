@@ -52,7 +52,7 @@ pub(crate) struct Gains {
 }
 
 impl Airframe {
-    /// AirSim's generic quadrotor under SimpleFlight, its default flight controller.
+    /// AirSim's generic quadrotor under SimpleFlight, its default episode controller.
     ///
     /// Source: AirSim, `MultiRotorParams.hpp` (`setupFrameGenericQuad`), `RotorParams.hpp`, `simple_flight/firmware/Params.hpp`.
     pub(crate) const AIRSIM: Self = Self {

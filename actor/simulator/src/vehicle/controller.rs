@@ -1,4 +1,4 @@
-//! Cascade flight controller: velocity → tilt → body rates → rotor commands, and climb → throttle.
+//! Cascade episode controller: velocity → tilt → body rates → rotor commands, and climb → throttle.
 //!
 //! The structure is SimpleFlight's. One departure: velocity errors are taken in the heading frame (yawed, but level), where
 //! SimpleFlight takes them in the tilted body frame; at the few degrees flown here the two agree to second order.
@@ -12,7 +12,7 @@ use super::rotors::RotorCommand;
 /// The controller's memory: only the climb loop integrates.
 #[derive(Debug, Clone)]
 pub(crate) struct Cascade {
-    /// Integral part of the throttle; starts at hover, as after a take-off.
+    /// Integral part of the throttle; starts at hover, as after a reset.
     throttle_integral: f32,
 }
 

@@ -87,7 +87,7 @@ impl BodyProperties {
     }
 }
 
-/// A drone and its controller, as it stands at some moment of a flight.
+/// A drone and its controller, as it stands at some moment of an episode.
 #[derive(Debug, Clone)]
 pub(crate) enum Vehicle {
     Quadrotor {
@@ -101,7 +101,7 @@ pub(crate) enum Vehicle {
 }
 
 impl Vehicle {
-    /// The vehicle as it starts a flight: rotors and controller trimmed for hover.
+    /// The vehicle as it starts an episode: rotors and controller trimmed for hover.
     pub(crate) fn trimmed(settings: &VehicleSettings) -> Self {
         let quadrotor = |airframe: Airframe| Self::Quadrotor {
             airframe,

@@ -22,9 +22,9 @@ pub struct VehicleSettings {
     pub preset: Preset,
     /// Time between two actions, s. Default 0.5: within the 0.5 to 1 s that the paper's step counts allow.
     pub control_period_secs: f32,
-    /// Least rate of physics and flight controller, Hz, 200 to 10,000. Default 200. Rounded up to whole steps per control period.
+    /// Least rate of physics and episode controller, Hz, 200 to 10,000. Default 200. Rounded up to whole steps per control period.
     pub physics_hz: f32,
-    /// Forward velocity commanded throughout a flight, m/s. Default 1, as in the paper.
+    /// Forward velocity commanded throughout an episode, m/s. Default 1, as in the paper.
     pub forward_speed_mps: f32,
     /// Time constant of the `point` preset's velocity, s. Default 0.3; other presets ignore it.
     pub point_time_constant_secs: f32,
@@ -54,7 +54,7 @@ impl VehicleSettings {
                 self.control_period_secs,
                 0.01,
                 5.0,
-                "the pilot could not steer",
+                "the policy could not steer",
             ),
             // The rate loop of `airsim` settles in 10 ms: below 200 Hz it oscillates.
             (
@@ -62,7 +62,7 @@ impl VehicleSettings {
                 self.physics_hz,
                 200.0,
                 10_000.0,
-                "the flight controller would be unstable, or a step take for ever",
+                "the episode controller would be unstable, or a step take for ever",
             ),
             (
                 "forward_speed_mps",

@@ -9,7 +9,7 @@ use super::{Preset, Vehicle, VehicleSettings, VehicleState};
 use crate::course::test_course;
 use crate::world::World;
 
-/// States after every physics step of a flight under constant `velocity_mps` from hover at mid-height. Walls do not act.
+/// States after every physics step of an episode under constant `velocity_mps` from hover at mid-height. Walls do not act.
 fn fly(preset: Preset, velocity_mps: Vector3<f32>, secs: f32) -> (f32, Vec<VehicleState>) {
     let settings = VehicleSettings {
         preset,
@@ -125,7 +125,7 @@ fn tilt_limit_is_respected_and_used() {
 }
 
 #[test]
-fn yaw_stays_zero_whatever_the_pilot_does() {
+fn yaw_stays_zero_whatever_the_policy_does() {
     // Rolling and pitching at once turns the nose by at most half the product of the two tilts; the controller takes it back.
     for (preset, tilt_rad) in [(Preset::Airsim, 0.114_f32), (Preset::Hummingbird, 0.255)] {
         for command in [

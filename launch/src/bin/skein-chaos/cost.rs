@@ -14,7 +14,7 @@ const TOLERANCE: f64 = 0.03;
 /// What it came to.
 #[derive(Debug)]
 pub(crate) struct Cost {
-    every_flights: u64,
+    every_episodes: u64,
     with: Vec<Summary>,
     without: Vec<Summary>,
 }
@@ -31,11 +31,11 @@ impl Cost {
     ) -> Result<Self> {
         let config = Config::load(&recipe.config, &recipe.overrides)?;
         let mut bare = recipe.clone();
-        // Beyond the last flight: one is written at the end all the same, as in the others.
+        // Beyond the last episode: one is written at the end all the same, as in the others.
         bare.overrides
-            .push(format!("checkpoints.every_flights={}", config.run.flights + 1));
+            .push(format!("checkpoints.every_episodes={}", config.run.episodes + 1));
         let mut cost = Self {
-            every_flights: config.checkpoints.every_flights,
+            every_episodes: config.checkpoints.every_episodes,
             with: Vec::new(),
             without: Vec::new(),
         };
@@ -61,11 +61,11 @@ impl Cost {
         };
         let all: f64 = median_of(&self.with, |summary| summary.thread_cpu_secs.values().sum());
         let waits = median_of(&self.with, |summary| summary.stages.of(Stage::Checkpoint).secs());
-        let receives = cpu("reception") / all;
+        let receives = cpu("receiver") / all;
         println!("Cost, medians of {} trainings each, seconds:", self.with.len());
         println!(
             "  {:<44} {with:8.2}",
-            format!("with a checkpoint each {} flights", self.every_flights)
+            format!("with a checkpoint each {} episodes", self.every_episodes)
         );
         println!("  {:<44} {without:8.2}", "without");
         println!("  {:<44} {:7.2} %", "slower by", slower * 100.0);
@@ -73,8 +73,8 @@ impl Cost {
         println!("  {:<44} {:8.2}", "processor time of writing them", cpu("checkpoints"));
         println!(
             "  {:<44} {:8.2}",
-            "processor time of assembling flights",
-            cpu("reception")
+            "processor time of assembling episodes",
+            cpu("receiver")
         );
         println!("  {:<44} {all:8.2}", "processor time of the learner");
         println!("  {:<44} {:7.2} %", "assembling, of the learner's", receives * 100.0);

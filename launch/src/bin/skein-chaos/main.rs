@@ -88,11 +88,11 @@ struct Arguments {
 
 /// What a soak sets, unless it is set otherwise: a run that outlasts it, and a replay buffer that is full, both parts of it, while it is still warming
 /// up.
-const SOAK_SETTINGS: [&str; 2] = ["run.flights=100000000", "replay.capacity=8192"];
+const SOAK_SETTINGS: [&str; 2] = ["run.episodes=100000000", "replay.capacity=8192"];
 
 /// What a death at each point sets, unless it is set otherwise: a checkpoint after each epoch, so that the points of writing one are passed soon after
 /// each death.
-const POINTS_SETTINGS: [&str; 1] = ["checkpoints.every_flights=1"];
+const POINTS_SETTINGS: [&str; 1] = ["checkpoints.every_episodes=1"];
 
 /// How it went.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -164,7 +164,7 @@ fn disturb(arguments: &Arguments, folder: &Path) -> Result<Verdict> {
     let mut storm = start(&stage, &recipe, arguments.actors, Spared::Nobody)?;
     let all_done = match faults {
         Some(faults) => {
-            let mut points = Points::new(faults, config.run.flights)?;
+            let mut points = Points::new(faults, config.run.episodes)?;
             storm.rage(&mut points)?;
             report::points(&points)
         }
@@ -257,8 +257,8 @@ fn summary(run: &RunDirectory) -> Result<Summary> {
 
 fn planning(arguments: &Arguments, config: &Config, calm: &Summary) -> Planning {
     let subject = Subject {
-        flights: config.run.flights,
-        flights_per_epoch: config.learning.flights_per_epoch,
+        episodes: config.run.episodes,
+        episodes_per_epoch: config.learning.episodes_per_epoch,
         actors: arguments.actors,
         actor_silence_secs: config.transport.actor_silence_secs,
         learner_silence_secs: config.transport.learner_silence_secs,
@@ -270,7 +270,7 @@ fn planning(arguments: &Arguments, config: &Config, calm: &Summary) -> Planning 
         freezes: arguments.freezes,
         attachments: arguments.attachments,
     };
-    let epochs = config.run.flights as f64 / config.learning.flights_per_epoch as f64;
+    let epochs = config.run.episodes as f64 / config.learning.episodes_per_epoch as f64;
     let epoch = Duration::from_secs_f64(calm.wall_secs / epochs.max(1.0));
-    Planning::new(wanted.plan(&subject, arguments.seed), subject.flights_per_epoch, epoch)
+    Planning::new(wanted.plan(&subject, arguments.seed), subject.episodes_per_epoch, epoch)
 }

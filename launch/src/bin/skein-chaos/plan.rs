@@ -1,6 +1,6 @@
 //! What is done to a run, and when: drawn from a seed before the run starts, so that the same seed disturbs in the same way.
 //!
-//! Moments are given in training flights, not in seconds, so that a plan fits a run whatever machine it is on. Some disturbances follow another
+//! Moments are given in training episodes, not in seconds, so that a plan fits a run whatever machine it is on. Some disturbances follow another
 //! within moments, to meet a run that is just getting up again.
 
 use rand::{RngExt, SeedableRng};
@@ -51,8 +51,8 @@ pub(crate) enum Manner {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum When {
-    /// Once so many training flights were learned from for the first time, and then this share of the time an epoch takes.
-    Flight { flight: u64, share: f64 },
+    /// Once so many training episodes were learned from for the first time, and then this share of the time an epoch takes.
+    Episode { episode: u64, share: f64 },
     /// So long after the disturbance before it.
     After { secs: f64 },
 }
@@ -78,8 +78,8 @@ pub(crate) struct Wanted {
 /// The run that is to be disturbed.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Subject {
-    pub(crate) flights: u64,
-    pub(crate) flights_per_epoch: u64,
+    pub(crate) episodes: u64,
+    pub(crate) episodes_per_epoch: u64,
     pub(crate) actors: u32,
     pub(crate) actor_silence_secs: f64,
     pub(crate) learner_silence_secs: f64,
@@ -121,12 +121,12 @@ impl Wanted {
                     what,
                 });
             }
-            let (flight, share) = draw.moment();
-            moments.push((flight, share, what, after));
+            let (episode, share) = draw.moment();
+            moments.push((episode, share, what, after));
         }
         for what in kills {
-            let (flight, share) = draw.moment();
-            moments.push((flight, share, what, Vec::new()));
+            let (episode, share) = draw.moment();
+            moments.push((episode, share, what, Vec::new()));
         }
         for _ in 0..self.attachments {
             let [(one, one_share), (other, other_share)] = [draw.moment(), draw.moment()];
@@ -144,8 +144,8 @@ impl Wanted {
                 .partial_cmp(&(other.0, other.1))
                 .expect("shares are numbers")
         });
-        let in_order = moments.into_iter().flat_map(|(flight, share, what, after)| {
-            let when = When::Flight { flight, share };
+        let in_order = moments.into_iter().flat_map(|(episode, share, what, after)| {
+            let when = When::Episode { episode, share };
             std::iter::once(Planned { when, what }).chain(after)
         });
         in_order.collect()
@@ -161,13 +161,13 @@ struct Draw {
 impl Draw {
     fn moment(&mut self) -> (u64, f64) {
         let Subject {
-            flights,
-            flights_per_epoch,
+            episodes,
+            episodes_per_epoch,
             ..
         } = self.subject;
-        let last = (flights as f64 * LAST) as u64 / flights_per_epoch;
+        let last = (episodes as f64 * LAST) as u64 / episodes_per_epoch;
         let epoch = self.generator.random_range(0..=last);
-        (epoch * flights_per_epoch, self.generator.random_range(0.0..1.0))
+        (epoch * episodes_per_epoch, self.generator.random_range(0.0..1.0))
     }
 
     fn actor_kill(&mut self) -> Disturbance {
@@ -227,8 +227,8 @@ mod tests {
     use super::*;
 
     const SUBJECT: Subject = Subject {
-        flights: 300,
-        flights_per_epoch: 10,
+        episodes: 300,
+        episodes_per_epoch: 10,
         actors: 4,
         actor_silence_secs: 5.0,
         learner_silence_secs: 30.0,
@@ -257,21 +257,21 @@ mod tests {
 
     #[test]
     fn moments_come_in_order_and_before_the_end() {
-        let flights: Vec<_> = (0..20)
+        let episodes: Vec<_> = (0..20)
             .flat_map(|seed| WANTED.plan(&SUBJECT, seed))
             .filter_map(|planned| match planned.when {
-                When::Flight { flight, .. } => Some(flight),
+                When::Episode { episode, .. } => Some(episode),
                 When::After { .. } => None,
             })
             .collect();
-        assert!(flights.iter().all(|&flight| flight <= 270 && flight % 10 == 0));
+        assert!(episodes.iter().all(|&episode| episode <= 270 && episode % 10 == 0));
         let one = WANTED.plan(&SUBJECT, 1);
-        assert!(matches!(one[0].when, When::Flight { .. }), "an aftershock of nothing");
+        assert!(matches!(one[0].when, When::Episode { .. }), "an aftershock of nothing");
         let mut last = (0, 0.0);
         for planned in &one {
-            if let When::Flight { flight, share } = planned.when {
-                assert!((flight, share) >= last);
-                last = (flight, share);
+            if let When::Episode { episode, share } = planned.when {
+                assert!((episode, share) >= last);
+                last = (episode, share);
             }
         }
     }

@@ -12,17 +12,17 @@ use crate::storm::{Attempt, Script, Storm};
 #[derive(Debug)]
 pub(crate) struct Planning {
     left: VecDeque<Planned>,
-    flights_per_epoch: u64,
+    episodes_per_epoch: u64,
     epoch: Duration,
     last_done: Instant,
 }
 
 impl Planning {
-    /// For a run whose epochs have so many flights and take about so long.
-    pub(crate) fn new(plan: Vec<Planned>, flights_per_epoch: u64, epoch: Duration) -> Self {
+    /// For a run whose epochs have so many episodes and take about so long.
+    pub(crate) fn new(plan: Vec<Planned>, episodes_per_epoch: u64, epoch: Duration) -> Self {
         Self {
             left: plan.into(),
-            flights_per_epoch,
+            episodes_per_epoch,
             epoch,
             last_done: Instant::now(),
         }
@@ -35,9 +35,9 @@ impl Planning {
 
     fn is_due(&self, when: When, storm: &Storm<'_>) -> bool {
         match when {
-            When::Flight { flight, share } => {
-                let long_past = storm.highest() >= flight + self.flights_per_epoch;
-                long_past || storm.highest() >= flight && storm.since_moved() >= self.epoch.mul_f64(share)
+            When::Episode { episode, share } => {
+                let long_past = storm.highest() >= episode + self.episodes_per_epoch;
+                long_past || storm.highest() >= episode && storm.since_moved() >= self.epoch.mul_f64(share)
             }
             When::After { secs } => self.last_done.elapsed().as_secs_f64() >= secs,
         }

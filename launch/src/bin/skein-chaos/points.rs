@@ -10,33 +10,33 @@ use skein_protocol::fault::FaultPoint;
 use crate::plan::Disturbance;
 use crate::storm::{Script, Storm};
 
-/// After this share of the run's flights the next point is armed as well: some are passed seldom, and the last ones only at the end.
+/// After this share of the run's episodes the next point is armed as well: some are passed seldom, and the last ones only at the end.
 const PATIENCE: f64 = 1.0 / 6.0;
 
 /// The fault points, in the order in which they are armed.
 #[derive(Debug)]
 pub(crate) struct Points {
     folder: PathBuf,
-    total_flights: u64,
+    total_episodes: u64,
     /// The next one last.
     to_arm: Vec<FaultPoint>,
-    /// With the flights learned from at most by then.
+    /// With the episodes learned from at most by then.
     armed: Vec<(FaultPoint, u64)>,
     fired: Vec<FaultPoint>,
-    /// Flights learned from at most when a point fired, until there are more.
+    /// Episodes learned from at most when a point fired, until there are more.
     recovering_from: Option<u64>,
 }
 
 impl Points {
-    /// All of them, to be armed in `folder`, over a run of so many flights.
+    /// All of them, to be armed in `folder`, over a run of so many episodes.
     ///
     /// # Errors
     /// When the folder cannot be made.
-    pub(crate) fn new(folder: PathBuf, total_flights: u64) -> Result<Self> {
+    pub(crate) fn new(folder: PathBuf, total_episodes: u64) -> Result<Self> {
         fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
         Ok(Self {
             folder,
-            total_flights,
+            total_episodes,
             to_arm: order_of_arming().into_iter().rev().collect(),
             armed: Vec::new(),
             fired: Vec::new(),
@@ -70,9 +70,9 @@ impl Points {
     }
 
     /// Whether the run has come farther since the last point fired: deaths without that are answered with longer and longer pauses. What comes
-    /// after the last flight, nobody can wait for.
+    /// after the last episode, nobody can wait for.
     fn has_recovered(&mut self, storm: &Storm<'_>) -> bool {
-        let total = self.total_flights;
+        let total = self.total_episodes;
         let recovering = |&from: &u64| storm.highest() <= from && from < total;
         self.recovering_from = self.recovering_from.filter(recovering);
         self.recovering_from.is_none()
@@ -91,12 +91,12 @@ impl Script for Points {
     fn step(&mut self, storm: &mut Storm<'_>) -> Result<()> {
         self.note_fired(storm)?;
         let recovered = self.has_recovered(storm);
-        let patience = (self.total_flights as f64 * PATIENCE) as u64;
+        let patience = (self.total_episodes as f64 * PATIENCE) as u64;
         let patient = self
             .armed
             .iter()
             .any(|&(_, armed_at)| storm.highest() < armed_at + patience);
-        let at_the_end = storm.flights() >= self.total_flights;
+        let at_the_end = storm.episodes() >= self.total_episodes;
         if recovered
             && (!patient || at_the_end)
             && let Some(point) = self.to_arm.pop()

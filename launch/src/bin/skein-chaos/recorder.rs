@@ -1,4 +1,4 @@
-//! The flight recorder: everything that was done to a run, as one JSON object a line, so that a failure can be studied.
+//! The episode recorder: everything that was done to a run, as one JSON object a line, so that a failure can be studied.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -36,18 +36,18 @@ impl Recorder {
         }
     }
 
-    /// Notes what happened: seconds since the start, flights learned from by then, `event`, and the fields of `details`.
+    /// Notes what happened: seconds since the start, episodes learned from by then, `event`, and the fields of `details`.
     ///
     /// # Errors
     /// When it cannot be written.
-    pub(crate) fn note(&mut self, flights: u64, event: &str, details: &impl Serialize) -> io::Result<()> {
+    pub(crate) fn note(&mut self, episodes: u64, event: &str, details: &impl Serialize) -> io::Result<()> {
         let Some(file) = &mut self.file else {
             return Ok(());
         };
         let mut line = Map::new();
         let secs = (self.started.elapsed().as_secs_f64() * 1000.0).round() / 1000.0;
         line.insert("secs".to_owned(), secs.into());
-        line.insert("flights".to_owned(), flights.into());
+        line.insert("episodes".to_owned(), episodes.into());
         line.insert("event".to_owned(), event.into());
         match serde_json::to_value(details)? {
             Value::Object(fields) => line.extend(fields),

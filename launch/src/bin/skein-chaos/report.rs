@@ -12,7 +12,7 @@ pub(crate) fn disturbances(storm: &Storm<'_>, planning: &Planning) -> bool {
     tally(storm);
     if planning.left() > 0 {
         println!(
-            "  {:<32} {}: the run ended too soon; train longer, with a greater run.flights",
+            "  {:<32} {}: the run ended too soon; train longer, with a greater run.episodes",
             "NOT DONE",
             planning.left()
         );

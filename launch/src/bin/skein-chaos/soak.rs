@@ -107,7 +107,7 @@ impl Soak {
             .iter()
             .map(|series| format!("{} {}", series.whose, series.what).replace(' ', "_"))
             .collect();
-        writeln!(file, "secs,flights,processes,{}", columns.join(","))?;
+        writeln!(file, "secs,episodes,processes,{}", columns.join(","))?;
         let now = Instant::now();
         Ok(Self {
             run: run.clone(),
@@ -174,7 +174,7 @@ impl Soak {
         writeln!(
             self.table,
             "{secs:.1},{},{},{}",
-            storm.flights(),
+            storm.episodes(),
             processes.len(),
             cells.join(",")
         )?;

@@ -175,25 +175,25 @@ pub(crate) fn wait(child: &mut Child, deadline: Instant) -> io::Result<Option<Ex
     }
 }
 
-/// Counts the flights in a `flights.csv` that grows, and may be cut back.
+/// Counts the episodes in an `episodes.csv` that grows, and may be cut back.
 #[derive(Debug)]
-pub(crate) struct FlightCount {
+pub(crate) struct EpisodeCount {
     path: PathBuf,
     read_bytes: u64,
     lines: u64,
 }
 
-impl FlightCount {
+impl EpisodeCount {
     /// Of the run in `run`.
     pub(crate) fn of(run: &RunDirectory) -> Self {
         Self {
-            path: run.flights_csv(),
+            path: run.episodes_csv(),
             read_bytes: 0,
             lines: 0,
         }
     }
 
-    /// Flights learned from so far; less than before when a learner was resumed from before.
+    /// Episodes learned from so far; less than before when a learner was resumed from before.
     pub(crate) fn now(&mut self) -> u64 {
         // Before the first epoch there is no file; that is no fault.
         let _ = self.read_on();
@@ -219,16 +219,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn flights_are_counted_as_they_come_and_when_they_are_cut_back() {
+    fn episodes_are_counted_as_they_come_and_when_they_are_cut_back() {
         let folder = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(folder.path());
-        let mut count = FlightCount::of(&run);
+        let mut count = EpisodeCount::of(&run);
         assert_eq!(count.now(), 0);
-        fs::write(run.flights_csv(), "header\n0\n1\n2").unwrap();
+        fs::write(run.episodes_csv(), "header\n0\n1\n2").unwrap();
         assert_eq!(count.now(), 2, "the third is still being written");
-        fs::write(run.flights_csv(), "header\n0\n1\n2\n3\n").unwrap();
+        fs::write(run.episodes_csv(), "header\n0\n1\n2\n3\n").unwrap();
         assert_eq!(count.now(), 4);
-        fs::write(run.flights_csv(), "header\n0\n").unwrap();
+        fs::write(run.episodes_csv(), "header\n0\n").unwrap();
         assert_eq!(count.now(), 1);
     }
 }

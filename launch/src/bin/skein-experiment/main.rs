@@ -34,9 +34,9 @@ struct Cli {
     /// Runs at a time [default: number of cores].
     #[arg(long, value_name = "J", value_parser = clap::value_parser!(u16).range(1..))]
     jobs: Option<u16>,
-    /// Shorten every run to so many training flights.
+    /// Shorten every run to so many training episodes.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
-    flights: Option<u64>,
+    episodes: Option<u64>,
     /// Where the runs of all experiments go [default: runs/experiments in the repository].
     #[arg(long, value_name = "DIR")]
     runs: Option<PathBuf>,
@@ -96,15 +96,15 @@ impl Cli {
     }
 
     fn carry_out(&self, name: &str) -> Result<Ended> {
-        let experiment = Experiment::load(&self.catalogue(), name, self.flights)?;
+        let experiment = Experiment::load(&self.catalogue(), name, self.episodes)?;
         let seeds = self.seeds.unwrap_or(experiment.seeds);
         let runs = self.runs.clone();
         let runs = runs.unwrap_or_else(|| self.repository.join("runs/experiments"));
-        let root = root(&runs, &experiment, self.flights);
+        let root = root(&runs, &experiment, self.episodes);
         // What would keep hours of work from being published is told before they begin.
-        if self.publish && (self.flights.is_some() || seeds < experiment.seeds) {
+        if self.publish && (self.episodes.is_some() || seeds < experiment.seeds) {
             bail!(
-                "--publish puts the whole experiment into RESULTS.md, and --flights or fewer than {} would leave a part of it there: leave out the one or the other",
+                "--publish puts the whole experiment into RESULTS.md, and --episodes or fewer than {} would leave a part of it there: leave out the one or the other",
                 plural(experiment.seeds as usize, "seed")
             );
         }
@@ -203,7 +203,7 @@ impl Cli {
                 .filter(|seeds| *seeds != experiment.seeds)
                 .map(|seeds| seeds.to_string()),
         );
-        option("--flights", self.flights.map(|flights| flights.to_string()));
+        option("--episodes", self.episodes.map(|episodes| episodes.to_string()));
         if options == Options::All {
             option("--jobs", self.jobs.map(|jobs| jobs.to_string()));
             option("--runs", self.runs.as_ref().map(|runs| runs.display().to_string()));
@@ -257,7 +257,7 @@ fn announce(experiment: &Experiment, plan: &Plan, jobs: usize) {
         eprintln!(
             "skein: the best snapshot of each then flies the suite {}: {}",
             flown.file_name(),
-            plural(flown.flights() as usize, "flight")
+            plural(flown.episodes() as usize, "episode")
         );
     }
     if let Some(shortened) = experiment.shortened() {

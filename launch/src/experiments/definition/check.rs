@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use skein_protocol::config::Config;
-use skein_simulator::suite::MOST_FLIGHTS;
+use skein_simulator::suite::MOST_EPISODES;
 
 use super::file::{ArmFile, File, as_overrides};
 use super::{Arm, DefinitionError, Experiment, FlownSuite, MOST_ARMS, Measure, TableKind};
@@ -30,7 +30,7 @@ pub(super) fn resolve(
     file: File,
     path: &Path,
     name: &str,
-    flights: Option<u64>,
+    episodes: Option<u64>,
 ) -> Result<Experiment, DefinitionError> {
     check_values(&file, path)?;
     let folder = path.parent().unwrap_or(Path::new(""));
@@ -47,13 +47,13 @@ pub(super) fn resolve(
     for arm in &file.arms {
         let own = settings_of(&format!("arm {}", arm.name), &arm.settings)?;
         let overrides = [&settings[..], &own].concat();
-        arms.push(arm_of(arm, own, overrides, &base, flights, path)?);
+        arms.push(arm_of(arm, own, overrides, &base, episodes, path)?);
     }
-    if let Some(flights) = flights {
-        tell_flights(flights, &mut settings, &mut arms);
+    if let Some(episodes) = episodes {
+        tell_episodes(episodes, &mut settings, &mut arms);
     }
     check_comparable(&arms, path)?;
-    check_same_flights(&file, &arms, path)?;
+    check_same_episodes(&file, &arms, path)?;
     check_same_reward(&file, &arms, path)?;
     let suite = suite_of(&file, folder, &arms, path)?;
     Ok(Experiment {
@@ -61,8 +61,8 @@ pub(super) fn resolve(
         question: file.question,
         base_name: file.base.file_name().unwrap_or_default().to_string_lossy().into_owned(),
         base,
-        base_flights: base_config.run.flights,
-        paper_flights: file.paper_flights,
+        base_episodes: base_config.run.episodes,
+        paper_episodes: file.paper_episodes,
         settings,
         seeds: file.seeds,
         suite,
@@ -77,7 +77,7 @@ fn arm_of(
     settings: Vec<String>,
     mut overrides: Vec<String>,
     base: &Path,
-    flights: Option<u64>,
+    episodes: Option<u64>,
     path: &Path,
 ) -> Result<Arm, DefinitionError> {
     let load = |overrides: &[String]| {
@@ -88,15 +88,15 @@ fn arm_of(
         })
     };
     let mut config = load(&overrides)?;
-    if let Some(flights) = flights {
-        if flights >= config.run.flights {
+    if let Some(episodes) = episodes {
+        if episodes >= config.run.episodes {
             let problem = format!(
                 "shortens nothing: arm {} flies {}; give fewer, or leave it out",
-                arm.name, config.run.flights
+                arm.name, config.run.episodes
             );
-            return Err(value_error(path, "--flights", flights, problem));
+            return Err(value_error(path, "--episodes", episodes, problem));
         }
-        overrides.push(format!("run.flights={flights}"));
+        overrides.push(format!("run.episodes={episodes}"));
         config = load(&overrides)?;
     }
     config.run.seed = 1;
@@ -110,26 +110,26 @@ fn arm_of(
 }
 
 /// Has readers told what is flown, instead of what the file says.
-fn tell_flights(flights: u64, settings: &mut Vec<String>, arms: &mut [Arm]) {
+fn tell_episodes(episodes: u64, settings: &mut Vec<String>, arms: &mut [Arm]) {
     let own = arms.iter_mut().map(|arm| &mut arm.settings);
     for told in own.chain([&mut *settings]) {
-        told.retain(|setting| !setting.starts_with("run.flights="));
+        told.retain(|setting| !setting.starts_with("run.episodes="));
     }
-    settings.push(format!("run.flights={flights}"));
+    settings.push(format!("run.episodes={episodes}"));
 }
 
 /// The suite that `file` names, if every arm can be put to it and a table tells what came of it.
 fn suite_of(file: &File, folder: &Path, arms: &[Arm], path: &Path) -> Result<Option<FlownSuite>, DefinitionError> {
     let is_told = file.tables.contains(&TableKind::Suite);
-    let nothing = match (file.suite_flights, &file.suite) {
-        (Some(flights), _) if !(1..=MOST_FLIGHTS).contains(&flights) => Some(format!(
-            "is outside 1..={MOST_FLIGHTS}: leave it out for as many as the suite says"
+    let nothing = match (file.suite_episodes, &file.suite) {
+        (Some(episodes), _) if !(1..=MOST_EPISODES).contains(&episodes) => Some(format!(
+            "is outside 1..={MOST_EPISODES}: leave it out for as many as the suite says"
         )),
         (Some(_), None) => Some("are of a suite, and none is named: add suite = \"FILE\", or leave it out".to_owned()),
         _ => None,
     };
-    if let (Some(flights), Some(problem)) = (file.suite_flights, nothing) {
-        return Err(value_error(path, "suite_flights", flights, problem));
+    if let (Some(episodes), Some(problem)) = (file.suite_episodes, nothing) {
+        return Err(value_error(path, "suite_episodes", episodes, problem));
     }
     let Some(named) = &file.suite else {
         let problem = "has the results of a suite, and none is named: add suite = \"FILE\", or take it out";
@@ -143,7 +143,7 @@ fn suite_of(file: &File, folder: &Path, arms: &[Arm], path: &Path) -> Result<Opt
         let problem = "would be flown, and no table tells it: add \"suite\" to tables, or leave it out";
         return Err(refuse(problem.to_owned()));
     }
-    let suite = FlownSuite::load(&folder.join(named), file.suite_flights).map_err(|problem| {
+    let suite = FlownSuite::load(&folder.join(named), file.suite_episodes).map_err(|problem| {
         refuse(format!(
             "cannot be flown: {problem}; name a suite file, relative to this one, or leave it out"
         ))
@@ -185,9 +185,9 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
             "cannot head a report: write one line without <!--",
         );
     }
-    if file.paper_flights == Some(0) {
+    if file.paper_episodes == Some(0) {
         return refuse(
-            "paper_flights",
+            "paper_episodes",
             &0,
             "are no run: write how many the paper's have, or leave it out",
         );
@@ -238,13 +238,13 @@ fn check_comparable(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
     })
 }
 
-/// Why arms that fly elsewhere cannot be compared by their own flights, and how they can.
-const ELSEWHERE: &str = ", or the two would be measured on different flights: put them to a suite, and write tables = [\"suite\", \"cost\"] and curves = []";
+/// Why arms that fly elsewhere cannot be compared by their own episodes, and how they can.
+const ELSEWHERE: &str = ", or the two would be measured on different episodes: put them to a suite, and write tables = [\"suite\", \"cost\"] and curves = []";
 
-/// Whether what is told of the arms' own flights, training's and evaluation's, is of flights of one kind. A suite flies all arms alike, whatever they were trained on.
-fn check_same_flights(file: &File, arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
-    let of_own_flights = |kind: &TableKind| !matches!(kind, TableKind::Suite | TableKind::Cost);
-    if file.curves.is_empty() && !file.tables.iter().any(of_own_flights) {
+/// Whether what is told of the arms' own episodes, training's and evaluation's, is of episodes of one kind. A suite flies all arms alike, whatever they were trained on.
+fn check_same_episodes(file: &File, arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
+    let of_own_episodes = |kind: &TableKind| !matches!(kind, TableKind::Suite | TableKind::Cost);
+    if file.curves.is_empty() && !file.tables.iter().any(of_own_episodes) {
         return Ok(());
     }
     let courses = |arm: &Arm| {

@@ -19,10 +19,10 @@ pub(super) struct File {
     pub(super) seeds: u64,
     /// Relative to the file.
     pub(super) suite: Option<PathBuf>,
-    /// Flights of each entry of it, if they are not as many as it says.
-    pub(super) suite_flights: Option<u64>,
-    /// Training flights of the paper's own runs, where the experiment stands for them.
-    pub(super) paper_flights: Option<u64>,
+    /// Episodes of each entry of it, if they are not as many as it says.
+    pub(super) suite_episodes: Option<u64>,
+    /// Training episodes of the paper's own runs, where the experiment stands for them.
+    pub(super) paper_episodes: Option<u64>,
     /// In what all arms differ from the base.
     #[serde(default)]
     pub(super) settings: Table,

@@ -31,10 +31,10 @@ pub struct Experiment {
     pub base_name: String,
     /// Its path.
     pub base: PathBuf,
-    /// Training flights that the base configuration flies.
-    pub base_flights: u64,
-    /// Training flights of the paper's own runs, where the experiment stands for them.
-    pub paper_flights: Option<u64>,
+    /// Training episodes that the base configuration flies.
+    pub base_episodes: u64,
+    /// Training episodes of the paper's own runs, where the experiment stands for them.
+    pub paper_episodes: Option<u64>,
     /// In what all arms differ from the base, the one thread of each run among it: `section.key=value`.
     pub settings: Vec<String>,
     /// Runs of each arm, with seeds from 1.
@@ -52,7 +52,7 @@ pub struct Experiment {
 /// Runs that fly less than whole ones.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Shortened {
-    /// Their training flights.
+    /// Their training episodes.
     pub flown: u64,
     /// Those of a whole run.
     pub whole: u64,
@@ -63,7 +63,7 @@ pub struct Shortened {
 impl Display for Shortened {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let Self { flown, whole, whose } = self;
-        write!(f, "{flown} training flights a run instead of the {whole} of {whose}")
+        write!(f, "{flown} training episodes a run instead of the {whole} of {whose}")
     }
 }
 
@@ -88,7 +88,7 @@ pub struct Arm {
 pub enum TableKind {
     /// R and completed courses of the best snapshot, for each evaluation course.
     Evaluation,
-    /// How the evaluation flights went: wall by wall, and what ended those that did not get through.
+    /// How the evaluation episodes went: wall by wall, and what ended those that did not get through.
     Outcomes,
     /// Completed courses and R of the best snapshot, for each entry of the suite.
     Suite,
@@ -110,15 +110,15 @@ pub struct Curve {
     pub over: Axis,
 }
 
-/// What a curve shows, averaged over `evaluation.window_flights` training flights.
+/// What a curve shows, averaged over `evaluation.window_episodes` training episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Measure {
-    /// Walls passed a flight.
+    /// Walls passed an episode.
     WallsPassed,
-    /// Sum of a flight's rewards.
+    /// Sum of an episode's rewards.
     Return,
-    /// How far the walls passed a flight lie below the most they had been.
+    /// How far the walls passed an episode lie below the most they had been.
     Drawdown,
 }
 
@@ -126,9 +126,9 @@ pub enum Measure {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Axis {
-    /// Training flights.
-    Flights,
-    /// Environment steps of training flights.
+    /// Training episodes.
+    Episodes,
+    /// Environment steps of training episodes.
     Steps,
     /// Updates of the agent.
     Updates,
@@ -201,20 +201,20 @@ pub enum DefinitionError {
 }
 
 impl Experiment {
-    /// Reads the experiment called `name` in `folder`, and checks that each of its arms can be run. `flights` shortens all runs to so many.
+    /// Reads the experiment called `name` in `folder`, and checks that each of its arms can be run. `episodes` shortens all runs to so many.
     ///
     /// # Errors
     /// [`DefinitionError`] names file, arm, key, value and remedy.
-    pub fn load(folder: &Path, name: &str, flights: Option<u64>) -> Result<Self, DefinitionError> {
+    pub fn load(folder: &Path, name: &str, episodes: Option<u64>) -> Result<Self, DefinitionError> {
         let path = file::find(folder, name)?;
-        check::resolve(file::read(&path)?, &path, name, flights)
+        check::resolve(file::read(&path)?, &path, name, episodes)
     }
 
     /// How much less the shortest arm flies than the paper, or than the configuration that all are based on; `None` if it flies as much.
     pub fn shortened(&self) -> Option<Shortened> {
-        let paper = self.paper_flights.map(|flights| (flights, "the paper".to_owned()));
-        let base = (self.base_flights, format!("`configs/{}`", self.base_name));
-        let flown = self.arms.iter().map(|arm| arm.config.run.flights).min()?;
+        let paper = self.paper_episodes.map(|episodes| (episodes, "the paper".to_owned()));
+        let base = (self.base_episodes, format!("`configs/{}`", self.base_name));
+        let flown = self.arms.iter().map(|arm| arm.config.run.episodes).min()?;
         let (whole, whose) = paper.into_iter().chain([base]).find(|(whole, _)| flown < *whole)?;
         Some(Shortened { flown, whole, whose })
     }

@@ -17,7 +17,7 @@ pub struct FlownSuite {
     pub path: PathBuf,
     /// What is flown.
     pub suite: Suite,
-    /// Flights of each entry, if they are not as many as the suite says.
+    /// Episodes of each entry, if they are not as many as the suite says.
     pub each: Option<u64>,
     /// What the result of a run is called: the suite file's name, `each`, and a checksum of all that is flown. The result of a suite that has been changed since is
     /// that of another one, and stays as it is.
@@ -25,14 +25,14 @@ pub struct FlownSuite {
 }
 
 impl FlownSuite {
-    /// The suite in the file at `path`; with `each`, so many flights of each entry.
+    /// The suite in the file at `path`; with `each`, so many episodes of each entry.
     ///
     /// # Errors
     /// What keeps it from being flown, or told in a table.
     pub fn load(path: &Path, each: Option<u64>) -> Result<Self, String> {
         let mut suite = Suite::load(path).map_err(|error| with_causes(&error))?;
         for entry in &mut suite.entries {
-            entry.flights = each.unwrap_or(entry.flights);
+            entry.episodes = each.unwrap_or(entry.episodes);
         }
         if let Some(entry) = suite.entries.iter().find(|entry| entry.name.contains(['|', '\n'])) {
             return Err(format!(
@@ -55,9 +55,9 @@ impl FlownSuite {
         self.path.file_name().unwrap_or_default().to_string_lossy().into_owned()
     }
 
-    /// Flights of all entries.
-    pub fn flights(&self) -> u64 {
-        self.suite.entries.iter().map(|entry| entry.flights).sum()
+    /// Episodes of all entries.
+    pub fn episodes(&self) -> u64 {
+        self.suite.entries.iter().map(|entry| entry.episodes).sum()
     }
 
     /// Whether what `arm` trains can be put to it: that shows when the suite is flown, and that would be after all of the training.

@@ -16,10 +16,10 @@ fn head() -> String {
     )
 }
 
-fn load(text: &str, flights: Option<u64>) -> Result<Experiment, String> {
+fn load(text: &str, episodes: Option<u64>) -> Result<Experiment, String> {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("test.toml"), text).unwrap();
-    Experiment::load(folder.path(), "test", flights).map_err(|error| skein_protocol::failure::with_causes(&error))
+    Experiment::load(folder.path(), "test", episodes).map_err(|error| skein_protocol::failure::with_causes(&error))
 }
 
 const ARM: &str = "[[arm]]\nname = \"a\"\nlabel = \"A\"\n";
@@ -31,7 +31,7 @@ fn every_shipped_experiment_can_be_run() {
     assert!(names.contains(&"paper".to_owned()), "{names:?}");
     for name in names {
         let experiment = Experiment::load(&folder, &name, None).unwrap();
-        let fewest = experiment.arms.iter().map(|arm| arm.config.run.flights).min().unwrap();
+        let fewest = experiment.arms.iter().map(|arm| arm.config.run.episodes).min().unwrap();
         assert!(
             experiment.seeds >= 3,
             "{name}: fewer seeds than anything can be said of"
@@ -43,7 +43,7 @@ fn every_shipped_experiment_can_be_run() {
 #[test]
 fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
     let text = format!(
-        "{}[settings]\nrun.flights = 90\nreplay = {{ success_share = 0.5, success = \"approach\" }}\n{ARM}settings.\"replay.success_share\" = 0.25\nsettings.simulator.reward.action_scale = 2.0\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n",
+        "{}[settings]\nrun.episodes = 90\nreplay = {{ success_share = 0.5, success = \"approach\" }}\n{ARM}settings.\"replay.success_share\" = 0.25\nsettings.simulator.reward.action_scale = 2.0\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n",
         head().replace("\"return\"", "\"walls_passed\"")
     );
     let experiment = load(&text, None).unwrap();
@@ -54,7 +54,7 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
         (a.config.replay.success_share, b.config.replay.success_share),
         (0.25, 0.5)
     );
-    assert_eq!((a.config.run.flights, a.config.run.learner_threads), (90, 1));
+    assert_eq!((a.config.run.episodes, a.config.run.learner_threads), (90, 1));
     assert_eq!(a.config.simulator["reward"]["action_scale"].as_float(), Some(2.0));
     assert_eq!(
         b.config.simulator["reward"]["action_scale"].as_float(),
@@ -62,23 +62,23 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
         "written out"
     );
     assert_eq!(
-        (experiment.seeds, b.settings.len(), experiment.base_flights),
+        (experiment.seeds, b.settings.len(), experiment.base_episodes),
         (3, 0, 300)
     );
     assert_eq!(
         experiment.shortened().unwrap().to_string(),
-        "90 training flights a run instead of the 300 of `configs/smoke.toml`"
+        "90 training episodes a run instead of the 300 of `configs/smoke.toml`"
     );
     assert!(
         !experiment.has_one_reward(),
         "arm a is rewarded twice as much for the view ahead"
     );
     let short = load(&text, Some(40)).unwrap();
-    assert_eq!(short.arms[1].config.run.flights, 40);
-    let flights = |setting: &&String| setting.starts_with("run.flights");
+    assert_eq!(short.arms[1].config.run.episodes, 40);
+    let episodes = |setting: &&String| setting.starts_with("run.episodes");
     assert_eq!(
-        short.settings.iter().filter(flights).collect::<Vec<_>>(),
-        ["run.flights=40"]
+        short.settings.iter().filter(episodes).collect::<Vec<_>>(),
+        ["run.episodes=40"]
     );
 }
 
@@ -86,10 +86,10 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
 fn what_flies_less_than_the_paper_is_shortened_and_what_flies_as_much_is_not() {
     let shortened = |keys: &str| load(&format!("{keys}{}{ARM}", head()), None).unwrap().shortened();
     assert_eq!(shortened(""), None);
-    assert_eq!(shortened("paper_flights = 300\n"), None);
+    assert_eq!(shortened("paper_episodes = 300\n"), None);
     assert_eq!(
-        shortened("paper_flights = 4000\n").unwrap().to_string(),
-        "300 training flights a run instead of the 4000 of the paper"
+        shortened("paper_episodes = 4000\n").unwrap().to_string(),
+        "300 training episodes a run instead of the 4000 of the paper"
     );
 }
 
@@ -125,7 +125,7 @@ fn a_suite_is_named_relative_to_the_experiment_and_its_result_after_all_that_is_
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
     let course = fs::read_to_string(shipped("courses/training.toml")).unwrap();
-    let suite = "name = \"x\"\nflights = 5\n[[entry]]\nname = \"as it is\"\ncourse = \"mine.toml\"\n";
+    let suite = "name = \"x\"\nepisodes = 5\n[[entry]]\nname = \"as it is\"\ncourse = \"mine.toml\"\n";
     write(
         "test.toml",
         &format!("suite = \"few.toml\"\n{}{ARM}", head().replace("evaluation", "suite")),
@@ -135,24 +135,24 @@ fn a_suite_is_named_relative_to_the_experiment_and_its_result_after_all_that_is_
     let load = || Experiment::load(folder.path(), "test", None).unwrap().suite.unwrap();
     let first = load();
     assert_eq!(
-        (first.path.clone(), first.flights()),
+        (first.path.clone(), first.episodes()),
         (folder.path().join("few.toml"), 5)
     );
     assert!(first.result_name.starts_with("few-"), "{}", first.result_name);
     // Words about it change nothing.
-    write("few.toml", &format!("# Few flights.\n{suite}"));
+    write("few.toml", &format!("# Few episodes.\n{suite}"));
     write("mine.toml", &format!("# Five walls.\n{course}"));
     assert_eq!(load(), first);
     write("few.toml", &suite.replace('5', "6"));
     assert_ne!(load().result_name, first.result_name);
     write("few.toml", suite);
     let fewer = format!(
-        "suite_flights = 2\nsuite = \"few.toml\"\n{}{ARM}",
+        "suite_episodes = 2\nsuite = \"few.toml\"\n{}{ARM}",
         head().replace("evaluation", "suite")
     );
     write("fewer.toml", &fewer);
     let fewer = Experiment::load(folder.path(), "fewer", None).unwrap().suite.unwrap();
-    assert_eq!((fewer.each, fewer.flights()), (Some(2), 2));
+    assert_eq!((fewer.each, fewer.episodes()), (Some(2), 2));
     assert_ne!(fewer.result_name, first.result_name);
     write(
         "mine.toml",
@@ -168,7 +168,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         let head = head().replace("\"evaluation\"", "\"evaluation\", \"suite\"");
         format!("suite = {suite:?}\n{head}{ARM}")
     };
-    for (text, flights, expected) in [
+    for (text, episodes, expected) in [
         (
             "question = 1".to_owned(),
             None,
@@ -203,9 +203,9 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             vec!["cannot head a report", "without <!--"],
         ),
         (
-            format!("paper_flights = 0\n{}{ARM}", head()),
+            format!("paper_episodes = 0\n{}{ARM}", head()),
             None,
-            vec!["paper_flights = 0 are no run", "leave it out"],
+            vec!["paper_episodes = 0 are no run", "leave it out"],
         ),
         (
             format!("seeds = 0\n{}{ARM}", head()),
@@ -265,14 +265,14 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             vec!["arm a", "seed=4", "section.key=value"],
         ),
         (
-            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.evaluation.flights = 9"),
+            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.evaluation.episodes = 9"),
             None,
             vec!["arm b", "[evaluation]", "arm a", "[settings]"],
         ),
         (
             with_arm(""),
             Some(300),
-            vec!["--flights = 300 shortens nothing", "arm a flies 300"],
+            vec!["--episodes = 300 shortens nothing", "arm a flies 300"],
         ),
         (
             head().replace("smoke.toml", "nowhere.toml") + ARM,
@@ -308,9 +308,9 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             ],
         ),
         (
-            format!("suite_flights = 5\n{}{ARM}", head()),
+            format!("suite_episodes = 5\n{}{ARM}", head()),
             None,
-            vec!["suite_flights = 5 are of a suite", "add suite ="],
+            vec!["suite_episodes = 5 are of a suite", "add suite ="],
         ),
         (
             with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.generator.clearance_m = [0.9, 1.25]"),
@@ -343,9 +343,9 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             vec!["arm b: simulator.reward cannot differ", "arm a", "walls_passed"],
         ),
         (
-            format!("suite_flights = 0\n{}", with_suite(&shipped("evaluations/paper.toml"))),
+            format!("suite_episodes = 0\n{}", with_suite(&shipped("evaluations/paper.toml"))),
             None,
-            vec!["suite_flights = 0 is outside 1..=1000000", "leave it out"],
+            vec!["suite_episodes = 0 is outside 1..=1000000", "leave it out"],
         ),
         (
             format!("suite = \"few.toml\"\n{}{ARM}", head()),
@@ -358,7 +358,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             vec!["tables = \"suite\" has the results", "add suite = "],
         ),
     ] {
-        let error = load(&text, flights).unwrap_err();
+        let error = load(&text, episodes).unwrap_err();
         for part in expected {
             assert!(error.contains(part), "`{error}` does not mention `{part}`");
         }

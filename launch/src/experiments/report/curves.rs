@@ -31,7 +31,7 @@ impl Findings<'_> {
 
     fn comparison(&self, curve: Curve) -> Result<Comparison<'_>, ExperimentReportError> {
         let arms = &self.experiment.arms;
-        let window = arms[0].config.evaluation.window_flights;
+        let window = arms[0].config.evaluation.window_episodes;
         let what = match curve.measure {
             Measure::WallsPassed => "Walls passed",
             Measure::Return => "Return",
@@ -42,9 +42,9 @@ impl Findings<'_> {
             None => "",
         };
         Ok(Comparison {
-            title: format!("{what} per training flight, average over {window} flights{shortened}"),
+            title: format!("{what} per training episode, average over {window} episodes{shortened}"),
             x: match curve.over {
-                Axis::Flights => "training flights",
+                Axis::Episodes => "training episodes",
                 Axis::Steps => "environment steps",
                 Axis::Updates => "updates of the agent",
             },
@@ -127,7 +127,7 @@ pub(super) fn measure_name(measure: Measure) -> &'static str {
 
 pub(super) fn axis_name(axis: Axis) -> &'static str {
     match axis {
-        Axis::Flights => "flights",
+        Axis::Episodes => "episodes",
         Axis::Steps => "steps",
         Axis::Updates => "updates",
     }

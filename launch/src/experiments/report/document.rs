@@ -82,10 +82,10 @@ impl Findings<'_> {
             seeds => format!("{seeds} seeds"),
         };
         format!(
-            "{seeds} an arm; a run: {} flights, {} steps, {} updates, {} of wall time. Skein {}.",
+            "{seeds} an arm; a run: {} episodes, {} steps, {} updates, {} of wall time. Skein {}.",
             range(
                 self.results,
-                |run| run.summary.flights as f64,
+                |run| run.summary.episodes as f64,
                 |value| format!("{value:.0}")
             ),
             range(
@@ -138,20 +138,20 @@ impl Findings<'_> {
         if tables.contains(&TableKind::Suite) {
             text.push_str("*Completed, mean* is the plain mean, in which the worst seed counts as much as any, with an interval of its own. ");
         }
-        let window = self.experiment.arms[0].config.evaluation.window_flights;
+        let window = self.experiment.arms[0].config.evaluation.window_episodes;
         if tables.contains(&TableKind::Learning) {
             text.push_str("A run that never came to a wall or to the rate counts with all that it took (≥). ");
         }
         if tables.contains(&TableKind::Learning) || tables.contains(&TableKind::Steadiness) {
             let _ = write!(
                 text,
-                "Volatility is the root mean square of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; – where a run has too few flights after that. A run that has learned nothing has a small one as well: read it beside the walls passed. "
+                "Volatility is the root mean square of the differences between the walls passed in successive {window} episodes, once they have risen to 0.9 of the level that the run comes to; – where a run has too few episodes after that. A run that has learned nothing has a small one as well: read it beside the walls passed. "
             );
         }
         if tables.contains(&TableKind::Steadiness) {
             let _ = write!(
                 text,
-                "The level is what a run comes to: the median of the averages over {window} flights in its second half. Dispersion across time is the interquartile range of the differences between the walls passed in successive {window} flights, once they have risen to 0.9 of the level that the run comes to; the largest drawdown is how far the average over {window} flights ever fell below the highest it had been (arXiv:1912.05663). "
+                "The level is what a run comes to: the median of the averages over {window} episodes in its second half. Dispersion across time is the interquartile range of the differences between the walls passed in successive {window} episodes, once they have risen to 0.9 of the level that the run comes to; the largest drawdown is how far the average over {window} episodes ever fell below the highest it had been (arXiv:1912.05663). "
             );
         }
         if !pictures.is_empty() {

@@ -1,4 +1,4 @@
-//! How the evaluation flights of an experiment went: wall by wall, and what ended those that did not get through.
+//! How the evaluation episodes of an experiment went: wall by wall, and what ended those that did not get through.
 
 use skein_protocol::evaluation::{CourseEvaluation, Failures};
 
@@ -10,7 +10,7 @@ const HEADER: [&str; 10] = [
     "arm",
     "course",
     "seeds",
-    "flights",
+    "episodes",
     "R",
     "passed wall 1, 2, …",
     "completed",
@@ -23,12 +23,12 @@ impl Findings<'_> {
     /// Of the evaluation courses, and of the entries of the suite, if there is one.
     pub(super) fn outcomes(&self) -> Vec<Titled> {
         let courses = Titled {
-            title: "How the evaluation flights went, all seeds together".to_owned(),
+            title: "How the evaluation episodes went, all seeds together".to_owned(),
             table: self.outcomes_of(&self.courses(), course_of),
         };
         let suite = self.experiment.suite.as_ref().map(|flown| Titled {
             title: format!(
-                "How the flights of the suite `{}` went, all seeds together",
+                "How the episodes of the suite `{}` went, all seeds together",
                 flown.file_name()
             ),
             table: self.outcomes_of(&self.entries(), entry_of),
@@ -61,18 +61,18 @@ pub(super) fn entry_of<'a>(result: &'a RunResult, name: &str) -> Option<&'a Cour
     courses.iter().find(|course| course.course == name)
 }
 
-/// What stands behind the arm and the course: the flights of all seeds.
+/// What stands behind the arm and the course: the episodes of all seeds.
 fn cells(of_seeds: &[&CourseEvaluation]) -> [String; HEADER.len() - 2] {
     let sum = |count: fn(&CourseEvaluation) -> u64| of_seeds.iter().map(|course| count(course)).sum::<u64>();
     let failed = |by: fn(&Failures) -> u64| summed(of_seeds, |course| course.failures.iter().map(by).collect());
     let passed = summed(of_seeds, |course| course.walls_passed.clone());
-    let could_be_passed = sum(|course| course.flights * course.walls_passed.len() as u64);
+    let could_be_passed = sum(|course| course.episodes * course.walls_passed.len() as u64);
     let mut hit_wall = failed(|failures| failures.hit_wall);
     // Behind the last wall there is none to hit.
     hit_wall.truncate(passed.len());
     [
         of_seeds.len().to_string(),
-        sum(|course| course.flights).to_string(),
+        sum(|course| course.episodes).to_string(),
         match could_be_passed {
             0 => NOTHING.to_owned(),
             walls => format!("{:.3}", passed.iter().sum::<u64>() as f64 / walls as f64),
@@ -107,16 +107,16 @@ fn joined(counts: &[u64]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use skein_protocol::evaluation::FlightScore;
+    use skein_protocol::evaluation::EpisodeScore;
     use skein_protocol::transition::Outcome;
 
     use super::*;
 
     #[test]
-    fn flights_of_all_seeds_are_counted_where_they_ended() {
-        let score = |walls_passed, outcome, hit_wall| FlightScore {
+    fn episodes_of_all_seeds_are_counted_where_they_ended() {
+        let score = |walls_passed, outcome, hit_wall| EpisodeScore {
             walls_passed,
-            flight_return: 0.0,
+            episode_return: 0.0,
             outcome,
             hit_wall,
         };

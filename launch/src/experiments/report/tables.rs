@@ -39,16 +39,16 @@ impl Findings<'_> {
     }
 
     fn evaluation(&self) -> Vec<Titled> {
-        let flights = self.experiment.arms[0].config.evaluation.flights;
+        let episodes = self.experiment.arms[0].config.evaluation.episodes;
         vec![
             Titled {
                 title: format!(
-                    "R, the share of walls passed, of the best snapshot in {flights} flights a course without exploration"
+                    "R, the share of walls passed, of the best snapshot in {episodes} episodes a course without exploration"
                 ),
                 table: self.by_course(|course| course.r, rate),
             },
             Titled {
-                title: format!("Share of these {flights} flights that completed the course"),
+                title: format!("Share of these {episodes} episodes that completed the course"),
                 table: self.by_course(|course| course.completed, percent),
             },
         ]
@@ -87,17 +87,17 @@ impl Findings<'_> {
                     label,
                     entry.name.clone(),
                     seeds,
-                    entry.flights.to_string(),
+                    entry.episodes.to_string(),
                     mean.map_or(NOTHING.to_owned(), percent),
                     estimate(|course| course.completed).map_or(NOTHING.to_owned(), percent),
                     estimate(|course| course.r).map_or(NOTHING.to_owned(), rate),
                 ]);
             }
         }
-        let header = ["arm", "entry", "seeds", "flights", "completed, mean", "completed", "R"];
+        let header = ["arm", "entry", "seeds", "episodes", "completed, mean", "completed", "R"];
         Some(Titled {
             title: format!(
-                "How the best snapshot flew the suite `{}` without exploration: the share of flights that completed their course, and R",
+                "How the best snapshot flew the suite `{}` without exploration: the share of episodes that completed their course, and R",
                 flown.file_name()
             ),
             table: grid(header.map(str::to_owned).to_vec(), rows, 2),
@@ -106,7 +106,7 @@ impl Findings<'_> {
 
     fn learning(&self) -> Titled {
         let evaluation = &self.experiment.arms[0].config.evaluation;
-        let window = evaluation.window_flights;
+        let window = evaluation.window_episodes;
         let mut at_the_end: Vec<(String, Measured)> =
             vec![(format!("walls passed, last {window}"), RunResult::final_walls_passed)];
         if self.experiment.has_one_reward() {
@@ -119,14 +119,14 @@ impl Findings<'_> {
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
             let mut row = self.head(number, arm).to_vec();
-            let flights = |run: &RunResult| run.summary.flights as f64;
-            row.push(self.until(number, RunResult::one_wall_after, flights, &count));
+            let episodes = |run: &RunResult| run.summary.episodes as f64;
+            row.push(self.until(number, RunResult::one_wall_after, episodes, &count));
             let trained = self
                 .of_arm(number)
                 .filter(|result| result.summary.trained.is_some())
                 .count();
             row.push(format!("{trained} of {}", self.of_arm(number).count()));
-            row.push(self.until_trained(number, |at| at.flights as f64, flights, &count));
+            row.push(self.until_trained(number, |at| at.episodes as f64, episodes, &count));
             row.push(self.until_trained(number, |at| at.steps as f64, |run| run.summary.steps as f64, &count));
             row.push(self.until_trained(number, |at| at.updates as f64, |run| run.summary.updates as f64, &count));
             row.push(self.until_trained(number, |at| at.wall_secs, |run| run.summary.wall_secs, &time));
@@ -136,9 +136,9 @@ impl Findings<'_> {
         let mut header = vec![
             "arm".to_owned(),
             "seeds".to_owned(),
-            "flights to one wall".to_owned(),
+            "episodes to one wall".to_owned(),
             format!("R ≥ {} reached", evaluation.trained_rate),
-            "after flights".to_owned(),
+            "after episodes".to_owned(),
             "steps".to_owned(),
             "updates".to_owned(),
             "time".to_owned(),
@@ -146,9 +146,9 @@ impl Findings<'_> {
         header.extend(names);
         Titled {
             title: format!(
-                "Learning: after how many flights the average of {window} came to one wall passed, when R ≥ {} was first confirmed in {} evaluation flights on {}, and the last {window} training flights",
+                "Learning: after how many episodes the average of {window} came to one wall passed, when R ≥ {} was first confirmed in {} evaluation episodes on {}, and the last {window} training episodes",
                 evaluation.trained_rate,
-                evaluation.confirm_flights,
+                evaluation.confirm_episodes,
                 match evaluation.confirm_on {
                     ConfirmOn::FirstCourse => "the first course",
                     ConfirmOn::Generated => "generated courses",
@@ -236,22 +236,22 @@ impl Findings<'_> {
             let count =
                 |of: &dyn Fn(&RunResult) -> f64| mean(of).map_or(NOTHING.to_owned(), |value| format!("{value:.0}"));
             let mut row = self.head(number, arm).to_vec();
-            row.push(count(&|run| run.summary.flights as f64));
+            row.push(count(&|run| run.summary.episodes as f64));
             row.push(count(&|run| run.summary.steps as f64));
             row.push(count(&|run| run.summary.updates as f64));
             row.push(count(&|run| run.summary.vae_updates as f64));
-            row.push(count(&|run| run.summary.evaluation_flights as f64));
+            row.push(count(&|run| run.summary.evaluation_episodes as f64));
             row.push(mean(&|run| run.summary.wall_secs).map_or(NOTHING.to_owned(), |secs| Clock(secs).to_string()));
             rows.push(row);
         }
         let header = [
             "arm",
             "seeds",
-            "flights",
+            "episodes",
             "steps",
             "updates",
             "VAE steps",
-            "evaluation flights",
+            "evaluation episodes",
             "wall time",
         ];
         Titled {

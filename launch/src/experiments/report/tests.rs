@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
+use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::transition::Outcome;
 
@@ -13,22 +13,22 @@ use crate::experiments::plan::PlannedRun;
 use crate::experiments::results;
 
 const SUMMARY: &str = r#"{"skein_version":"0","run":7,"seed":1,"ending":"completed","policy_sha256":"","final_version":8,"best_version":7,
-    "best_confirmed_walls_passed":4.9,"flights":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_flights":4,
+    "best_confirmed_walls_passed":4.9,"episodes":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_episodes":4,
     "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
 
-/// `completed` of four flights passed both walls of a course, the others none.
+/// `completed` of four episodes passed both walls of a course, the others none.
 fn flown(entry: &str, completed: usize) -> CourseEvaluation {
-    let score = |number: usize| FlightScore {
+    let score = |number: usize| EpisodeScore {
         walls_passed: if number < completed { 2 } else { 0 },
-        flight_return: 0.0,
+        episode_return: 0.0,
         outcome: match number < completed {
             true => Outcome::ReachedEnd,
             false => Outcome::TimedOut,
         },
         hit_wall: None,
     };
-    let flights: Vec<_> = (0..4).map(score).collect();
-    CourseEvaluation::of(entry, 2, &flights)
+    let episodes: Vec<_> = (0..4).map(score).collect();
+    CourseEvaluation::of(entry, 2, &episodes)
 }
 
 fn leave(run: &PlannedRun, suite: &[CourseEvaluation]) {
@@ -45,18 +45,18 @@ fn leave(run: &PlannedRun, suite: &[CourseEvaluation]) {
     fs::write(result, report(suite)).unwrap();
     fs::write(run.directory.evaluation_json(), report(&[])).unwrap();
     fs::write(run.directory.summary_json(), SUMMARY).unwrap();
-    fs::write(run.directory.flights_csv(), "steps,walls_passed,return\n4,2,1.0\n").unwrap();
+    fs::write(run.directory.episodes_csv(), "steps,walls_passed,return\n4,2,1.0\n").unwrap();
 }
 
-/// An experiment in `folder` of one arm and two seeds, and its runs, which are complete: the first completed half of its calm flights, the second all.
+/// An experiment in `folder` of one arm and two seeds, and its runs, which are complete: the first completed half of its calm episodes, the second all.
 fn two_runs(folder: &Path) -> (Experiment, Plan) {
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
     let (base, course) = (configs.join("smoke.toml"), configs.join("courses/training.toml"));
     let entry = |name: &str| format!("[[entry]]\nname = \"{name}\"\ncourse = {course:?}\n");
-    let suite = format!("name = \"few\"\nflights = 4\n{}{}", entry("calm"), entry("windy"));
+    let suite = format!("name = \"few\"\nepisodes = 4\n{}{}", entry("calm"), entry("windy"));
     fs::write(folder.join("few.toml"), suite).unwrap();
     let experiment = format!(
-        "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\npaper_flights = 4000\ncurves = []\n[settings]\nevaluation.window_flights = 2\nlearning.warmup_steps = 20\nsac.batch_size = 16\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
+        "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\npaper_episodes = 4000\ncurves = []\n[settings]\nevaluation.window_episodes = 2\nlearning.warmup_steps = 20\nsac.batch_size = 16\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
     );
     fs::write(folder.join("test.toml"), experiment).unwrap();
     let experiment = Experiment::load(folder, "test", None).unwrap();
@@ -90,7 +90,7 @@ fn a_suite_is_told_entry_by_entry_over_the_seeds() {
     };
     assert_eq!(
         told(&plan),
-        "| arm | entry | seeds | flights |          completed, mean |                completed |                    R |\n\
+        "| arm | entry | seeds | episodes |          completed, mean |                completed |                    R |\n\
          |-----|-------|------:|--------:|-------------------------:|-------------------------:|---------------------:|\n\
          | A   | calm  |     2 |       4 | 75.0 % [50.0 %, 100.0 %] | 75.0 % [50.0 %, 100.0 %] | 0.750 [0.500, 1.000] |\n\
          | A   | windy |     2 |       4 |  25.0 % [25.0 %, 25.0 %] |  25.0 % [25.0 %, 25.0 %] | 0.250 [0.250, 0.250] |"
@@ -117,7 +117,7 @@ fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
         findings(&experiment, &plan, &runs).document(&[], "", "runs.csv")
     };
     let (one, several) = (told(), "**Of several builds**");
-    let shortened = "**Shortened**: 300 training flights a run instead of the 4000 of the paper.";
+    let shortened = "**Shortened**: 300 training episodes a run instead of the 4000 of the paper.";
     assert!(one.contains(shortened), "{one}");
     assert!(one.contains("Skein 0.\n") && !one.contains(several), "{one}");
 
@@ -151,26 +151,26 @@ fn every_run_has_a_line_of_its_own() {
     assert_eq!(column("completed calm"), ["0.5000", "1.0000"]);
     assert_eq!(column("R calm"), ["0.7500", "1.0000"]);
     assert_eq!(column("R windy"), ["0.2500", "0.2500"]);
-    assert_eq!(column("trained_flights"), ["", ""], "never");
-    assert_eq!(column("one_wall_flights"), ["", ""], "one flight is not two");
+    assert_eq!(column("trained_episodes"), ["", ""], "never");
+    assert_eq!(column("one_wall_episodes"), ["", ""], "one episode is not two");
 }
 
-/// Two runs of ten flights, told by hand: the first rises and is trained after six of them, the second never comes to a wall.
+/// Two runs of ten episodes, told by hand: the first rises and is trained after six of them, the second never comes to a wall.
 #[test]
 fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, plan) = two_runs(folder.path());
-    let flights = |walls: [u8; 10], steps: u32| {
+    let episodes = |walls: [u8; 10], steps: u32| {
         let row = |walls: u8| format!("{steps},{walls},{walls}.5\n");
         format!("steps,walls_passed,return\n{}", walls.map(row).concat())
     };
     let summary = |steps: u64, updates: u64, trained: &str| {
-        let counts = format!(r#""flights":10,"steps":{steps},"updates":{updates}"#);
+        let counts = format!(r#""episodes":10,"steps":{steps},"updates":{updates}"#);
         SUMMARY
-            .replace(r#""flights":8,"steps":4,"updates":2"#, &counts)
+            .replace(r#""episodes":8,"steps":4,"updates":2"#, &counts)
             .replace(r#""wall_secs":3.3}"#, &format!(r#""wall_secs":70.0{trained}}}"#))
     };
-    let trained = r#","trained":{"rate":0.95,"flights":6,"steps":60,"updates":20,"wall_secs":30.0}"#;
+    let trained = r#","trained":{"rate":0.95,"episodes":6,"steps":60,"updates":20,"wall_secs":30.0}"#;
     for (run, walls, steps, summary) in [
         (
             &plan.runs[0],
@@ -180,7 +180,7 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
         ),
         (&plan.runs[1], [0, 0, 1, 0, 0, 0, 0, 1, 0, 1], 20, summary(200, 60, "")),
     ] {
-        fs::write(run.directory.flights_csv(), flights(walls, steps)).unwrap();
+        fs::write(run.directory.episodes_csv(), episodes(walls, steps)).unwrap();
         fs::write(run.directory.summary_json(), summary).unwrap();
     }
     let runs = results::read(&plan).unwrap();
@@ -195,7 +195,7 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
             .map(|cell| cell.trim().to_owned());
         cells.filter(|cell| !cell.is_empty()).collect::<Vec<_>>()
     };
-    // Averages of two flights: 0, 2, 3, 2, 2.5, whose level is 2.5, and 0, 0.5, 0, 0.5, 0.5, whose is 0.5. Once risen they change by -1 and 0.5, and by -0.5, 0.5
+    // Averages of two episodes: 0, 2, 3, 2, 2.5, whose level is 2.5, and 0, 0.5, 0, 0.5, 0.5, whose is 0.5. Once risen they change by -1 and 0.5, and by -0.5, 0.5
     // and 0: the root mean squares are 0.79 and 0.41, the interquartile ranges 0.75 and 0.5.
     let volatility = "0.60 [0.41, 0.79]";
     assert_eq!(
@@ -231,14 +231,14 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
     let averages = [0.0, 0.5, 2.0, 3.0, 3.0, 2.5, 2.0, 2.0, 2.5];
     let over = |places: [f64; 9]| places.into_iter().zip(averages).collect::<Vec<_>>();
     assert_eq!(
-        walls(Axis::Flights),
+        walls(Axis::Episodes),
         over([2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0])
     );
     assert_eq!(
         walls(Axis::Steps),
         over([20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0])
     );
-    // None before the warm-up is over, all behind the last flight.
+    // None before the warm-up is over, all behind the last episode.
     assert_eq!(
         walls(Axis::Updates),
         over([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0])

@@ -1,6 +1,6 @@
 //! Supervision of small shell scripts that behave, or misbehave, as a learner and its actors may.
 
-mod lives;
+mod incarnations;
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -16,14 +16,14 @@ use skein_protocol::config::Config;
 /// What was shown to the user.
 #[derive(Default)]
 struct Seen {
-    flights: Vec<u64>,
+    episodes: Vec<u64>,
     warnings: String,
     restarts: Restarts,
 }
 
 impl Watcher for Seen {
     fn progress(&mut self, progress: &Progress, restarts: Restarts) {
-        self.flights.push(progress.flights);
+        self.episodes.push(progress.episodes);
         self.restarts = restarts;
     }
 
@@ -34,7 +34,7 @@ impl Watcher for Seen {
 }
 
 /// A shell function that reports so many updates, and these actors, both of them unless told otherwise.
-const REPORT: &str = r#"report() { echo '{"phase":"flying","flights":7,"total_flights":9,"evaluation_flights":[0,0],"steps":1,"updates":'$1',"vae_updates":0,"steps_per_sec":1.0,"updates_per_sec":0.0,"walls_passed":null,"mean_return":null,"temperature":null,"vae_loss":null,"actors":2,"live_actors":'${2:-[0,1]}',"elapsed_secs":1.0}'; }"#;
+const REPORT: &str = r#"report() { echo '{"phase":"flying","episodes":7,"total_episodes":9,"evaluation_episodes":[0,0],"steps":1,"updates":'$1',"vae_updates":0,"steps_per_sec":1.0,"updates_per_sec":0.0,"walls_passed":null,"mean_return":null,"temperature":null,"vae_loss":null,"actors":2,"live_actors":'${2:-[0,1]}',"elapsed_secs":1.0}'; }"#;
 
 /// An actor that flies until the learner's script says stop.
 const FAITHFUL_ACTOR: &str = "while [ ! -e $dir/stop ]; do sleep 0.02; done";
@@ -141,7 +141,7 @@ fn a_run_ends_when_its_learner_does() {
     let stage = Stage::new("report 0; echo a remark; touch $dir/stop", FAITHFUL_ACTOR);
     let (result, seen) = stage.run(never);
     assert_eq!(result.unwrap(), Ended::Finished);
-    assert_eq!(seen.flights, [7]);
+    assert_eq!(seen.episodes, [7]);
     assert_eq!(seen.warnings, "a remark\n");
 }
 
@@ -157,12 +157,12 @@ fn a_dead_learner_is_not_started_again_during_a_stop() {
 }
 
 #[test]
-fn an_interruption_between_two_lives_of_the_learner_ends_the_run() {
+fn an_interruption_between_two_incarnations_of_the_learner_ends_the_run() {
     let stage = Stage::new("report 1; kill -9 $$", FAITHFUL_ACTOR);
     let pids = stage.plan.run.root().join("pids");
     let begun = std::time::Instant::now();
     let (result, _) = stage.run(|interrupts| async move {
-        // Two lives, two actors; the third life begins after a pause of a second.
+        // Two lives, two actors; the third incarnation begins after a pause of a second.
         until(|| fs::read_to_string(&pids).is_ok_and(|pids| pids.lines().count() == 4)).await;
         tokio::time::sleep(Duration::from_millis(500)).await;
         interrupts.send(()).await.unwrap();

@@ -62,18 +62,18 @@ impl NativeCritic {
         }
     }
 
-    /// The gradient of all parameters, from what flows back to the estimates, `flowing.values`.
+    /// The gradient of all parameters, from what flows back to the estimates, `grad.values`.
     pub fn gradient(
         &self,
         team: &mut Team,
         parameters: &[f32],
         joined: &[f32],
         given: &CriticLayers,
-        flowing: &mut CriticLayers,
+        grad: &mut CriticLayers,
         into: &mut [f32],
     ) {
-        for (number, layers) in flowing.networks.iter_mut().enumerate() {
-            gather(&flowing.values, number, output_mut(layers));
+        for (number, layers) in grad.networks.iter_mut().enumerate() {
+            gather(&grad.values, number, output_mut(layers));
             let (parameters, given) = (self.of(number, parameters), &given.networks[number]);
             self.network.backward(team, parameters, given, layers);
             let into = &mut into[number * self.len..][..self.len];
@@ -87,19 +87,19 @@ impl NativeCritic {
         team: &mut Team,
         parameters: &[f32],
         given: &CriticLayers,
-        flowing: &[f32],
+        grad: &[f32],
         columns: Range<usize>,
         into: &mut [f32],
     ) {
-        let mut own_flowing = vec![0.0; flowing.len() / self.networks];
+        let mut own_grad = vec![0.0; grad.len() / self.networks];
         let mut own = vec![0.0; into.len()];
         into.fill(0.0);
         for (number, given) in given.networks.iter().enumerate() {
-            gather(flowing, number, &mut own_flowing);
+            gather(grad, number, &mut own_grad);
             let parameters = self.of(number, parameters);
             let columns = columns.clone();
             self.network
-                .backward_through(team, parameters, given, &own_flowing, columns, &mut own);
+                .backward_through(team, parameters, given, &own_grad, columns, &mut own);
             into.iter_mut().zip(&own).for_each(|(sum, own)| *sum += own);
         }
     }

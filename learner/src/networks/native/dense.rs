@@ -101,9 +101,9 @@ impl Dense {
     }
 
     /// ∂zᵢ₋₁ = ∂zᵢ Wᵢ where hᵢ₋₁ > 0.
-    fn layer_backward(&self, index: usize, parameters: &[f32], flowing: &[f32], before: &[f32], into: &mut [f32]) {
+    fn layer_backward(&self, index: usize, parameters: &[f32], grad: &[f32], before: &[f32], into: &mut [f32]) {
         let weights = self.layers[index].weights(parameters);
-        product_once(self.isa, flowing, weights, Start::Zero, Finish::Gated(before), into);
+        product_once(self.isa, grad, weights, Start::Zero, Finish::Gated(before), into);
     }
 
     /// h₀ = `input`, `[rows, inputs]`; fills `given` with all hᵢ.
@@ -144,10 +144,10 @@ impl Dense {
         });
     }
 
-    /// What flows back to each layer's sums zᵢ = hᵢ₋₁ Wᵢᵀ + bᵢ. The last of `flowing` is given, the others are filled. `given`: what the layers gave for the same rows.
-    pub fn backward(&self, team: &mut Team, parameters: &[f32], given: &Layers, flowing: &mut Layers) {
-        let rows = flowing[0].len() / self.layers[0].outputs;
-        let mut parts = self.parts(rows, team.size(), flowing);
+    /// What flows back to each layer's sums zᵢ = hᵢ₋₁ Wᵢᵀ + bᵢ. The last of `grad` is given, the others are filled. `given`: what the layers gave for the same rows.
+    pub fn backward(&self, team: &mut Team, parameters: &[f32], given: &Layers, grad: &mut Layers) {
+        let rows = grad[0].len() / self.layers[0].outputs;
+        let mut parts = self.parts(rows, team.size(), grad);
         team.split_rows(&mut parts, 1, 1, |_, parts| {
             for Part { first, layers } in parts {
                 for index in (1..layers.len()).rev() {
@@ -167,7 +167,7 @@ impl Dense {
         team: &mut Team,
         parameters: &[f32],
         given: &Layers,
-        flowing: &[f32],
+        grad: &[f32],
         columns: Range<usize>,
         into: &mut [f32],
     ) {
@@ -178,7 +178,7 @@ impl Dense {
                 let (start, rows) = ((first + part) * rows_each, into.len() / columns.len());
                 PASSING.with_borrow_mut(|[from, to]| {
                     from.clear();
-                    from.extend_from_slice(&flowing[start * self.outputs()..][..rows * self.outputs()]);
+                    from.extend_from_slice(&grad[start * self.outputs()..][..rows * self.outputs()]);
                     for index in (1..self.layers.len()).rev() {
                         let width = self.layers[index - 1].outputs;
                         to.resize(rows * width, 0.0);
@@ -193,12 +193,12 @@ impl Dense {
         });
     }
 
-    /// The gradient of all parameters, summed over rows: ∂Wᵢ = ∂zᵢᵀ hᵢ₋₁, ∂bᵢ = Σ ∂zᵢ. `given` and `flowing`: of as many rows as `input`.
-    pub fn gradient(&self, team: &mut Team, input: &[f32], given: &Layers, flowing: &Layers, into: &mut [f32]) {
+    /// The gradient of all parameters, summed over rows: ∂Wᵢ = ∂zᵢᵀ hᵢ₋₁, ∂bᵢ = Σ ∂zᵢ. `given` and `grad`: of as many rows as `input`.
+    pub fn gradient(&self, team: &mut Team, input: &[f32], given: &Layers, grad: &Layers, into: &mut [f32]) {
         for (index, layer) in self.layers.iter().enumerate() {
-            let (flowing, inputs) = (&flowing[index], layer.inputs);
+            let (grad, inputs) = (&grad[index], layer.inputs);
             let input = if index == 0 { input } else { &given[index - 1] };
-            let left = Matrix::of_rows(flowing, layer.outputs);
+            let left = Matrix::of_rows(grad, layer.outputs);
             let right = Terms::Matrix(input, inputs);
             gradient(team, self.isa, left, right, &mut into[layer.weight.clone()]);
             let bias = &mut into[layer.bias.clone()];
@@ -207,7 +207,7 @@ impl Dense {
                     #[inline(always)]
                     || {
                         sums.fill(0.0);
-                        for row in flowing.chunks_exact(layer.outputs) {
+                        for row in grad.chunks_exact(layer.outputs) {
                             for (sum, term) in sums.iter_mut().zip(&row[first..]) {
                                 *sum += term;
                             }

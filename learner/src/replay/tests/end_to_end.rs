@@ -4,23 +4,23 @@ use skein_protocol::config::EncoderTraining;
 
 use super::*;
 
-/// For flights of at most 11 steps, one an epoch.
+/// For episodes of at most 11 steps, one an epoch.
 fn end_to_end(capacity: usize) -> Config {
     let mut config = config(capacity, Observation::LatentVelocity);
     config.learning.encoder = EncoderTraining::EndToEnd;
-    config.learning.flights_per_epoch = 1;
-    config.transport.max_records_per_flight = 12;
+    config.learning.episodes_per_epoch = 1;
+    config.transport.max_records_per_episode = 12;
     config
 }
 
 /// Of 1 to 11 steps; in some, a wall is passed.
-fn flown(number: u64) -> CommittedFlight {
-    let mut flight = flight(number, 1 + (number as usize * 7) % 11, Outcome::Collided);
+fn flown(number: u64) -> CommittedEpisode {
+    let mut episode = episode(number, 1 + (number as usize * 7) % 11, Outcome::Collided);
     if number.is_multiple_of(3) {
-        let middle = flight.steps() / 2;
-        flight.level_up[middle] = true;
+        let middle = episode.steps() / 2;
+        episode.level_up[middle] = true;
     }
-    with_images(flight)
+    with_images(episode)
 }
 
 fn draw(replay: &Replay, seed: u64) -> Minibatch {
@@ -36,34 +36,34 @@ fn assert_images_belong(batch: &Minibatch) {
     assert_eq!((images.len(), next_images.len()), (32, 32));
     for ((reward, image), next) in batch.rewards.iter().zip(images).zip(next_images) {
         let at = (reward * 100.0).round() as u64;
-        let (flight, step) = (at / 1000, (at % 1000) as usize);
-        let shades = [shade(flight, step), shade(flight, step + 1)];
+        let (episode, step) = (at / 1000, (at % 1000) as usize);
+        let shades = [shade(episode, step), shade(episode, step + 1)];
         assert!(
             image.iter().all(|&pixel| pixel == shades[0]),
-            "flight {flight}, step {step}"
+            "episode {episode}, step {step}"
         );
         assert!(
             next.iter().all(|&pixel| pixel == shades[1]),
-            "after flight {flight}, step {step}"
+            "after episode {episode}, step {step}"
         );
     }
 }
 
 #[test]
 fn a_minibatch_has_the_images_of_its_transitions_however_often_the_ring_goes_round() {
-    for leg_steps in [usize::MAX, 2] {
+    for segment_steps in [usize::MAX, 2] {
         let config = end_to_end(60);
         let (most, mut replay) = (2 * 60 + 12, Replay::new(&config));
         let (mut stored, mut swept) = (0, 0);
         for number in 0..60 {
-            let flight = flown(number);
-            stored += flight.steps() + 1;
+            let episode = flown(number);
+            stored += episode.steps() + 1;
             let held = replay.image_count().unwrap();
-            for leg in in_legs(&flight, leg_steps.min(flight.steps())) {
-                replay.insert(leg).unwrap();
+            for segment in in_segments(&episode, segment_steps.min(episode.steps())) {
+                replay.insert(segment).unwrap();
             }
             let now = replay.image_count().unwrap();
-            swept += usize::from(now < held + flight.steps() + 1);
+            swept += usize::from(now < held + episode.steps() + 1);
             assert!(now <= most, "{now} images are held");
             let batch = draw(&replay, number);
             assert_images_belong(&batch);
@@ -85,7 +85,7 @@ fn a_buffer_restored_at_any_time_comes_to_hold_the_same() {
         undisturbed.insert(flown(number)).unwrap();
         restored.insert(flown(number)).unwrap();
         restored = Replay::restore(&config, restored.state()).unwrap();
-        assert!(restored.state() == undisturbed.state(), "after flight {number}");
+        assert!(restored.state() == undisturbed.state(), "after episode {number}");
     }
 }
 
@@ -109,7 +109,7 @@ fn transitions_are_drawn_as_without_images() {
 }
 
 #[test]
-fn a_flight_that_is_needed_whole_is_never_copied() {
+fn an_episode_that_is_needed_whole_is_never_copied() {
     let mut replay = Replay::new(&end_to_end(60));
     for number in 0..30 {
         replay.insert(flown(number)).unwrap();
@@ -118,16 +118,16 @@ fn a_flight_that_is_needed_whole_is_never_copied() {
         let after = replay.state().images.unwrap();
         // The newest but one lies where it lay, also if the others were swept.
         let newest = after.len() - 2;
-        assert!(Arc::ptr_eq(&after[newest], before.last().unwrap()), "flight {number}");
+        assert!(Arc::ptr_eq(&after[newest], before.last().unwrap()), "episode {number}");
     }
 }
 
 #[test]
-fn while_a_policy_learns_from_images_a_flight_or_a_checkpoint_without_them_is_refused() {
+fn while_a_policy_learns_from_images_an_episode_or_a_checkpoint_without_them_is_refused() {
     let config = end_to_end(60);
     let mut replay = Replay::new(&config);
     let error = replay.insert(flown(4).without_images()).unwrap_err();
-    assert_eq!(error, InsertError::NoImages { flight: FlightId(4) });
+    assert_eq!(error, InsertError::NoImages { episode: EpisodeId(4) });
     replay.insert(flown(4)).unwrap();
     let mut state = replay.state();
     state.images = None;

@@ -12,7 +12,7 @@ use skein_protocol::transition::Outcome;
 use skein_protocol::{IMAGE_PIXELS, TRUE_STATE};
 
 use super::*;
-use crate::flight::samples::{code, flight, shade, with_images};
+use crate::episode::samples::{code, episode, shade, with_images};
 
 /// Length of the codes.
 const LATENT: usize = 16;
@@ -49,7 +49,7 @@ fn final_code(shade: u8) -> LatentCode {
 #[test]
 fn a_minibatch_holds_the_configured_share_of_success() {
     let mut replay = frozen(&config(1000, Observation::Latent));
-    let mut crossing = flight(1, 20, Outcome::Collided);
+    let mut crossing = episode(1, 20, Outcome::Collided);
     crossing.level_up[7] = true;
     replay.insert(crossing).unwrap();
     let mut batch = Minibatch::default();
@@ -64,73 +64,73 @@ fn a_minibatch_holds_the_configured_share_of_success() {
     }
 }
 
-/// `flight` in legs of `steps` steps, each with the images of all that it saw.
-fn in_legs(flight: &CommittedFlight, steps: usize) -> Vec<CommittedFlight> {
-    let leg = |first: usize| {
-        let end = (first + steps).min(flight.steps());
-        let is_last = end == flight.steps();
-        let images = &flight.depth.as_ref().unwrap()[first * IMAGE_PIXELS..(end + 1) * IMAGE_PIXELS];
-        CommittedFlight {
+/// `episode` in segments of `steps` steps, each with the images of all that it saw.
+fn in_segments(episode: &CommittedEpisode, steps: usize) -> Vec<CommittedEpisode> {
+    let segment = |first: usize| {
+        let end = (first + steps).min(episode.steps());
+        let is_last = end == episode.steps();
+        let images = &episode.depth.as_ref().unwrap()[first * IMAGE_PIXELS..(end + 1) * IMAGE_PIXELS];
+        CommittedEpisode {
             first_step: first,
             action_before: first
                 .checked_sub(1)
-                .map_or([0.0; ACTION], |before| flight.actions[before]),
-            observations: flight.observations[first..=end].to_vec(),
-            actions: flight.actions[first..end].to_vec(),
-            rewards: flight.rewards[first..end].to_vec(),
-            reward_terms: flight.reward_terms[first..end].to_vec(),
-            level_up: flight.level_up[first..end].to_vec(),
-            outcome: flight.outcome.filter(|_| is_last),
+                .map_or([0.0; ACTION], |before| episode.actions[before]),
+            observations: episode.observations[first..=end].to_vec(),
+            actions: episode.actions[first..end].to_vec(),
+            rewards: episode.rewards[first..end].to_vec(),
+            reward_terms: episode.reward_terms[first..end].to_vec(),
+            level_up: episode.level_up[first..end].to_vec(),
+            outcome: episode.outcome.filter(|_| is_last),
             depth: Some(images.to_vec()),
-            ..flight.without_images()
+            ..episode.without_images()
         }
     };
-    (0..flight.steps()).step_by(steps).map(leg).collect()
+    (0..episode.steps()).step_by(steps).map(segment).collect()
 }
 
 #[test]
-fn a_flight_stored_in_legs_is_the_flight_stored_whole() {
+fn an_episode_stored_in_segments_is_the_episode_stored_whole() {
     for (steps, outcome) in [(1, Outcome::Collided), (3, Outcome::TimedOut), (7, Outcome::ReachedEnd)] {
         let config = config(1000, Observation::LatentVelocityAction);
-        let (mut whole, mut legs) = (Replay::new(&config), Replay::new(&config));
+        let (mut whole, mut segments) = (Replay::new(&config), Replay::new(&config));
         for number in 0..3 {
-            let mut flown = with_images(flight(number, 7, outcome));
+            let mut flown = with_images(episode(number, 7, outcome));
             flown.level_up[5] = true;
-            let parts = in_legs(&flown, steps);
+            let parts = in_segments(&flown, steps);
             let mut joined = parts[0].without_images();
-            parts[1..].iter().for_each(|leg| joined.extend(leg));
+            parts[1..].iter().for_each(|segment| joined.extend(segment));
             assert_eq!(joined, flown.without_images());
-            parts.into_iter().for_each(|leg| legs.insert(leg).unwrap());
+            parts.into_iter().for_each(|segment| segments.insert(segment).unwrap());
             whole.insert(flown).unwrap();
         }
-        assert_eq!(legs.state(), whole.state());
-        legs.renew_latents(4, encode).unwrap();
+        assert_eq!(segments.state(), whole.state());
+        segments.renew_latents(4, encode).unwrap();
         whole.renew_latents(4, encode).unwrap();
-        assert_eq!(legs.state(), whole.state());
+        assert_eq!(segments.state(), whole.state());
     }
 }
 
 #[test]
-fn a_leg_that_does_not_follow_what_was_stored_last_is_refused() {
-    let legs = |number| in_legs(&with_images(flight(number, 6, Outcome::Collided)), 2);
+fn a_segment_that_does_not_follow_what_was_stored_last_is_refused() {
+    let segments = |number| in_segments(&with_images(episode(number, 6, Outcome::Collided)), 2);
     let config = config(1000, Observation::Latent);
     let mut replay = Replay::new(&config);
-    let refused = |leg: CommittedFlight, replay: &mut Replay| {
+    let refused = |segment: CommittedEpisode, replay: &mut Replay| {
         let before = replay.state();
-        let error = replay.insert(leg).unwrap_err().to_string();
+        let error = replay.insert(segment).unwrap_err().to_string();
         assert_eq!(replay.state(), before);
-        assert!(error.contains("flight 4 from its step 2 on"), "{error}");
+        assert!(error.contains("episode 4 from its step 2 on"), "{error}");
     };
-    refused(legs(4).remove(1), &mut replay);
-    replay.insert(legs(3).remove(0)).unwrap();
-    refused(legs(4).remove(1), &mut replay);
-    replay.insert(legs(4).remove(0)).unwrap();
-    replay.insert(legs(4).remove(1)).unwrap();
-    refused(legs(4).remove(1), &mut replay);
+    refused(segments(4).remove(1), &mut replay);
+    replay.insert(segments(3).remove(0)).unwrap();
+    refused(segments(4).remove(1), &mut replay);
+    replay.insert(segments(4).remove(0)).unwrap();
+    replay.insert(segments(4).remove(1)).unwrap();
+    refused(segments(4).remove(1), &mut replay);
     let mut restored = Replay::restore(&config, replay.state()).unwrap();
     assert!(
-        restored.insert(legs(4).remove(2)).is_err(),
-        "a checkpoint lies between flights"
+        restored.insert(segments(4).remove(2)).is_err(),
+        "a checkpoint lies between episodes"
     );
 }
 
@@ -138,7 +138,7 @@ fn a_leg_that_does_not_follow_what_was_stored_last_is_refused() {
 fn an_empty_part_is_made_up_for_by_the_other() {
     for level_up in [false, true] {
         let mut replay = frozen(&config(1000, Observation::Latent));
-        let mut one_sided = flight(1, 20, Outcome::Collided);
+        let mut one_sided = episode(1, 20, Outcome::Collided);
         one_sided.level_up.fill(level_up);
         replay.insert(one_sided).unwrap();
         let mut batch = Minibatch::default();
@@ -153,14 +153,14 @@ fn without_a_success_share_the_whole_buffer_is_one_part_that_knows_no_success() 
     config.replay.success_share = 0.0;
     let mut replay = frozen(&config);
     for number in 0..50 {
-        let mut crossing = flight(number, 20, Outcome::Collided);
+        let mut crossing = episode(number, 20, Outcome::Collided);
         crossing.level_up[7] = true;
         replay.insert(crossing).unwrap();
     }
     assert_eq!((replay.len(), replay.success_len()), (1000, 0));
     let mut batch = Minibatch::default();
     replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 20_000, &mut batch);
-    // The level-up of the newest flight is one transition of a thousand.
+    // The level-up of the newest episode is one transition of a thousand.
     let level_up = 49_007.0_f32 / 100.0;
     let drawn = batch.rewards.iter().filter(|&&reward| reward == level_up).count();
     assert!((5..50).contains(&drawn), "{drawn}");
@@ -173,7 +173,7 @@ fn without_a_success_share_the_whole_buffer_is_one_part_that_knows_no_success() 
 #[test]
 fn every_transition_of_a_part_is_equally_likely() {
     let mut replay = frozen(&config(1000, Observation::Latent));
-    replay.insert(flight(0, 10, Outcome::Collided)).unwrap();
+    replay.insert(episode(0, 10, Outcome::Collided)).unwrap();
     let mut batch = Minibatch::default();
     replay.sample(&mut Pcg64Mcg::seed_from_u64(5), 100_000, &mut batch);
     for step in 0..10 {
@@ -191,7 +191,7 @@ fn every_transition_of_a_part_is_equally_likely() {
 fn a_minibatch_is_a_function_of_content_and_seed() {
     let mut replay = frozen(&config(100, Observation::LatentVelocity));
     for number in 0..20 {
-        replay.insert(flight(number, 9, Outcome::Collided)).unwrap();
+        replay.insert(episode(number, 9, Outcome::Collided)).unwrap();
     }
     let draw = |seed| {
         let mut batch = Minibatch::default();
@@ -208,7 +208,7 @@ fn rows_of_a_minibatch_belong_together() {
     config.learning.critic_input = CriticInput::GroundTruth;
     let mut replay = frozen(&config);
     for number in 0..20 {
-        replay.insert(flight(number, 9, Outcome::Collided)).unwrap();
+        replay.insert(episode(number, 9, Outcome::Collided)).unwrap();
     }
     let mut batch = Minibatch::default();
     replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 64, &mut batch);
@@ -220,7 +220,7 @@ fn rows_of_a_minibatch_belong_together() {
         assert_eq!(
             next[LATENT],
             at + 1.25,
-            "the next observation is one step later in the same flight"
+            "the next observation is one step later in the same episode"
         );
         assert_eq!(batch.rewards[index], at / 100.0);
         for (states, seen) in [(&batch.true_states, observation), (&batch.next_true_states, next)] {
@@ -242,14 +242,14 @@ fn rows_of_a_minibatch_belong_together() {
 }
 
 #[test]
-fn a_truncated_flight_is_not_terminated_anywhere() {
+fn a_truncated_episode_is_not_terminated_anywhere() {
     for (outcome, expected) in [
         (Outcome::TimedOut, 0.0),
         (Outcome::Collided, 1.0),
         (Outcome::ReachedEnd, 1.0),
     ] {
         let mut replay = frozen(&config(100, Observation::Latent));
-        replay.insert(flight(1, 6, outcome)).unwrap();
+        replay.insert(episode(1, 6, outcome)).unwrap();
         let terminated: Vec<_> = (0..6).map(|slot| replay.regular.row(slot).terminated).collect();
         assert_eq!(terminated, [0.0, 0.0, 0.0, 0.0, 0.0, expected]);
     }
@@ -259,10 +259,10 @@ fn a_truncated_flight_is_not_terminated_anywhere() {
 fn memory_is_bounded_and_set_aside_once() {
     let config = config(64, Observation::Latent);
     let mut replay = frozen(&config);
-    replay.insert(flight(0, 1, Outcome::Collided)).unwrap();
+    replay.insert(episode(0, 1, Outcome::Collided)).unwrap();
     let first_row = replay.regular.row(0).observation.as_ptr();
     for number in 1..100 {
-        replay.insert(flight(number, 9, Outcome::Collided)).unwrap();
+        replay.insert(episode(number, 9, Outcome::Collided)).unwrap();
     }
     assert_eq!(replay.len(), 48, "the regular part is full, the success part empty");
     assert_eq!(
@@ -278,12 +278,14 @@ fn memory_is_bounded_and_set_aside_once() {
 fn more_images_than_training_can_need_are_refused_and_nothing_is_stored() {
     let mut config = config(64, Observation::Latent);
     config.vae.train_steps = 10;
-    config.learning.flights_per_epoch = 1;
-    config.transport.max_records_per_flight = 20;
+    config.learning.episodes_per_epoch = 1;
+    config.transport.max_records_per_episode = 20;
     let mut replay = Replay::new(&config);
-    replay.insert(with_images(flight(0, 30, Outcome::Collided))).unwrap();
+    replay.insert(with_images(episode(0, 30, Outcome::Collided))).unwrap();
     let before = replay.state();
-    let error = replay.insert(with_images(flight(1, 9, Outcome::Collided))).unwrap_err();
+    let error = replay
+        .insert(with_images(episode(1, 9, Outcome::Collided)))
+        .unwrap_err();
     assert!(
         matches!(
             error,
@@ -300,30 +302,30 @@ fn more_images_than_training_can_need_are_refused_and_nothing_is_stored() {
 }
 
 #[test]
-fn a_flight_without_images_is_refused_while_the_vae_is_trained() {
+fn an_episode_without_images_is_refused_while_the_vae_is_trained() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
-    let error = replay.insert(flight(7, 3, Outcome::Collided)).unwrap_err();
-    assert_eq!(error, InsertError::NoImages { flight: FlightId(7) });
+    let error = replay.insert(episode(7, 3, Outcome::Collided)).unwrap_err();
+    assert_eq!(error, InsertError::NoImages { episode: EpisodeId(7) });
     assert!(replay.is_empty());
 }
 
 #[test]
 fn images_are_dropped_when_the_vae_is_frozen_and_no_more_are_taken() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
-    replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
+    replay.insert(with_images(episode(0, 5, Outcome::Collided))).unwrap();
     assert_eq!(replay.image_count(), Some(6));
     replay.freeze();
-    replay.insert(with_images(flight(1, 5, Outcome::Collided))).unwrap();
+    replay.insert(with_images(episode(1, 5, Outcome::Collided))).unwrap();
     assert_eq!(replay.image_count(), None);
     assert_eq!(replay.state().images, None);
 }
 
 #[test]
-fn the_encoder_sees_pieces_of_one_size_whatever_the_flights_lengths() {
+fn the_encoder_sees_pieces_of_one_size_whatever_the_episodes_lengths() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
     for (number, steps) in [(0, 2), (1, 6), (2, 1)] {
         replay
-            .insert(with_images(flight(number, steps, Outcome::Collided)))
+            .insert(with_images(episode(number, steps, Outcome::Collided)))
             .unwrap();
     }
     let mut pieces = Vec::new();
@@ -339,7 +341,7 @@ fn the_encoder_sees_pieces_of_one_size_whatever_the_flights_lengths() {
 #[test]
 fn a_failed_encoder_leaves_everything_as_it_was() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
-    replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
+    replay.insert(with_images(episode(0, 5, Outcome::Collided))).unwrap();
     let before = replay.state();
     let mut calls = 0;
     let result = replay.renew_latents(4, |images| {
@@ -355,11 +357,11 @@ fn a_failed_encoder_leaves_everything_as_it_was() {
 }
 
 #[test]
-fn sampled_images_are_those_of_the_flights_closing_ones_included() {
+fn sampled_images_are_those_of_the_episodes_closing_ones_included() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
     for number in 0..3 {
         replay
-            .insert(with_images(flight(number, 2, Outcome::Collided)))
+            .insert(with_images(episode(number, 2, Outcome::Collided)))
             .unwrap();
     }
     let mut images = Vec::new();
@@ -379,7 +381,7 @@ fn sampled_images_are_those_of_the_flights_closing_ones_included() {
 fn content_of_another_shape_is_not_restored() {
     let narrow = config(64, Observation::Latent);
     let mut replay = Replay::new(&narrow);
-    replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
+    replay.insert(with_images(episode(0, 5, Outcome::Collided))).unwrap();
     let error = Replay::restore(&config(64, Observation::LatentVelocity), replay.state()).unwrap_err();
     assert_eq!(error.part, "regular part");
     let mut without_images = replay.state();
@@ -405,11 +407,11 @@ fn time_of_a_minibatch_of_256_from_a_full_buffer() {
     config.replay.success_share = 0.125;
     let mut replay = frozen(&config);
     for number in 0..20_000 {
-        let mut flight = flight(number, 50, Outcome::Collided);
+        let mut episode = episode(number, 50, Outcome::Collided);
         for step in 0..10 {
-            flight.level_up[step * 5] = true;
+            episode.level_up[step * 5] = true;
         }
-        replay.insert(flight).unwrap();
+        replay.insert(episode).unwrap();
     }
     assert_eq!(replay.len(), 1 << 17);
     let mut batch = Minibatch::default();

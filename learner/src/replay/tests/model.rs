@@ -8,7 +8,7 @@ use skein_protocol::transition::Outcome;
 
 use super::super::*;
 use super::{config, encode, final_code};
-use crate::flight::samples::{flight, with_images};
+use crate::episode::samples::{episode, with_images};
 
 /// A transition, owned.
 #[derive(Debug, Clone, PartialEq)]
@@ -38,15 +38,15 @@ impl Model {
         }
     }
 
-    fn insert(&mut self, flight: &CommittedFlight) {
-        for step in 0..flight.steps() {
+    fn insert(&mut self, episode: &CommittedEpisode) {
+        for step in 0..episode.steps() {
             let moment = |step: usize| {
-                let mut vector = flight.observations[step].latent[..self.view.latent].to_vec();
+                let mut vector = episode.observations[step].latent[..self.view.latent].to_vec();
                 if self.view.moment != Observation::Latent {
-                    vector.extend(&flight.observations[step].velocity_mps[1..]);
+                    vector.extend(&episode.observations[step].velocity_mps[1..]);
                 }
                 if self.view.moment == Observation::LatentVelocityAction {
-                    vector.extend(if step == 0 { [0.0; 2] } else { flight.actions[step - 1] });
+                    vector.extend(if step == 0 { [0.0; 2] } else { episode.actions[step - 1] });
                 }
                 vector
             };
@@ -57,12 +57,12 @@ impl Model {
                 }
                 vector
             };
-            let ends = step + 1 == flight.steps() && flight.outcome != Some(Outcome::TimedOut);
+            let ends = step + 1 == episode.steps() && episode.outcome != Some(Outcome::TimedOut);
             let transition = Transition {
                 observation: observed(step),
                 next_observation: observed(step + 1),
-                action: flight.actions[step],
-                reward: flight.rewards[step],
+                action: episode.actions[step],
+                reward: episode.rewards[step],
                 terminated: if ends { 1.0 } else { 0.0 },
             };
             let ahead = match self.section.success {
@@ -70,7 +70,10 @@ impl Model {
                 SuccessRule::Approach => self.section.approach_steps,
             };
             let success = self.section.success_share > 0.0
-                && flight.level_up[step..].iter().take(ahead + 1).any(|&level_up| level_up);
+                && episode.level_up[step..]
+                    .iter()
+                    .take(ahead + 1)
+                    .any(|&level_up| level_up);
             let (part, capacity) = &mut self.parts[usize::from(!success)];
             part.push_back(transition);
             if part.len() > *capacity {
@@ -117,18 +120,18 @@ fn assert_same(replay: &Replay, model: &Model) {
 }
 
 prop_compose! {
-    /// Flights of 1 to 12 steps with crossings anywhere and every outcome.
-    fn flights()(
+    /// Episodes of 1 to 12 steps with crossings anywhere and every outcome.
+    fn episodes()(
         shapes in prop::collection::vec((prop::collection::vec(prop::bool::weighted(0.2), 1..12), 0..3_usize), 1..20)
-    ) -> Vec<CommittedFlight> {
+    ) -> Vec<CommittedEpisode> {
         shapes
             .into_iter()
             .enumerate()
             .map(|(number, (level_up, outcome))| {
                 let outcome = [Outcome::Collided, Outcome::ReachedEnd, Outcome::TimedOut][outcome];
-                let mut flight = flight(number as u64, level_up.len(), outcome);
-                flight.level_up = level_up;
-                flight
+                let mut episode = episode(number as u64, level_up.len(), outcome);
+                episode.level_up = level_up;
+                episode
             })
             .collect()
     }
@@ -140,7 +143,7 @@ proptest! {
     /// Overwriting, classification, freezing at any point, saving and restoring at any point: always what the model holds.
     #[test]
     fn holds_what_a_naive_model_holds(
-        flights in flights(),
+        episodes in episodes(),
         capacity in 4..80_usize,
         freeze_after in 0..20_usize,
         observation in prop::sample::select(vec![
@@ -159,15 +162,15 @@ proptest! {
         config.replay.success = rule;
         config.replay.approach_steps = 3;
         let (mut replay, mut model) = (Replay::new(&config), Model::new(&config));
-        for (number, flight) in flights.iter().enumerate() {
+        for (number, episode) in episodes.iter().enumerate() {
             if number == freeze_after {
                 replay.renew_latents(chunk, encode).unwrap();
                 replay.freeze();
                 model.set_latents(|vector| final_code(vector[0] as u8));
             }
             let images_live = replay.image_count().is_some();
-            replay.insert(if images_live { with_images(flight.clone()) } else { flight.clone() }).unwrap();
-            model.insert(flight);
+            replay.insert(if images_live { with_images(episode.clone()) } else { episode.clone() }).unwrap();
+            model.insert(episode);
             assert_same(&replay, &model);
             let restored = Replay::restore(&config, replay.state()).unwrap();
             prop_assert_eq!(restored.state(), replay.state());

@@ -45,7 +45,7 @@ pub(super) fn flow_back(
     let flows = codes_flow
         .chunks_exact(latent)
         .zip(heads_flow.chunks_exact_mut(2 * latent));
-    for ((heads, noise), (flowing, into)) in rows.zip(flows) {
+    for ((heads, noise), (grad, into)) in rows.zip(flows) {
         let (means, log_variances) = heads.split_at(latent);
         let (mean_flow, log_variance_flow) = into.split_at_mut(latent);
         isa.vectorised(
@@ -54,8 +54,8 @@ pub(super) fn flow_back(
                 for place in 0..latent {
                     let (mean, unbounded) = (means[place], log_variances[place]);
                     let log_variance = unbounded.clamp(-BOUND, BOUND);
-                    mean_flow[place] = divergence_weight.mul_add(mean, flowing[place]);
-                    let drawn = 0.5 * flowing[place] * noise[place] * exp(0.5 * log_variance);
+                    mean_flow[place] = divergence_weight.mul_add(mean, grad[place]);
+                    let drawn = 0.5 * grad[place] * noise[place] * exp(0.5 * log_variance);
                     let flow = (0.5 * divergence_weight).mul_add(exp(log_variance) - 1.0, drawn);
                     // Outside of the bounds nothing changes with it.
                     log_variance_flow[place] = if (-BOUND..=BOUND).contains(&unbounded) {
@@ -94,21 +94,17 @@ mod tests {
         // Two that are out of bounds.
         (heads[LATENT + 3], heads[LATENT + 4]) = (11.0, -12.0);
         let noise: [f32; LATENT] = std::array::from_fn(|place| (place as f32 * 1.3).cos());
-        let flowing: [f32; LATENT] = std::array::from_fn(|place| (place as f32 * 0.4).cos());
-        // The loss is Σ flowing · code + weight · divergence.
+        let grad: [f32; LATENT] = std::array::from_fn(|place| (place as f32 * 0.4).cos());
+        // The loss is Σ grad · code + weight · divergence.
         let weight = 0.3;
         let loss = |heads: &[f32]| {
             let mut codes = [0.0; LATENT];
             let divergence = draw(Isa::best(), LATENT, heads, &noise, &mut codes);
-            let linear: f64 = codes
-                .iter()
-                .zip(&flowing)
-                .map(|(code, flow)| f64::from(code * flow))
-                .sum();
+            let linear: f64 = codes.iter().zip(&grad).map(|(code, flow)| f64::from(code * flow)).sum();
             linear + f64::from(weight) * divergence
         };
         let mut found = [0.0; 2 * LATENT];
-        flow_back(Isa::best(), LATENT, &heads, &noise, &flowing, weight, &mut found);
+        flow_back(Isa::best(), LATENT, &heads, &noise, &grad, weight, &mut found);
         for place in 0..2 * LATENT {
             let at = |moved: f32| {
                 let mut heads = heads;

@@ -121,16 +121,16 @@ impl Linear {
     }
 
     /// The gradient with respect to the input, `[n, inputs]`, from that with respect to the output, `[n, outputs]`.
-    pub(super) fn backward(&self, team: &mut Team, flowing: &[f32], finish: Finish<'_>, input: &mut [f32]) {
-        rows_times(team, flowing, &self.backward, Start::Zero, finish, input);
+    pub(super) fn backward(&self, team: &mut Team, grad: &[f32], finish: Finish<'_>, input: &mut [f32]) {
+        rows_times(team, grad, &self.backward, Start::Zero, finish, input);
     }
 
     /// The gradient of the weights and biases.
-    pub(super) fn gradient(&self, team: &mut Team, isa: Isa, flowing: &[f32], input: &[f32], all: &mut [f32]) {
-        let left = Matrix::of_rows(flowing, self.outputs);
+    pub(super) fn gradient(&self, team: &mut Team, isa: Isa, grad: &[f32], input: &[f32], all: &mut [f32]) {
+        let left = Matrix::of_rows(grad, self.outputs);
         let terms = Terms::Matrix(input, self.inputs);
         gradient(team, isa, left, terms, &mut all[self.place.weight.clone()]);
-        super::elementwise::column_sums(isa, flowing, &mut all[self.place.bias.clone()]);
+        super::elementwise::column_sums(isa, grad, &mut all[self.place.bias.clone()]);
     }
 
     /// Operations of one pass, for an image.

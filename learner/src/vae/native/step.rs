@@ -118,15 +118,15 @@ impl Step<'_> {
             watch.rest();
             let mut sums = Sums::new(network.decoder_places(), sums);
             let ways = [(2, &*c, &mut *g), (1, &*b, f), (0, &*a, e)];
-            let mut flowing = &**d;
+            let mut grad = &**d;
             for (index, output, into) in ways {
-                sums.add(isa, index + 1, flowing);
+                sums.add(isa, index + 1, grad);
                 watch.layer(DECODER + index, Pass::Gradient);
-                network.decoder[index].look(flowing, Start::Zero, Finish::Gated(output), into);
+                network.decoder[index].look(grad, Start::Zero, Finish::Gated(output), into);
                 watch.layer(DECODER + index, Pass::Backward);
-                flowing = into;
+                grad = into;
             }
-            sums.add(isa, 0, flowing);
+            sums.add(isa, 0, grad);
             watch.layer(UNFOLD, Pass::Gradient);
         });
     }
@@ -188,17 +188,17 @@ impl Step<'_> {
             let Member { columns, watch, .. } = member;
             let [a, b, c, d, sums] = images;
             let mut sums = Sums::new(network.encoder_places(), sums);
-            let mut flowing = &**d;
+            let mut grad = &**d;
             for (layer, into) in [(3, c), (2, b), (1, a)] {
-                sums.add(isa, layer, flowing);
+                sums.add(isa, layer, grad);
                 watch.layer(layer, Pass::Gradient);
                 into.fill(0.0);
-                network.encoder[layer].spread(flowing, columns, into);
+                network.encoder[layer].spread(grad, columns, into);
                 gate(isa, into, &seen[layer][index * into.len()..][..into.len()]);
                 watch.layer(layer, Pass::Backward);
-                flowing = into;
+                grad = into;
             }
-            sums.add(isa, 0, flowing);
+            sums.add(isa, 0, grad);
             watch.layer(0, Pass::Gradient);
         });
     }
@@ -216,8 +216,8 @@ impl Step<'_> {
             of_layer(index, layer, &batch.seen_flow[index], &batch.seen[index], gradient);
         }
         for (index, layer) in network.decoder.iter().enumerate() {
-            let flowing = batch.drawn_flow.get(index + 1).unwrap_or(&batch.drawn[3]);
-            of_layer(DECODER + index, layer, &batch.drawn[index], flowing, gradient);
+            let grad = batch.drawn_flow.get(index + 1).unwrap_or(&batch.drawn[3]);
+            of_layer(DECODER + index, layer, &batch.drawn[index], grad, gradient);
         }
         network
             .heads
@@ -249,9 +249,9 @@ impl<'a> Sums<'a> {
         Self { parts }
     }
 
-    /// `flowing`: the gradient with respect to the output of the layer at this place, before its ReLU.
-    fn add(&mut self, isa: Isa, layer: usize, flowing: &[f32]) {
-        column_sums(isa, flowing, self.parts[layer]);
+    /// `grad`: the gradient with respect to the output of the layer at this place, before its ReLU.
+    fn add(&mut self, isa: Isa, layer: usize, grad: &[f32]) {
+        column_sums(isa, grad, self.parts[layer]);
     }
 }
 

@@ -138,11 +138,11 @@ impl Unfold {
         &self.columns[(block * pixels + pixel) * PART..][..PART]
     }
 
-    /// First half of the backward pass: what each input pixel sees of the gradient flowing back to the images, `[n, 5, 11, 128]`.
-    pub(super) fn gather(&mut self, flowing: &[f32]) {
-        let images = flowing.len() / (ROWS * ROW);
+    /// First half of the backward pass: what each input pixel sees of the gradient grad back to the images, `[n, 5, 11, 128]`.
+    pub(super) fn gather(&mut self, grad: &[f32]) {
+        let images = grad.len() / (ROWS * ROW);
         self.columns.resize(BLOCKS * INPUTS * images * PART);
-        for (index, image) in flowing.chunks_exact(ROWS * ROW).enumerate() {
+        for (index, image) in grad.chunks_exact(ROWS * ROW).enumerate() {
             for (row, image) in image.chunks_exact(ROW).enumerate() {
                 for pixel in 0..INPUTS {
                     let from = image[pixel * STRIDE * CHANNELS..][..RUN].chunks_exact(PART);
@@ -155,7 +155,7 @@ impl Unfold {
         }
     }
 
-    /// Second half: the gradient with respect to the inputs of some images, `[3 · images, 1024]`, the first of which is number `first` of the batch; nought where
+    /// Second half: the gradient with respect to the inputs of some images, `[3 · images, 1024]`, the first of which is number `first` of the batch; zero where
     /// `gate` is.
     ///
     /// The weights are the left operand, read where they lie, and not packed for it: pixels are few, weights are many.

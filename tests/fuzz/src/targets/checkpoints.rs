@@ -9,8 +9,8 @@ use std::sync::{Arc, LazyLock};
 
 use skein_learner::checkpoint::{CheckpointState, CheckpointStore, EpochOrder, Progress, checkpoint_directory};
 use skein_learner::disk::Disk;
-use skein_learner::flights::assembly::Keep;
-use skein_learner::metrics::{EventFile, EventWriter, FlightRow, FlightsCsv};
+use skein_learner::episodes::assembly::Keep;
+use skein_learner::metrics::{EpisodeRow, EpisodesCsv, EventFile, EventWriter};
 use skein_learner::replay::Replay;
 use skein_learner::state::{NamedTensor, Part, Stateful, TensorValues};
 use skein_protocol::config::Config;
@@ -21,7 +21,7 @@ use skein_protocol::transition::Outcome;
 use tch::Tensor;
 use tempfile::TempDir;
 
-use super::replay::{config, flight};
+use super::replay::{config, episode};
 use super::{Target, USUAL, Verdict, tagged};
 use crate::scratch::{folder, with_files};
 
@@ -34,13 +34,13 @@ pub(super) const FILES: Target = Target {
     run: checkpoint,
 };
 
-pub(super) const FLIGHTS_CSV: Target = Target {
-    name: "flights_csv",
-    reads: "flights.csv, after a byte that says after how many flights it is to be continued",
+pub(super) const EPISODES_CSV: Target = Target {
+    name: "episodes_csv",
+    reads: "episodes.csv, after a byte that says after how many episodes it is to be continued",
     longest_bytes: 2048,
     weight: USUAL / 2,
     samples: csv_samples,
-    run: flights_csv,
+    run: episodes_csv,
 };
 
 pub(super) const EVENT_FILES: Target = Target {
@@ -57,8 +57,8 @@ pub(super) const EVENT_FILES: Target = Target {
     run: event_files,
 };
 
-/// Flights that the checkpoint is of.
-const FLIGHTS: u64 = 7;
+/// Episodes that the checkpoint is of.
+const EPISODES: u64 = 7;
 /// What the first byte of an input counts through. The configuration is read only to say what differs, the manifest before all else.
 const FILE_NAMES: [&str; 6] = [
     "tensors.safetensors",
@@ -72,7 +72,7 @@ const FILE_NAMES: [&str; 6] = [
 /// A small state with everything in it.
 fn state() -> CheckpointState {
     let mut replay = Replay::new(&config());
-    replay.insert(flight()).unwrap();
+    replay.insert(episode()).unwrap();
     let tensor = |name: &str, shape: &[usize], values| NamedTensor {
         name: name.to_owned(),
         shape: shape.to_vec(),
@@ -80,7 +80,7 @@ fn state() -> CheckpointState {
     };
     CheckpointState {
         progress: Progress {
-            flights: FLIGHTS,
+            episodes: EPISODES,
             epochs: 2,
             version: 2,
             in_the_air: vec![EpochOrder {
@@ -90,7 +90,7 @@ fn state() -> CheckpointState {
                 keep: Keep::Depth,
             }],
             latest_candidate: Some(5),
-            ..Progress::start(config().evaluation.window_flights as usize)
+            ..Progress::start(config().evaluation.window_episodes as usize)
         },
         tensors: vec![
             tensor("single", &[3, 2], TensorValues::F32(vec![0.5; 6])),
@@ -125,7 +125,7 @@ impl Sound {
     }
 
     fn place(&self) -> PathBuf {
-        checkpoint_directory(self.folder.path(), FLIGHTS)
+        checkpoint_directory(self.folder.path(), EPISODES)
     }
 }
 
@@ -200,13 +200,13 @@ fn checkpoint(bytes: &[u8]) -> Verdict {
         fs::write(&path, file).unwrap();
         if name != "manifest.json" {
             store(sound.folder.path(), &config())
-                .seal(&sound.place(), FLIGHTS)
+                .seal(&sound.place(), EPISODES)
                 .unwrap();
         }
         let mut reader = config();
         // Under the configuration it was written under, nobody looks at it.
         reader.run.seed += u64::from(name == "config.toml");
-        let loaded = store(sound.folder.path(), &reader).load(FLIGHTS);
+        let loaded = store(sound.folder.path(), &reader).load(EPISODES);
         fs::write(path, &sound.files[name]).unwrap();
         if let Err(error) = &loaded {
             let folder = sound.folder.path().display().to_string();
@@ -218,7 +218,7 @@ fn checkpoint(bytes: &[u8]) -> Verdict {
 
 /// Uses what was loaded as far as it can be used without networks.
 fn go_on(state: CheckpointState) {
-    assert_eq!(state.progress.flights, FLIGHTS);
+    assert_eq!(state.progress.episodes, EPISODES);
     let mut windows = state.progress.metrics.windows;
     let is_full = windows.walls_passed.is_full();
     windows.walls_passed.push(1.0);
@@ -238,7 +238,7 @@ fn go_on(state: CheckpointState) {
         }
     }
     if let Ok(mut replay) = Replay::restore(&config(), state.replay) {
-        let _ = replay.insert(flight());
+        let _ = replay.insert(episode());
     }
 }
 
@@ -268,9 +268,9 @@ impl Stateful for Own {
 /// A disk that nobody waits for.
 static DISK: LazyLock<Disk> = LazyLock::new(|| Disk::new(Arc::new(AtomicBool::new(true))));
 
-fn row(flight: u64) -> FlightRow {
-    FlightRow {
-        flight,
+fn row(episode: u64) -> EpisodeRow {
+    EpisodeRow {
+        episode,
         epoch: 0,
         policy_version: 0,
         actor: 1,
@@ -284,9 +284,9 @@ fn row(flight: u64) -> FlightRow {
 
 fn csv_samples() -> Vec<Vec<u8>> {
     let folder = folder();
-    let path = folder.path().join("flights.csv");
-    let mut csv = FlightsCsv::create(&path, &DISK).unwrap();
-    (0..4).for_each(|flight| csv.write(&row(flight)).unwrap());
+    let path = folder.path().join("episodes.csv");
+    let mut csv = EpisodesCsv::create(&path, &DISK).unwrap();
+    (0..4).for_each(|episode| csv.write(&row(episode)).unwrap());
     csv.flush().unwrap();
     let file = fs::read(path).unwrap();
     vec![
@@ -297,23 +297,23 @@ fn csv_samples() -> Vec<Vec<u8>> {
     ]
 }
 
-fn flights_csv(bytes: &[u8]) -> Verdict {
-    let Some((&flights, content)) = bytes.split_first() else {
+fn episodes_csv(bytes: &[u8]) -> Verdict {
+    let Some((&episodes, content)) = bytes.split_first() else {
         return Verdict::Refused;
     };
-    let flights = u64::from(flights);
-    with_files(&[("flights.csv", content)], |folder| {
-        let path = folder.join("flights.csv");
-        let mut csv = match FlightsCsv::resume(&path, flights, &DISK) {
+    let episodes = u64::from(episodes);
+    with_files(&[("episodes.csv", content)], |folder| {
+        let path = folder.join("episodes.csv");
+        let mut csv = match EpisodesCsv::resume(&path, episodes, &DISK) {
             Ok(csv) => csv,
             Err(error) => {
-                assert!(error.to_string().contains("flights.csv"), "{error}");
+                assert!(error.to_string().contains("episodes.csv"), "{error}");
                 return Verdict::Refused;
             }
         };
-        csv.write(&row(flights)).unwrap();
+        csv.write(&row(episodes)).unwrap();
         csv.flush().unwrap();
-        FlightsCsv::resume(&path, flights + 1, &DISK).unwrap();
+        EpisodesCsv::resume(&path, episodes + 1, &DISK).unwrap();
         Verdict::Accepted
     })
 }

@@ -71,10 +71,10 @@ pub(super) const SUITE: Target = Target {
         match text(bytes).map(|text| Suite::parse(text, &file)) {
             Some(Ok(suite)) => {
                 for entry in &suite.entries {
-                    assert!(entry.flights > 0);
-                    for flight in [0, entry.flights - 1] {
+                    assert!(entry.episodes > 0);
+                    for episode in [0, entry.episodes - 1] {
                         // A range may hold what fits for one seed and nothing for another.
-                        if let Ok(course) = entry.courses.of_flight(flight) {
+                        if let Ok(course) = entry.courses.of_episode(episode) {
                             assert!(course.levels() > 0);
                         }
                     }
@@ -93,7 +93,7 @@ pub(super) const SUITE: Target = Target {
 fn suite_samples() -> Vec<Vec<u8>> {
     vec![
         shipped("configs/evaluations/generalist.toml"),
-        b"name = \"x\"\n[[entry]]\nname = \"one\"\nflights = 3\nfirst_seed = 18446744073709551615\n[entry.generated]\nshapes = [\"star\"]\n".to_vec(),
+        b"name = \"x\"\n[[entry]]\nname = \"one\"\nepisodes = 3\nfirst_seed = 18446744073709551615\n[entry.generated]\nshapes = [\"star\"]\n".to_vec(),
     ]
 }
 
@@ -138,7 +138,7 @@ fn generator_samples() -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// Flies the first step from the first and the last level: nothing panics, every number is finite, and a flight does not begin in a wall.
+/// Flies the first step from the first and the last level: nothing panics, every number is finite, and an episode does not begin in a wall.
 pub(super) fn assert_flyable(course: Course) -> Verdict {
     let settings = SimulatorSettings::default();
     let levels = course.levels();

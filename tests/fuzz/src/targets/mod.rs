@@ -80,7 +80,7 @@ pub static TARGETS: [Target; 23] = [
     snapshots::RECEIVED,
     checkpoints::FILES,
     replay::REPLAY,
-    checkpoints::FLIGHTS_CSV,
+    checkpoints::EPISODES_CSV,
     checkpoints::EVENT_FILES,
     runs::IDENTITY,
     runs::ANNOUNCEMENT,

@@ -1,15 +1,15 @@
-//! Transition and status records in any sequence, through the learner's desk: whatever comes, a flight is committed whole, once and finite, or not at all.
+//! Transition and status records in any sequence, through the learner's dispatcher: whatever comes, an episode is committed whole, once and finite, or not at all.
 
 use std::collections::BTreeSet;
 use std::mem::offset_of;
 use std::time::{Duration, Instant};
 
 use bytemuck::{Zeroable, bytes_of_mut};
-use skein_learner::flight::CommittedFlight;
-use skein_learner::flights::assembly::Keep;
-use skein_learner::flights::desk::{Desk, Order, Place};
+use skein_learner::episode::CommittedEpisode;
+use skein_learner::episodes::assembly::Keep;
+use skein_learner::episodes::dispatcher::{Dispatcher, Order, Place};
 use skein_protocol::config::TransportSection;
-use skein_protocol::ids::{ActorId, Attempt, Epoch, FlightId, Incarnation, PolicyVersion, RunId};
+use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, Epoch, PolicyVersion, RunId};
 use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
@@ -29,32 +29,32 @@ pub(super) const RECORDS: Target = Target {
 };
 
 const RUN: RunId = RunId(1);
-/// Flights ordered in the beginning.
-const FLIGHTS: u64 = 6;
-/// Records of the longest flight.
-const LONGEST_FLIGHT: usize = 8;
+/// Episodes ordered in the beginning.
+const EPISODES: u64 = 6;
+/// Records of the longest episode.
+const LONGEST_EPISODE: usize = 8;
 /// Length of the latent codes.
 const LATENT: usize = 16;
 /// Bytes of a record before its image.
 const HEADER: usize = offset_of!(TransitionRecord, depth);
 
-pub(super) fn sample_ticket(flight: u64) -> Ticket {
+pub(super) fn sample_ticket(episode: u64) -> Ticket {
     Ticket {
         run: RUN,
-        flight: FlightId(flight),
+        episode: EpisodeId(episode),
         attempt: Attempt(0),
         policy_version: PolicyVersion(3),
         course: CourseChoice::Training,
         start_level: 1,
         exploration: Exploration::Sample,
-        seed: flight,
-        leg: None,
+        seed: episode,
+        segment: None,
     }
 }
 
-/// Scripts in which flights are flown as they should be, and some in which they are not.
+/// Scripts in which episodes are flown as they should be, and some in which they are not.
 fn samples() -> Vec<Vec<u8>> {
-    /// Actor 0, in life 1, serves.
+    /// Actor 0, in incarnation 1, serves.
     const ATTACH: [u8; 4] = [1, 0, 1, 0];
     const ISSUE: [u8; 1] = [2];
     const STEP: [u8; 3] = [3, 0, 0];
@@ -108,42 +108,42 @@ fn samples() -> Vec<Vec<u8>> {
     ]
 }
 
-/// The learner's desk, and what its actors hold.
+/// The learner's dispatcher, and what its actors hold.
 struct Learner {
-    desk: Desk,
+    dispatcher: Dispatcher,
     now: Instant,
     held: Vec<Held>,
     committed: BTreeSet<Place>,
 }
 
-/// A ticket, as the life of an actor that holds it knows it.
+/// A ticket, as the incarnation of an actor that holds it knows it.
 struct Held {
     ticket: Ticket,
     actor: ActorId,
-    life: Incarnation,
+    incarnation: ActorIncarnation,
     step: u32,
 }
 
 impl Learner {
     fn new() -> Self {
         let limits = TransportSection {
-            max_records_per_flight: LONGEST_FLIGHT,
+            max_records_per_episode: LONGEST_EPISODE,
             ..TransportSection::default()
         };
-        let mut desk = Desk::new(RUN, &limits, LATENT);
-        for flight in 0..FLIGHTS {
-            desk.order(Order {
-                ticket: sample_ticket(flight),
+        let mut dispatcher = Dispatcher::new(RUN, &limits, LATENT);
+        for episode in 0..EPISODES {
+            dispatcher.order(Order {
+                ticket: sample_ticket(episode),
                 epoch: Epoch(0),
-                keep: keep(flight),
+                keep: keep(episode),
                 place: Place {
                     batch: 0,
-                    index: flight as usize,
+                    index: episode as usize,
                 },
             });
         }
         Self {
-            desk,
+            dispatcher,
             now: Instant::now(),
             held: Vec::new(),
             committed: BTreeSet::new(),
@@ -155,7 +155,9 @@ impl Learner {
             match script.u8() % 7 {
                 0 => {
                     let record: StatusRecord = pod(script.bytes(size_of::<StatusRecord>()));
-                    record.read(RUN).inspect(|status| self.desk.on_status(status, self.now));
+                    record
+                        .read(RUN)
+                        .inspect(|status| self.dispatcher.on_status(status, self.now));
                 }
                 1 => self.attach(script),
                 2 => self.issue(),
@@ -163,7 +165,7 @@ impl Learner {
                 4 => self.send(script, change),
                 5 => {
                     self.now += Duration::from_secs(script.u8().into());
-                    self.desk.on_time(self.now);
+                    self.dispatcher.on_time(self.now);
                 }
                 _ => {
                     let mut record = TransitionRecord::zeroed();
@@ -172,41 +174,43 @@ impl Learner {
                     self.receive(&record);
                 }
             }
-            let open = self.desk.open_orders() + self.committed.len();
-            // A flight that was given up for good ends the run; it alone may be missing.
-            assert!(open <= FLIGHTS as usize, "{open} of {FLIGHTS} flights");
+            let open = self.dispatcher.open_orders() + self.committed.len();
+            // An episode that was given up for good ends the run; it alone may be missing.
+            assert!(open <= EPISODES as usize, "{open} of {EPISODES} episodes");
         }
         Verdict::of(self.committed.first())
     }
 
-    /// An actor of three, in one of four lives, comes or goes.
+    /// An actor of three, in one of four incarnations, comes or goes.
     fn attach(&mut self, script: &mut Script<'_>) {
         let status = ActorStatus {
             actor: ActorId(u32::from(script.u8() % 3)),
-            incarnation: Incarnation(u64::from(script.u8() % 4)),
+            incarnation: ActorIncarnation(u64::from(script.u8() % 4)),
             pid: 1,
             state: script.one_of(&[ActorState::Serving, ActorState::Serving, ActorState::Leaving]),
             newest_policy: None,
-            flights_flown: 0,
+            episodes_flown: 0,
             times: Times::default(),
         };
-        self.desk.on_status(&status, self.now);
+        self.dispatcher.on_status(&status, self.now);
     }
 
     fn issue(&mut self) {
-        for message in self.desk.issue(self.now) {
+        for message in self.dispatcher.issue(self.now) {
             let ticket = match message.read(RUN) {
                 Ok(Control::Fly(ticket)) => ticket,
                 Ok(Control::Rejoin) => continue,
-                other => panic!("the desk sends tickets and letters, not {other:?}"),
+                other => panic!("the dispatcher sends tickets and letters, not {other:?}"),
             };
-            let lives = (0..3).flat_map(|actor| (0..4).map(move |life| (ActorId(actor), Incarnation(life))));
+            let incarnations =
+                (0..3).flat_map(|actor| (0..4).map(move |incarnation| (ActorId(actor), ActorIncarnation(incarnation))));
             // Other actors came by records of random bytes and hold theirs for ever.
-            for (actor, life) in lives.filter(|&(actor, life)| message.is_for(actor, life)) {
+            for (actor, incarnation) in incarnations.filter(|&(actor, incarnation)| message.is_for(actor, incarnation))
+            {
                 self.held.push(Held {
                     ticket: ticket.clone(),
                     actor,
-                    life,
+                    incarnation,
                     step: 0,
                 });
             }
@@ -221,7 +225,7 @@ impl Learner {
             return;
         };
         let mut record = TransitionRecord::zeroed();
-        record.begin(&held.ticket, held.actor, held.life, held.step);
+        record.begin(&held.ticket, held.actor, held.incarnation, held.step);
         held.step += 1;
         record.truncated = u8::from(end == 2);
         if end == 1 {
@@ -234,16 +238,16 @@ impl Learner {
     }
 
     fn receive(&mut self, record: &TransitionRecord) {
-        // A hopeless flight ends a run; here the others are flown on.
-        if let Ok(Some((place, flight))) = self.desk.on_record(record, self.now) {
+        // A hopeless episode ends a run; here the others are flown on.
+        if let Ok(Some((place, episode))) = self.dispatcher.on_record(record, self.now) {
             assert!(self.committed.insert(place), "{place:?} was committed twice");
-            assert_sound(&flight);
+            assert_sound(&episode);
         }
     }
 }
 
-fn keep(flight: u64) -> Keep {
-    if flight.is_multiple_of(2) {
+fn keep(episode: u64) -> Keep {
+    if episode.is_multiple_of(2) {
         Keep::Depth
     } else {
         Keep::Latents
@@ -258,21 +262,21 @@ fn change(record: &mut TransitionRecord, script: &mut Script<'_>) {
     }
 }
 
-fn assert_sound(flight: &CommittedFlight) {
-    flight.check().unwrap();
-    let ticket = sample_ticket(flight.flight.0);
+fn assert_sound(episode: &CommittedEpisode) {
+    episode.check().unwrap();
+    let ticket = sample_ticket(episode.episode.0);
     assert_eq!(
-        (flight.policy_version, flight.level),
+        (episode.policy_version, episode.level),
         (ticket.policy_version, ticket.start_level)
     );
-    assert_eq!(flight.depth.is_some(), keep(flight.flight.0) == Keep::Depth);
-    assert!(flight.observations.len() <= LONGEST_FLIGHT);
-    assert!(flight.walls_passed <= flight.course_walls);
-    let codes = flight.observations.iter();
+    assert_eq!(episode.depth.is_some(), keep(episode.episode.0) == Keep::Depth);
+    assert!(episode.observations.len() <= LONGEST_EPISODE);
+    assert!(episode.walls_passed <= episode.course_walls);
+    let codes = episode.observations.iter();
     assert!(codes.flat_map(|seen| &seen.latent[LATENT..]).all(|&value| value == 0.0));
-    let actions = flight.actions.iter().flatten();
+    let actions = episode.actions.iter().flatten();
     assert!(actions.clone().all(|action| action.abs() <= 1.0));
-    let seen = flight.observations.iter().flat_map(|seen| {
+    let seen = episode.observations.iter().flat_map(|seen| {
         seen.latent
             .into_iter()
             .chain(seen.velocity_mps)
@@ -280,9 +284,9 @@ fn assert_sound(flight: &CommittedFlight) {
             .chain(seen.orientation)
     });
     let numbers = seen
-        .chain(flight.rewards.iter().copied())
-        .chain(flight.reward_terms.iter().flatten().copied());
+        .chain(episode.rewards.iter().copied())
+        .chain(episode.reward_terms.iter().flatten().copied());
     // Squares of what is learned from must be finite too.
     numbers.for_each(|number| assert!((number * number).is_finite(), "{number}"));
-    assert!(flight.total_reward().is_finite());
+    assert!(episode.total_reward().is_finite());
 }

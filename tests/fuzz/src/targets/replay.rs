@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_learner::flight::{CommittedFlight, StepObservation};
+use skein_learner::episode::{CommittedEpisode, StepObservation};
 use skein_learner::replay::{Minibatch, Replay, ReplayState, RingState};
 use skein_protocol::config::{Config, EncoderTraining};
-use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
+use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LONGEST_LATENT};
 
@@ -32,8 +32,8 @@ pub(super) fn config() -> Config {
     let mut config = Config::default();
     config.replay.capacity = 256;
     config.vae.train_steps = 16;
-    config.learning.flights_per_epoch = 1;
-    config.transport.max_records_per_flight = 16;
+    config.learning.episodes_per_epoch = 1;
+    config.transport.max_records_per_episode = 16;
     config
 }
 
@@ -56,8 +56,8 @@ fn restore(bytes: &[u8]) -> Verdict {
     if replay.image_count().is_some_and(|images| images > 0) {
         replay.sample_images(&mut rng, 2, &mut Vec::new());
     }
-    // A flight more: taken in, or refused for want of room for its images.
-    let _ = replay.insert(flight());
+    // An episode more: taken in, or refused for want of room for its images.
+    let _ = replay.insert(episode());
     let encode = |images: &[u8]| Ok::<_, ()>(vec![[0.5; LONGEST_LATENT]; images.len() / IMAGE_PIXELS]);
     replay.renew_latents(8, encode).unwrap();
     replay.freeze();
@@ -75,7 +75,7 @@ fn restore_end_to_end(state: ReplayState) {
     assert_eq!(replay.state(), state);
     let (mut rng, mut drawn) = (Pcg64Mcg::seed_from_u64(1), Minibatch::default());
     for _ in 0..3 {
-        replay.insert(flight()).unwrap();
+        replay.insert(episode()).unwrap();
         replay.sample(&mut rng, 4, &mut drawn);
         assert_eq!([drawn.images.len(), drawn.next_images.len()], [4 * IMAGE_PIXELS; 2]);
     }
@@ -110,7 +110,7 @@ fn ring(script: &mut Script<'_>, capacity: usize) -> RingState {
     }
 }
 
-pub(super) fn flight() -> CommittedFlight {
+pub(super) fn episode() -> CommittedEpisode {
     let seen = StepObservation {
         latent: [0.0; LONGEST_LATENT],
         velocity_mps: [0.0; 3],
@@ -118,8 +118,8 @@ pub(super) fn flight() -> CommittedFlight {
         orientation: [0.0, 0.0, 0.0, 1.0],
         ground_truth: [0.0; GROUND_TRUTH],
     };
-    CommittedFlight {
-        flight: FlightId(1),
+    CommittedEpisode {
+        episode: EpisodeId(1),
         epoch: Epoch(0),
         policy_version: PolicyVersion(0),
         actor: ActorId(0),

@@ -1,4 +1,4 @@
-//! What plots are drawn from: `flights.csv`, `evaluation_paths.csv`, and the images beside their reconstructions.
+//! What plots are drawn from: `episodes.csv`, `evaluation_trajectories.csv`, and the images beside their reconstructions.
 
 use std::sync::LazyLock;
 
@@ -15,7 +15,7 @@ use crate::script::Script;
 
 pub(super) const FILES: Target = Target {
     name: "report_files",
-    reads: "flights.csv (after a 0), evaluation_paths.csv (after a 1), reconstructions.safetensors (after a 2)",
+    reads: "episodes.csv (after a 0), evaluation_trajectories.csv (after a 1), reconstructions.safetensors (after a 2)",
     longest_bytes: 4096,
     weight: USUAL / 2,
     samples,
@@ -126,7 +126,11 @@ fn fuzzed_course(script: &[u8]) -> Option<NamedCourse> {
 
 /// A run that left one file, of the kind that the first byte says.
 fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory) -> Verdict) -> Verdict {
-    const NAMES: [&str; 3] = ["flights.csv", "evaluation_paths.csv", "reconstructions.safetensors"];
+    const NAMES: [&str; 3] = [
+        "episodes.csv",
+        "evaluation_trajectories.csv",
+        "reconstructions.safetensors",
+    ];
     let Some((&kind, content)) = bytes.split_first() else {
         return Verdict::Refused;
     };
@@ -135,15 +139,15 @@ fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory) -> Verdict) -> Verdic
 }
 
 fn samples() -> Vec<Vec<u8>> {
-    let flights = "flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
+    let episodes = "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
                    0,0,0,0,1,12,0,-0.9,collided\n1,0,0,1,1,33,1,0.2,timed_out\n";
-    let paths = "course,flight,step,x_m,y_m,z_m,outcome\n\
+    let paths = "course,episode,step,x_m,y_m,z_m,outcome\n\
                  training,0,0,1.5,0,3,collided\ntraining,0,1,9.7,1,3,collided\nfuzzed,1,0,1.5,0.5,3.5,reached_end\n";
     // Empty images: a header is what there is to damage.
     let images = r#"{"depth":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]},"reconstruction":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]}}"#;
     let images = [&(images.len() as u64).to_le_bytes()[..], images.as_bytes()].concat();
     vec![
-        tagged(0, flights.as_bytes()),
+        tagged(0, episodes.as_bytes()),
         tagged(1, paths.as_bytes()),
         tagged(2, &images),
         [&tagged(1, paths.as_bytes())[..], &[0], &[128; 60]].concat(),

@@ -7,10 +7,10 @@ use skein_launch::display::Display;
 use skein_launch::supervisor::Restarts;
 use skein_protocol::PROTOCOL_VERSION;
 use skein_protocol::config::Config;
-use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
+use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::progress::Progress;
-use skein_protocol::run::{Announcement, Life, RunDirectory, RunIdentity};
+use skein_protocol::run::{Announcement, LearnerIncarnation, RunDirectory, RunIdentity};
 use skein_protocol::summary::Summary;
 use skein_protocol::transition::Outcome;
 
@@ -28,20 +28,20 @@ pub(super) const IDENTITY: Target = Target {
 
 pub(super) const ANNOUNCEMENT: Target = Target {
     name: "announcement",
-    reads: "what a learner announces of its present life",
+    reads: "what a learner announces of its present incarnation",
     longest_bytes: 1024,
     weight: USUAL,
     samples: || {
-        let life: Life = serde_json::from_str("7").unwrap();
+        let incarnation: LearnerIncarnation = serde_json::from_str("7").unwrap();
         let (identity, config) = opened();
-        vec![serde_json::to_vec(&Announcement::new(&identity, life, &config)).unwrap()]
+        vec![serde_json::to_vec(&Announcement::new(&identity, incarnation, &config)).unwrap()]
     },
     run: |bytes| {
         let read = serde_json::from_slice::<Announcement>(bytes).ok();
         let joined = read.filter(|announcement| announcement.check(&IDENTIFIED.0, &IDENTIFIED.1).is_ok());
         if let Some(announcement) = &joined {
-            // Life and process are the learner's to choose; in all else it is what we would say.
-            let mut mine = Announcement::new(&IDENTIFIED.0, announcement.life, &IDENTIFIED.1);
+            // LearnerIncarnation and process are the learner's to choose; in all else it is what we would say.
+            let mut mine = Announcement::new(&IDENTIFIED.0, announcement.incarnation, &IDENTIFIED.1);
             mine.pid = announcement.pid;
             assert_eq!(announcement, &mine);
         }
@@ -103,9 +103,9 @@ fn identity(bytes: &[u8]) -> Verdict {
 }
 
 fn result_samples() -> Vec<Vec<u8>> {
-    let scores = [FlightScore {
+    let scores = [EpisodeScore {
         walls_passed: 3,
-        flight_return: -1.5,
+        episode_return: -1.5,
         outcome: Outcome::Collided,
         hit_wall: Some(4),
     }; 4];
@@ -116,8 +116,8 @@ fn result_samples() -> Vec<Vec<u8>> {
     };
     // Read, not made: it has fields for whatever a run may come to, and a reader that knows fewer of them reads it too.
     let summary = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"1024266715d59141","final_version":80,
-        "best_version":70,"best_confirmed_walls_passed":4.9,"flights":800,"steps":42837,"updates":20418,"vae_updates":400,
-        "evaluation_flights":400,"tickets_reissued":0,"records_refused":0,"wall_secs":333.3,
+        "best_version":70,"best_confirmed_walls_passed":4.9,"episodes":800,"steps":42837,"updates":20418,"vae_updates":400,
+        "evaluation_episodes":400,"tickets_reissued":0,"records_refused":0,"wall_secs":333.3,
         "stages":[{"thread":"actors","stage":"physics","count":42000,"secs":12.5},{"thread":"training","stage":"idle","count":80,"secs":200.0}]}"#;
     let read: Summary = serde_json::from_str(summary).unwrap();
     let written = serde_json::to_vec(&read).unwrap();
@@ -145,9 +145,9 @@ fn results(bytes: &[u8]) -> Verdict {
 }
 
 fn progress_samples() -> Vec<Vec<u8>> {
-    let line = |phase: &str, flights: u64, secs: f64| {
+    let line = |phase: &str, episodes: u64, secs: f64| {
         format!(
-            r#"{{"phase":"{phase}","flights":{flights},"total_flights":2000,"evaluation_flights":[0,20],"steps":10000,"updates":4000,"vae_updates":100,"steps_per_sec":151.6,"updates_per_sec":63.2,"walls_passed":1.25,"mean_return":null,"temperature":0.05,"vae_loss":50.1,"actors":2,"elapsed_secs":{secs}}}"#
+            r#"{{"phase":"{phase}","episodes":{episodes},"total_episodes":2000,"evaluation_episodes":[0,20],"steps":10000,"updates":4000,"vae_updates":100,"steps_per_sec":151.6,"updates_per_sec":63.2,"walls_passed":1.25,"mean_return":null,"temperature":0.05,"vae_loss":50.1,"actors":2,"elapsed_secs":{secs}}}"#
         )
     };
     let lines = [

@@ -1,10 +1,10 @@
-//! Status and control records and tickets of legs, bit for bit: what is believed says the same when it is written again.
+//! Status and control records and tickets of segments, bit for bit: what is believed says the same when it is written again.
 
 use std::time::Duration;
 
 use bytemuck::{Pod, Zeroable, bytes_of, pod_read_unaligned};
-use skein_protocol::ids::{ActorId, Incarnation, PolicyVersion, RunId};
-use skein_protocol::leg::{Leg, LegRecord};
+use skein_protocol::ids::{ActorId, ActorIncarnation, PolicyVersion, RunId};
+use skein_protocol::segment::{Segment, SegmentRecord};
 use skein_protocol::stages::{Stage, Times};
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, ControlRecord};
@@ -14,13 +14,17 @@ use super::{Target, USUAL, Verdict};
 
 pub(super) const SIGNALS: Target = Target {
     name: "signals",
-    reads: "status and control records, tickets of legs",
-    longest_bytes: size_of::<LegRecord>(),
+    reads: "status and control records, tickets of segments",
+    longest_bytes: size_of::<SegmentRecord>(),
     weight: 2 * USUAL,
     samples: signal_samples,
     run: |bytes| {
         let run = run_of(bytes);
-        let read = [status(pod(bytes), run), control(pod(bytes), run), leg(pod(bytes), run)];
+        let read = [
+            status(pod(bytes), run),
+            control(pod(bytes), run),
+            segment(pod(bytes), run),
+        ];
         Verdict::of(read.into_iter().flatten().next())
     },
 };
@@ -31,26 +35,26 @@ fn signal_samples() -> Vec<Vec<u8>> {
     times.add(Stage::ActorIdle, 2, Duration::from_secs(3));
     let status = ActorStatus {
         actor: ActorId(3),
-        incarnation: Incarnation(7),
+        incarnation: ActorIncarnation(7),
         pid: 4711,
         state: ActorState::Serving,
         newest_policy: Some(PolicyVersion(2)),
-        flights_flown: 12,
+        episodes_flown: 12,
         times,
     };
     let run = RunId(1);
     let ticket = sample_ticket(5);
-    let leg = Leg {
+    let segment = Segment {
         steps: 1,
         flown: vec![[0.5, -1.0]; 3].into(),
     };
     vec![
-        bytes_of(&LegRecord::fly(&ticket, &leg, ActorId(3), Incarnation(7))).to_vec(),
+        bytes_of(&SegmentRecord::fly(&ticket, &segment, ActorId(3), ActorIncarnation(7))).to_vec(),
         bytes_of(&StatusRecord::new(run, &status)).to_vec(),
-        bytes_of(&ControlRecord::fly(&ticket, ActorId(3), Incarnation(7))).to_vec(),
+        bytes_of(&ControlRecord::fly(&ticket, ActorId(3), ActorIncarnation(7))).to_vec(),
         bytes_of(&ControlRecord::heartbeat(run)).to_vec(),
         bytes_of(&ControlRecord::stop(run)).to_vec(),
-        bytes_of(&ControlRecord::rejoin(run, ActorId(3), Incarnation(7))).to_vec(),
+        bytes_of(&ControlRecord::rejoin(run, ActorId(3), ActorIncarnation(7))).to_vec(),
     ]
 }
 
@@ -80,21 +84,21 @@ fn status(record: StatusRecord, run: RunId) -> Option<()> {
 fn control(record: ControlRecord, run: RunId) -> Option<()> {
     assert!(record.read(RunId(!run.0)).is_err());
     if let Control::Fly(ticket) = record.read(run).ok()? {
-        let again = ControlRecord::fly(&ticket, ActorId(1), Incarnation(2));
+        let again = ControlRecord::fly(&ticket, ActorId(1), ActorIncarnation(2));
         assert!(ticket.start_level > 0);
         assert_eq!(again.read(run), Ok(Control::Fly(ticket)));
     }
     Some(())
 }
 
-fn leg(record: LegRecord, run: RunId) -> Option<()> {
+fn segment(record: SegmentRecord, run: RunId) -> Option<()> {
     assert!(record.read(RunId(!run.0)).is_err());
     let Control::Fly(ticket) = record.read(run).ok()? else {
-        panic!("a record of a leg is a ticket or nothing");
+        panic!("a record of a segment is a ticket or nothing");
     };
-    let leg = ticket.leg.clone().expect("it is of a leg");
-    assert!(leg.steps > 0 && leg.flown.iter().flatten().all(|command| command.abs() <= 1.0));
-    let again = LegRecord::fly(&ticket, &leg, ActorId(1), Incarnation(2));
+    let segment = ticket.segment.clone().expect("it is of a segment");
+    assert!(segment.steps > 0 && segment.flown.iter().flatten().all(|command| command.abs() <= 1.0));
+    let again = SegmentRecord::fly(&ticket, &segment, ActorId(1), ActorIncarnation(2));
     assert_eq!(again.read(run), Ok(Control::Fly(ticket)));
     Some(())
 }

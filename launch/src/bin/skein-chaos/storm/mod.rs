@@ -1,7 +1,7 @@
 //! A run that is disturbed while it goes on.
 //!
 //! What is done to it is a [`Script`]'s business. Here is what every script needs: the hand that kills, freezes and attaches, and the eye on
-//! supervisor, crews and flights, so that what happens by itself is told from what was done.
+//! supervisor, crews and episodes, so that what happens by itself is told from what was done.
 
 mod supervisor;
 
@@ -19,9 +19,9 @@ use supervisor::{Supervisor, Told};
 
 use crate::plan::{Disturbance, Manner, Reach};
 use crate::recorder::Recorder;
-use crate::stage::{FlightCount, LOOK, Stage, wait};
+use crate::stage::{EpisodeCount, LOOK, Stage, wait};
 
-/// Without a new flight for so long, a run is stuck: the longest pause of a sound one is its evaluation.
+/// Without a new episode for so long, a run is stuck: the longest pause of a sound one is its evaluation.
 const STUCK: Duration = Duration::from_secs(300);
 /// How long a killed process may take to be gone: the kernel gives its memory back first.
 const DEATH: Duration = Duration::from_secs(2);
@@ -63,8 +63,8 @@ pub(crate) struct Storm<'a> {
     supervisor: Supervisor,
     crews: Vec<Child>,
     frozen: Vec<(Process, Instant)>,
-    count: FlightCount,
-    flights: u64,
+    count: EpisodeCount,
+    episodes: u64,
     highest: u64,
     moved: Instant,
     spared: Spared,
@@ -92,8 +92,8 @@ impl<'a> Storm<'a> {
             },
             crews: Vec::new(),
             frozen: Vec::new(),
-            count: FlightCount::of(&stage.run),
-            flights: 0,
+            count: EpisodeCount::of(&stage.run),
+            episodes: 0,
             highest: 0,
             moved: Instant::now(),
             spared,
@@ -129,7 +129,7 @@ impl<'a> Storm<'a> {
     fn rage_on(&mut self, script: &mut impl Script) -> Result<()> {
         loop {
             self.thaw(Thaw::Due);
-            self.watch_flights();
+            self.watch_episodes();
             self.reap_crews(Instant::now())?;
             self.watch_supervisor()?;
             if matches!(self.supervisor, Supervisor::Ended) {
@@ -137,9 +137,9 @@ impl<'a> Storm<'a> {
             }
             if self.moved.elapsed() > STUCK {
                 bail!(
-                    "nothing was learned from for {} s, after {} flights; the last that was said:\n{}",
+                    "nothing was learned from for {} s, after {} episodes; the last that was said:\n{}",
                     STUCK.as_secs(),
-                    self.flights,
+                    self.episodes,
                     self.stage.last_words()
                 );
             }
@@ -237,18 +237,18 @@ impl<'a> Storm<'a> {
         self.strike(Role::Crew, choice, signal)
     }
 
-    fn watch_flights(&mut self) {
-        let flights = self.count.now();
-        if flights != self.flights {
-            self.flights = flights;
-            self.highest = self.highest.max(flights);
+    fn watch_episodes(&mut self) {
+        let episodes = self.count.now();
+        if episodes != self.episodes {
+            self.episodes = episodes;
+            self.highest = self.highest.max(episodes);
             self.moved = Instant::now();
         }
     }
 
     /// Learned from at present.
-    pub(crate) fn flights(&self) -> u64 {
-        self.flights
+    pub(crate) fn episodes(&self) -> u64 {
+        self.episodes
     }
 
     /// Learned from at any time.
@@ -256,7 +256,7 @@ impl<'a> Storm<'a> {
         self.highest
     }
 
-    /// Since the number of flights has changed.
+    /// Since the number of episodes has changed.
     pub(crate) fn since_moved(&self) -> Duration {
         self.moved.elapsed()
     }
@@ -299,7 +299,7 @@ impl<'a> Storm<'a> {
     /// When it cannot be written.
     pub(crate) fn note(&mut self, event: &str, details: &impl serde::Serialize) -> Result<()> {
         self.recorder
-            .note(self.flights, event, details)
+            .note(self.episodes, event, details)
             .context("cannot write the recording")
     }
 }

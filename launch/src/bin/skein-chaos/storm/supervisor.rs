@@ -127,7 +127,7 @@ impl Storm<'_> {
 
     fn watch_resumption(&mut self, mut child: Child, give_up_at: Instant, actors: u32) -> Result<Supervisor> {
         let Some(status) = child.try_wait()? else {
-            // It starts actors once its learner has reported: then nothing of the former life is in its way any more.
+            // It starts actors once its learner has reported: then nothing of the former incarnation is in its way any more.
             let accepted = self
                 .stage
                 .processes()
@@ -169,8 +169,8 @@ impl Storm<'_> {
         match (status.code(), told) {
             (Some(0), _) | (Some(INTERRUPTED), Told::ToStop) => Ok(()),
             _ => bail!(
-                "the run ended with {status} after {} flights; the last that was said:\n{}",
-                self.flights,
+                "the run ended with {status} after {} episodes; the last that was said:\n{}",
+                self.episodes,
                 self.stage.last_words()
             ),
         }

@@ -19,7 +19,7 @@ fn a_dead_actor_is_started_again() {
 }
 
 /// A learner that lives as `first` once, then runs to its end.
-fn first_life(first: &str) -> String {
+fn first_incarnation(first: &str) -> String {
     format!("report 1; if mkdir $dir/died 2>/dev/null; then {first}; fi; report 2; touch $dir/stop")
 }
 
@@ -36,8 +36,8 @@ fn a_learner_that_dies_is_started_again_and_its_actors_stay() {
             "the learner exited with status 4; it is started again at once",
         ),
     ] {
-        let stage = Stage::new(&first_life(&format!("sleep 0.1; {death}")), FAITHFUL_ACTOR);
-        fs::create_dir_all(stage.plan.run.checkpoints().join("flight-40")).unwrap();
+        let stage = Stage::new(&first_incarnation(&format!("sleep 0.1; {death}")), FAITHFUL_ACTOR);
+        fs::create_dir_all(stage.plan.run.checkpoints().join("episode-40")).unwrap();
         fs::create_dir(stage.plan.run.checkpoints().join(".writing")).unwrap();
         let (result, seen) = stage.run(never);
         assert_eq!(result.unwrap(), Ended::Finished);
@@ -89,7 +89,7 @@ fn an_actor_that_is_killed_before_it_is_of_use_is_always_started_again() {
 #[test]
 fn a_frozen_learner_is_killed_and_started_again() {
     for first in ["kill -STOP $$", "trap '' TERM; while :; do sleep 0.02; done"] {
-        let mut stage = Stage::new(&first_life(first), FAITHFUL_ACTOR);
+        let mut stage = Stage::new(&first_incarnation(first), FAITHFUL_ACTOR);
         stage.plan.deadlines.learner_silence = Duration::from_millis(300);
         let (result, seen) = stage.run(never);
         assert_eq!(result.unwrap(), Ended::Finished);
@@ -114,7 +114,7 @@ fn a_learner_that_hangs_before_its_first_report_is_started_again() {
 
 #[test]
 fn actors_that_left_for_want_of_a_learner_come_back_with_it() {
-    // The first life of the actors ends with that of the learner, which takes a while to come back.
+    // The first incarnation of the actors ends with that of the learner, which takes a while to come back.
     let actor = format!(
         "while [ ! -e $dir/died ]; do sleep 0.02; done; if mkdir $dir/left-$id 2>/dev/null; then exit 3; fi; touch $dir/back-$id; {FAITHFUL_ACTOR}"
     );

@@ -1,6 +1,6 @@
-//! `flights.csv`: one row per committed training flight, in flight order.
+//! `episodes.csv`: one row per committed training episode, in episode order.
 //!
-//! Row n is flight n, whoever flew it and whenever. A run that is resumed cuts the file back to the flights its checkpoint knows of, so what is in the
+//! Row n is episode n, whoever flew it and whenever. A run that is resumed cuts the file back to the episodes its checkpoint knows of, so what is in the
 //! file never says more than what was learned from, and never twice.
 
 use std::fs::{File, OpenOptions};
@@ -12,16 +12,16 @@ use skein_protocol::transition::Outcome;
 use xxhash_rust::xxh3::Xxh3Default;
 
 use crate::disk::{Disk, Patient};
-use crate::flight::CommittedFlight;
+use crate::episode::CommittedEpisode;
 
-/// A row of `flights.csv`; the fields are its columns.
+/// A row of `episodes.csv`; the fields are its columns.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct FlightRow {
-    /// Number of the flight, from 0 without a gap.
-    pub flight: u64,
+pub struct EpisodeRow {
+    /// Number of the episode, from 0 without a gap.
+    pub episode: u64,
     /// Epoch it belongs to.
     pub epoch: u64,
-    /// Snapshot it was flown with; in legs, the first of them.
+    /// Snapshot it was flown with; in segments, the first of them.
     pub policy_version: u64,
     /// Who flew it: the one column that may differ between two runs of one configuration.
     pub actor: u32,
@@ -40,7 +40,7 @@ pub struct FlightRow {
 
 /// The columns in order: what is continued has the same.
 const COLUMNS: [&str; 9] = [
-    "flight",
+    "episode",
     "epoch",
     "policy_version",
     "actor",
@@ -51,33 +51,33 @@ const COLUMNS: [&str; 9] = [
     "outcome",
 ];
 
-/// Of a flight that has ended.
-impl From<&CommittedFlight> for FlightRow {
-    fn from(flight: &CommittedFlight) -> Self {
+/// Of an episode that has ended.
+impl From<&CommittedEpisode> for EpisodeRow {
+    fn from(episode: &CommittedEpisode) -> Self {
         Self {
-            flight: flight.flight.0,
-            epoch: flight.epoch.0,
-            policy_version: flight.policy_version.0,
-            actor: flight.actor.0,
-            level: flight.level,
-            steps: flight.steps(),
-            walls_passed: flight.walls_passed,
-            total_reward: flight.total_reward(),
-            outcome: flight.ending(),
+            episode: episode.episode.0,
+            epoch: episode.epoch.0,
+            policy_version: episode.policy_version.0,
+            actor: episode.actor.0,
+            level: episode.level,
+            steps: episode.steps(),
+            walls_passed: episode.walls_passed,
+            total_reward: episode.total_reward(),
+            outcome: episode.ending(),
         }
     }
 }
 
-/// The first bytes of `flights.csv`, by which it is recognised as what was written; part of a checkpoint.
+/// The first bytes of `episodes.csv`, by which it is recognised as what was written; part of a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct FlightsExtent {
+pub struct EpisodesExtent {
     /// How many.
     pub bytes: u64,
     /// Their checksum.
     pub xxh3: u64,
 }
 
-impl FlightsExtent {
+impl EpisodesExtent {
     /// Of a file that is empty, or not there yet.
     pub fn empty() -> Self {
         Self {
@@ -86,11 +86,11 @@ impl FlightsExtent {
         }
     }
 
-    /// Checks that the file at `path` begins with them; nothing is written. `flights` is how many rows they hold.
+    /// Checks that the file at `path` begins with them; nothing is written. `episodes` is how many rows they hold.
     ///
     /// # Errors
-    /// [`FlightsError::Damaged`]; [`FlightsError::Io`] when it cannot be read.
-    pub fn check(&self, path: &Path, flights: u64) -> Result<(), FlightsError> {
+    /// [`EpisodesError::Damaged`]; [`EpisodesError::Io`] when it cannot be read.
+    pub fn check(&self, path: &Path, episodes: u64) -> Result<(), EpisodesError> {
         if self.bytes == 0 {
             return Ok(());
         }
@@ -105,15 +105,15 @@ impl FlightsExtent {
             Ok(_) => Ok(()),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Err("is missing".to_owned()),
             Err(source) => {
-                return Err(FlightsError::Io {
+                return Err(EpisodesError::Io {
                     path: path.to_owned(),
                     source,
                 });
             }
         };
-        found.map_err(|problem| FlightsError::Damaged {
+        found.map_err(|problem| EpisodesError::Damaged {
             path: path.to_owned(),
-            flights,
+            episodes,
             problem,
         })
     }
@@ -134,8 +134,8 @@ struct Summed<W> {
 }
 
 impl<W> Summed<W> {
-    fn extent(&self) -> FlightsExtent {
-        FlightsExtent {
+    fn extent(&self) -> EpisodesExtent {
+        EpisodesExtent {
             bytes: self.bytes,
             xxh3: self.sum.digest(),
         }
@@ -161,16 +161,16 @@ impl<W> std::fmt::Debug for Summed<W> {
     }
 }
 
-/// Writes `flights.csv`.
+/// Writes `episodes.csv`.
 #[derive(Debug)]
-pub struct FlightsCsv {
+pub struct EpisodesCsv {
     path: PathBuf,
     writer: csv::Writer<Summed<Patient<File>>>,
 }
 
-/// Why `flights.csv` cannot be written or continued.
+/// Why `episodes.csv` cannot be written or continued.
 #[derive(Debug, thiserror::Error)]
-pub enum FlightsError {
+pub enum EpisodesError {
     /// The file system refuses.
     #[error("cannot write {}: {source}", path.display())]
     Io {
@@ -191,35 +191,35 @@ pub enum FlightsError {
     },
     /// It is not what was written before the checkpoint.
     #[error(
-        "{} {problem}, but the checkpoint of flight {flights} counts on it; put the file back", path.display()
+        "{} {problem}, but the checkpoint of episode {episodes} counts on it; put the file back", path.display()
     )]
     Damaged {
         /// The file.
         path: PathBuf,
-        /// Flights committed at the checkpoint.
-        flights: u64,
+        /// Episodes committed at the checkpoint.
+        episodes: u64,
         /// What is wrong with it.
         problem: String,
     },
-    /// The rows are not those of the flights that the checkpoint knows of.
-    #[error("{} cannot be continued after {expected} flights: {problem}", path.display())]
+    /// The rows are not those of the episodes that the checkpoint knows of.
+    #[error("{} cannot be continued after {expected} episodes: {problem}", path.display())]
     Content {
         /// The file.
         path: PathBuf,
-        /// Flights it should hold.
+        /// Episodes it should hold.
         expected: u64,
         /// What it holds instead.
         problem: String,
     },
 }
 
-impl FlightsCsv {
+impl EpisodesCsv {
     /// Starts an empty file; one that is there is replaced.
     ///
     /// # Errors
-    /// [`FlightsError::Io`].
-    pub fn create(path: &Path, disk: &Disk) -> Result<Self, FlightsError> {
-        let file = File::create(path).map_err(|source| FlightsError::Io {
+    /// [`EpisodesError::Io`].
+    pub fn create(path: &Path, disk: &Disk) -> Result<Self, EpisodesError> {
+        let file = File::create(path).map_err(|source| EpisodesError::Io {
             path: path.to_owned(),
             source,
         })?;
@@ -233,20 +233,20 @@ impl FlightsCsv {
         })
     }
 
-    /// Continues after the first `flights` rows; later rows, of flights whose learning was lost, are cut off.
+    /// Continues after the first `episodes` rows; later rows, of episodes whose learning was lost, are cut off.
     ///
     /// # Errors
-    /// [`FlightsError`] when the file does not hold flights 0 to `flights` - 1 in order.
-    pub fn resume(path: &Path, flights: u64, disk: &Disk) -> Result<Self, FlightsError> {
-        if flights == 0 {
+    /// [`EpisodesError`] when the file does not hold episodes 0 to `episodes` - 1 in order.
+    pub fn resume(path: &Path, episodes: u64, disk: &Disk) -> Result<Self, EpisodesError> {
+        if episodes == 0 {
             return Self::create(path, disk);
         }
-        let io = |source| FlightsError::Io {
+        let io = |source| EpisodesError::Io {
             path: path.to_owned(),
             source,
         };
         let mut file = OpenOptions::new().read(true).write(true).open(path).map_err(io)?;
-        let end = end_of_rows(path, &file, flights)?;
+        let end = end_of_rows(path, &file, episodes)?;
         file.set_len(end).map_err(io)?;
         end_line(&mut file).map_err(io)?;
         file.rewind().map_err(io)?;
@@ -261,28 +261,28 @@ impl FlightsCsv {
         })
     }
 
-    /// Appends a row; it reaches the file with [`FlightsCsv::flush`].
+    /// Appends a row; it reaches the file with [`EpisodesCsv::flush`].
     ///
     /// # Errors
-    /// [`FlightsError::Row`].
-    pub fn write(&mut self, row: &FlightRow) -> Result<(), FlightsError> {
-        self.writer.serialize(row).map_err(|source| FlightsError::Row {
+    /// [`EpisodesError::Row`].
+    pub fn write(&mut self, row: &EpisodeRow) -> Result<(), EpisodesError> {
+        self.writer.serialize(row).map_err(|source| EpisodesError::Row {
             path: self.path.clone(),
             source,
         })
     }
 
-    /// What is in the file: all that was written before it was last [flushed](FlightsCsv::flush), and perhaps some of what was written since.
-    pub fn extent(&self) -> FlightsExtent {
+    /// What is in the file: all that was written before it was last [flushed](EpisodesCsv::flush), and perhaps some of what was written since.
+    pub fn extent(&self) -> EpisodesExtent {
         self.writer.get_ref().extent()
     }
 
     /// Hands everything written to the operating system.
     ///
     /// # Errors
-    /// [`FlightsError::Io`].
-    pub fn flush(&mut self) -> Result<(), FlightsError> {
-        self.writer.flush().map_err(|source| FlightsError::Io {
+    /// [`EpisodesError::Io`].
+    pub fn flush(&mut self) -> Result<(), EpisodesError> {
+        self.writer.flush().map_err(|source| EpisodesError::Io {
             path: self.path.clone(),
             source,
         })
@@ -300,14 +300,14 @@ fn end_line(file: &mut File) -> io::Result<()> {
     Ok(())
 }
 
-/// Byte after the first `flights` rows, which must be flights 0, 1, 2, …
-fn end_of_rows(path: &Path, file: &File, flights: u64) -> Result<u64, FlightsError> {
-    let content = |problem| FlightsError::Content {
+/// Byte after the first `episodes` rows, which must be episodes 0, 1, 2, …
+fn end_of_rows(path: &Path, file: &File, episodes: u64) -> Result<u64, EpisodesError> {
+    let content = |problem| EpisodesError::Content {
         path: path.to_owned(),
-        expected: flights,
+        expected: episodes,
         problem,
     };
-    let row_error = |source| FlightsError::Row {
+    let row_error = |source| EpisodesError::Row {
         path: path.to_owned(),
         source,
     };
@@ -318,13 +318,13 @@ fn end_of_rows(path: &Path, file: &File, flights: u64) -> Result<u64, FlightsErr
         return Err(content(format!("its columns are {headers:?}")));
     }
     let mut record = csv::StringRecord::new();
-    for expected in 0..flights {
+    for expected in 0..episodes {
         if !reader.read_record(&mut record).map_err(row_error)? {
             return Err(content(format!("it ends after {expected}")));
         }
-        let row: FlightRow = record.deserialize(Some(&headers)).map_err(row_error)?;
-        if row.flight != expected {
-            return Err(content(format!("its row {expected} is flight {}", row.flight)));
+        let row: EpisodeRow = record.deserialize(Some(&headers)).map_err(row_error)?;
+        if row.episode != expected {
+            return Err(content(format!("its row {expected} is episode {}", row.episode)));
         }
     }
     Ok(reader.position().byte())
@@ -337,29 +337,29 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::flight::samples;
+    use crate::episode::samples;
 
     fn disk() -> Disk {
         Disk::new(std::sync::Arc::default())
     }
 
-    fn row(number: u64) -> FlightRow {
-        FlightRow::from(&samples::flight(number, 3, Outcome::ReachedEnd))
+    fn row(number: u64) -> EpisodeRow {
+        EpisodeRow::from(&samples::episode(number, 3, Outcome::ReachedEnd))
     }
 
-    fn write(csv: &mut FlightsCsv, flights: std::ops::Range<u64>) {
-        flights.for_each(|flight| csv.write(&row(flight)).unwrap());
+    fn write(csv: &mut EpisodesCsv, episodes: std::ops::Range<u64>) {
+        episodes.for_each(|episode| csv.write(&row(episode)).unwrap());
         csv.flush().unwrap();
     }
 
     #[test]
     fn columns_are_those_documented() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("flights.csv");
-        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 0..1);
+        let path = directory.path().join("episodes.csv");
+        write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..1);
         assert_eq!(
             fs::read_to_string(&path).unwrap(),
-            "flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n0,0,0,0,1,3,0,0.03,reached_end\n"
+            "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n0,0,0,0,1,3,0,0.03,reached_end\n"
         );
     }
 
@@ -369,11 +369,11 @@ mod tests {
             let value = f32::from_bits(bits);
             prop_assume!(value.is_finite());
             let directory = tempfile::tempdir().unwrap();
-            let path = directory.path().join("flights.csv");
-            let mut csv = FlightsCsv::create(&path, &disk()).unwrap();
-            csv.write(&FlightRow { total_reward: value, ..row(0) }).unwrap();
+            let path = directory.path().join("episodes.csv");
+            let mut csv = EpisodesCsv::create(&path, &disk()).unwrap();
+            csv.write(&EpisodeRow { total_reward: value, ..row(0) }).unwrap();
             csv.flush().unwrap();
-            let read: FlightRow = csv::Reader::from_path(&path).unwrap().deserialize().next().unwrap().unwrap();
+            let read: EpisodeRow = csv::Reader::from_path(&path).unwrap().deserialize().next().unwrap().unwrap();
             prop_assert_eq!(read.total_reward.to_bits(), bits);
         }
     }
@@ -382,24 +382,24 @@ mod tests {
     fn a_file_that_lost_the_end_of_its_last_line_is_continued_on_the_next() {
         let directory = tempfile::tempdir().unwrap();
         let (whole, cut) = (directory.path().join("whole.csv"), directory.path().join("cut.csv"));
-        write(&mut FlightsCsv::create(&whole, &disk()).unwrap(), 0..5);
-        write(&mut FlightsCsv::create(&cut, &disk()).unwrap(), 0..4);
+        write(&mut EpisodesCsv::create(&whole, &disk()).unwrap(), 0..5);
+        write(&mut EpisodesCsv::create(&cut, &disk()).unwrap(), 0..4);
         let text = fs::read_to_string(&cut).unwrap();
         fs::write(&cut, text.trim_end()).unwrap();
-        write(&mut FlightsCsv::resume(&cut, 4, &disk()).unwrap(), 4..5);
+        write(&mut EpisodesCsv::resume(&cut, 4, &disk()).unwrap(), 4..5);
         assert_eq!(fs::read(&whole).unwrap(), fs::read(&cut).unwrap());
     }
 
     #[test]
     fn a_file_of_other_columns_is_not_continued() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("flights.csv");
-        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 0..4);
+        let path = directory.path().join("episodes.csv");
+        write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..4);
         let text = fs::read_to_string(&path).unwrap();
-        fs::write(&path, text.replacen("flight,epoch", "epoch,flight", 1)).unwrap();
-        let error = FlightsCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
+        fs::write(&path, text.replacen("episode,epoch", "epoch,episode", 1)).unwrap();
+        let error = EpisodesCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
         assert!(
-            error.contains("flights.csv") && error.contains("its columns are"),
+            error.contains("episodes.csv") && error.contains("its columns are"),
             "{error}"
         );
     }
@@ -408,11 +408,11 @@ mod tests {
     fn a_resumed_file_is_that_of_a_run_never_interrupted() {
         let directory = tempfile::tempdir().unwrap();
         let (whole, resumed) = (directory.path().join("whole.csv"), directory.path().join("resumed.csv"));
-        write(&mut FlightsCsv::create(&whole, &disk()).unwrap(), 0..30);
+        write(&mut EpisodesCsv::create(&whole, &disk()).unwrap(), 0..30);
         for checkpoint in [0, 1, 20] {
-            write(&mut FlightsCsv::create(&resumed, &disk()).unwrap(), 0..25);
+            write(&mut EpisodesCsv::create(&resumed, &disk()).unwrap(), 0..25);
             write(
-                &mut FlightsCsv::resume(&resumed, checkpoint, &disk()).unwrap(),
+                &mut EpisodesCsv::resume(&resumed, checkpoint, &disk()).unwrap(),
                 checkpoint..30,
             );
             assert_eq!(
@@ -426,35 +426,35 @@ mod tests {
     #[test]
     fn a_row_cut_short_behind_the_checkpoint_does_not_matter() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("flights.csv");
-        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 0..5);
+        let path = directory.path().join("episodes.csv");
+        write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..5);
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, &text[..text.len() - 7]).unwrap();
-        write(&mut FlightsCsv::resume(&path, 4, &disk()).unwrap(), 4..5);
+        write(&mut EpisodesCsv::resume(&path, 4, &disk()).unwrap(), 4..5);
         assert_eq!(fs::read_to_string(&path).unwrap(), text);
     }
 
     #[test]
     fn a_row_with_a_quote_that_would_swallow_the_next_is_refused() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("flights.csv");
-        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 0..2);
+        let path = directory.path().join("episodes.csv");
+        write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..2);
         let text = fs::read_to_string(&path).unwrap();
         let (whole, last) = text.trim_end().rsplit_once(',').unwrap();
         fs::write(&path, format!("{whole},\"{last}\n")).unwrap();
-        let refusal = FlightsCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
-        assert!(refusal.contains("flights.csv"), "{refusal}");
+        let refusal = EpisodesCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
+        assert!(refusal.contains("episodes.csv"), "{refusal}");
     }
 
     #[test]
     fn a_file_that_is_not_what_was_written_before_the_checkpoint_is_refused() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("flights.csv");
-        let mut csv = FlightsCsv::create(&path, &disk()).unwrap();
+        let path = directory.path().join("episodes.csv");
+        let mut csv = EpisodesCsv::create(&path, &disk()).unwrap();
         write(&mut csv, 0..3);
         drop(csv);
-        // Counted over two lives.
-        let mut csv = FlightsCsv::resume(&path, 2, &disk()).unwrap();
+        // Counted over two incarnations.
+        let mut csv = EpisodesCsv::resume(&path, 2, &disk()).unwrap();
         write(&mut csv, 2..5);
         let extent = csv.extent();
         write(&mut csv, 5..7);
@@ -482,17 +482,17 @@ mod tests {
     }
 
     #[test]
-    fn a_file_of_other_flights_is_not_continued() {
+    fn a_file_of_other_episodes_is_not_continued() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("flights.csv");
-        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 0..5);
-        let error = FlightsCsv::resume(&path, 6, &disk()).unwrap_err().to_string();
+        let path = directory.path().join("episodes.csv");
+        write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..5);
+        let error = EpisodesCsv::resume(&path, 6, &disk()).unwrap_err().to_string();
         assert!(
-            error.contains("flights.csv") && error.contains("ends after 5"),
+            error.contains("episodes.csv") && error.contains("ends after 5"),
             "{error}"
         );
-        write(&mut FlightsCsv::create(&path, &disk()).unwrap(), 3..9);
-        let error = FlightsCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
-        assert!(error.contains("row 0 is flight 3"), "{error}");
+        write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 3..9);
+        let error = EpisodesCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
+        assert!(error.contains("row 0 is episode 3"), "{error}");
     }
 }

@@ -5,55 +5,55 @@ use std::time::Instant;
 
 use proptest::prelude::*;
 
-use super::tests::{LIFE, RUN, attach, desk, feed, limits, order, records, tickets_for};
+use super::tests::{INCARNATION, RUN, attach, dispatcher, feed, limits, order, records, tickets_for};
 use super::*;
 
 #[test]
 fn an_actor_is_woken_to_a_ticket_unless_it_shows_that_it_flies() {
     let now = Instant::now();
-    let (mut desk, tickets) = desk(now);
-    assert!(desk.take_wake(), "it had nothing to fly");
-    assert!(!desk.take_wake(), "once is enough");
+    let (mut dispatcher, tickets) = dispatcher(now);
+    assert!(dispatcher.take_wake(), "it had nothing to fly");
+    assert!(!dispatcher.take_wake(), "once is enough");
 
     // It flies 0, and finds 2 before it flies 1 or after.
-    feed(&mut desk, &records(&tickets[0], 0, LIFE), now);
-    let second = tickets_for(&desk.issue(now), 0, LIFE).remove(0);
-    assert!(!desk.take_wake(), "it flies");
+    feed(&mut dispatcher, &records(&tickets[0], 0, INCARNATION), now);
+    let second = tickets_for(&dispatcher.issue(now), 0, INCARNATION).remove(0);
+    assert!(!dispatcher.take_wake(), "it flies");
 
     // It may say this for want of 2, which was on its way.
-    attach(&mut desk, 0, LIFE, now);
-    assert!(desk.take_wake());
-    attach(&mut desk, 0, LIFE, now);
+    attach(&mut dispatcher, 0, INCARNATION, now);
+    assert!(dispatcher.take_wake());
+    attach(&mut dispatcher, 0, INCARNATION, now);
     assert!(
-        !desk.take_wake(),
+        !dispatcher.take_wake(),
         "nothing is on its way that was not when it was woken"
     );
 
     // Nothing that it was given before that word shows that it has heard the word's answer.
-    (3..6).for_each(|flight| desk.order(order(flight)));
-    feed(&mut desk, &records(&tickets[1], 0, LIFE), now);
-    let third = tickets_for(&desk.issue(now), 0, LIFE).remove(0);
-    assert!(desk.take_wake(), "it may wait");
-    feed(&mut desk, &records(&second, 0, LIFE), now);
-    let fourth = tickets_for(&desk.issue(now), 0, LIFE).remove(0);
-    assert!(desk.take_wake(), "it may wait");
-    feed(&mut desk, &records(&third, 0, LIFE), now);
-    assert_eq!(tickets_for(&desk.issue(now), 0, LIFE).len(), 1);
-    assert!(!desk.take_wake(), "it flies");
-    feed(&mut desk, &records(&fourth, 0, LIFE), now);
+    (3..6).for_each(|episode| dispatcher.order(order(episode)));
+    feed(&mut dispatcher, &records(&tickets[1], 0, INCARNATION), now);
+    let third = tickets_for(&dispatcher.issue(now), 0, INCARNATION).remove(0);
+    assert!(dispatcher.take_wake(), "it may wait");
+    feed(&mut dispatcher, &records(&second, 0, INCARNATION), now);
+    let fourth = tickets_for(&dispatcher.issue(now), 0, INCARNATION).remove(0);
+    assert!(dispatcher.take_wake(), "it may wait");
+    feed(&mut dispatcher, &records(&third, 0, INCARNATION), now);
+    assert_eq!(tickets_for(&dispatcher.issue(now), 0, INCARNATION).len(), 1);
+    assert!(!dispatcher.take_wake(), "it flies");
+    feed(&mut dispatcher, &records(&fourth, 0, INCARNATION), now);
 }
 
 #[test]
 fn an_actor_that_is_asked_to_join_anew_is_woken() {
     let now = Instant::now();
-    let (mut desk, _) = desk(now);
-    desk.take_wake();
+    let (mut dispatcher, _) = dispatcher(now);
+    dispatcher.take_wake();
     let late = now + Duration::from_secs(61);
-    attach(&mut desk, 0, LIFE, late);
-    desk.take_wake();
-    desk.on_time(late);
-    desk.issue(late);
-    assert!(desk.take_wake());
+    attach(&mut dispatcher, 0, INCARNATION, late);
+    dispatcher.take_wake();
+    dispatcher.on_time(late);
+    dispatcher.issue(late);
+    assert!(dispatcher.take_wake());
 }
 
 /// Where an actor is between two looks.
@@ -65,7 +65,7 @@ enum Stage {
     Waits,
 }
 
-/// An actor that looks for tickets before each flight, and speaks and waits when there are none.
+/// An actor that looks for tickets before each episode, and speaks and waits when there are none.
 #[derive(Default)]
 struct Actor {
     stage: Stage,
@@ -78,19 +78,19 @@ struct Actor {
 }
 
 struct World {
-    desk: Desk,
+    dispatcher: Dispatcher,
     actors: Vec<Actor>,
     now: Instant,
 }
 
 impl World {
-    fn new(flights: u64) -> Self {
-        let mut desk = Desk::new(RUN, &limits(), 32);
-        (0..flights).for_each(|flight| desk.order(order(flight)));
+    fn new(episodes: u64) -> Self {
+        let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
+        (0..episodes).for_each(|episode| dispatcher.order(order(episode)));
         let mut actors = vec![Actor::default(), Actor::default(), Actor::default()];
         actors.iter_mut().for_each(|actor| actor.words = 1);
         Self {
-            desk,
+            dispatcher,
             actors,
             now: Instant::now(),
         }
@@ -102,7 +102,7 @@ impl World {
         actor.stage = match actor.stage {
             Stage::Looks => match actor.told.pop_front() {
                 Some(ticket) => {
-                    actor.sent.extend(records(&ticket, id as u32, LIFE));
+                    actor.sent.extend(records(&ticket, id as u32, INCARNATION));
                     Stage::Looks
                 }
                 None => Stage::FoundNothing,
@@ -122,7 +122,7 @@ impl World {
         let mut has_heard = false;
         for (id, actor) in self.actors.iter_mut().enumerate() {
             for _ in 0..std::mem::take(&mut actor.words) {
-                attach(&mut self.desk, id as u32, LIFE, self.now);
+                attach(&mut self.dispatcher, id as u32, INCARNATION, self.now);
                 has_heard = true;
             }
         }
@@ -131,22 +131,22 @@ impl World {
             let taken: Vec<_> = waiting.drain(..most.min(waiting.len())).collect();
             has_heard |= !taken.is_empty();
             for record in taken {
-                if !feed(&mut self.desk, &[record], self.now).is_empty() {
+                if !feed(&mut self.dispatcher, &[record], self.now).is_empty() {
                     self.hand_out();
                 }
             }
         }
         self.hand_out();
-        if self.desk.take_wake() {
+        if self.dispatcher.take_wake() {
             self.actors.iter_mut().for_each(|actor| actor.is_called = true);
         }
         has_heard
     }
 
     fn hand_out(&mut self) {
-        let messages = self.desk.issue(self.now);
+        let messages = self.dispatcher.issue(self.now);
         for (id, actor) in self.actors.iter_mut().enumerate() {
-            actor.told.extend(tickets_for(&messages, id as u32, LIFE));
+            actor.told.extend(tickets_for(&messages, id as u32, INCARNATION));
         }
     }
 }
@@ -169,6 +169,6 @@ proptest! {
                 break;
             }
         }
-        prop_assert_eq!(world.desk.open_orders(), 0);
+        prop_assert_eq!(world.dispatcher.open_orders(), 0);
     }
 }

@@ -1,7 +1,7 @@
-//! The receiving thread: owns the transport's ports, feeds the desk, delivers flights in the order they were ordered.
+//! The receiving thread: owns the transport's ports, feeds the dispatcher, delivers episodes in the order they were ordered.
 //!
-//! The training thread speaks to it through [`Reception`]: it orders batches of flights, publishes snapshots, and takes flights out of a [`Batch`] one by
-//! one. While the training thread updates the networks, records are taken in, tickets handed out and signs of life given here.
+//! The training thread speaks to it through [`EpisodeReceiver`]: it orders batches of episodes, publishes snapshots, and takes episodes out of a [`Batch`] one by
+//! one. While the training thread updates the networks, records are taken in, tickets handed out and heartbeats given here.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
@@ -12,18 +12,18 @@ use std::time::{Duration, Instant};
 use skein_protocol::config::Config;
 use skein_protocol::failure::with_causes;
 use skein_protocol::ids::Epoch;
-use skein_protocol::run::{Life, RunIdentity};
+use skein_protocol::run::{LearnerIncarnation, RunIdentity};
 use skein_protocol::services::{LearnerPorts, LearnerWaker};
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::Times;
 use skein_protocol::ticket::Ticket;
 
 use super::assembly::Keep;
-use super::desk::{Desk, HopelessFlight};
+use super::dispatcher::{Dispatcher, HopelessEpisode};
 use super::faults::Faults;
 use super::server::Server;
 use super::situation::Situation;
-use crate::flight::CommittedFlight;
+use crate::episode::CommittedEpisode;
 
 /// How long the services may take to be opened.
 const OPENING_PATIENCE: Duration = Duration::from_secs(30);
@@ -34,7 +34,7 @@ const STOP_CHECK: Duration = Duration::from_millis(100);
 
 /// The training thread's end.
 #[derive(Debug)]
-pub struct Reception {
+pub struct EpisodeReceiver {
     commands: Sender<Command>,
     waker: LearnerWaker,
     thread: Option<JoinHandle<()>>,
@@ -51,32 +51,32 @@ pub struct Shared {
     times: RwLock<Times>,
     situation: RwLock<Option<(Instant, Situation)>>,
     /// Why the receiving thread ended before it was told to.
-    failure: RwLock<Option<ReceptionError>>,
+    failure: RwLock<Option<ReceiverError>>,
 }
 
-/// Flights ordered together, to be taken out in order.
+/// Episodes ordered together, to be taken out in order.
 #[derive(Debug)]
 pub struct Batch {
-    flights: Receiver<CommittedFlight>,
+    episodes: Receiver<CommittedEpisode>,
     remaining: usize,
     shared: Arc<Shared>,
 }
 
-/// Why no flight comes.
+/// Why no episode comes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum ReceptionError {
+pub enum ReceiverError {
     /// The run was told to stop.
     #[error("told to stop")]
     Stopped,
-    /// A flight cannot be flown, by whomever and however often.
+    /// An episode cannot be flown, by whomever and however often.
     #[error(transparent)]
-    Hopeless(#[from] HopelessFlight),
-    /// The transport does not work any more. Nothing that was computed is at fault: a new life of the learner has a new transport.
+    Hopeless(#[from] HopelessEpisode),
+    /// The transport does not work any more. Nothing that was computed is at fault: a new incarnation of the learner has a new transport.
     #[error("the transport failed: {0}")]
     Transport(String),
 }
 
-impl ReceptionError {
+impl ReceiverError {
     fn transport(error: &(dyn std::error::Error + 'static)) -> Self {
         Self::Transport(with_causes(error))
     }
@@ -91,30 +91,44 @@ pub(super) enum Command {
         epoch: Epoch,
         keep: Keep,
         tickets: Vec<Ticket>,
-        deliver: Sender<CommittedFlight>,
+        deliver: Sender<CommittedEpisode>,
     },
     Finish,
 }
 
-impl Reception {
-    /// Starts the receiving thread and returns once actors can attach to this `life` of the learner.
+impl EpisodeReceiver {
+    /// Starts the receiving thread and returns once actors can attach to this `incarnation` of the learner.
     ///
     /// # Errors
-    /// [`ReceptionError::Transport`] when the services cannot be opened.
-    pub fn start(identity: &RunIdentity, life: Life, config: &Config) -> Result<Self, ReceptionError> {
+    /// [`ReceiverError::Transport`] when the services cannot be opened.
+    pub fn start(
+        identity: &RunIdentity,
+        incarnation: LearnerIncarnation,
+        config: &Config,
+    ) -> Result<Self, ReceiverError> {
         let (commands, inbox) = mpsc::channel();
         let (ready, is_ready) = mpsc::channel();
         let shared = Arc::new(Shared::default());
         let (thread_identity, thread_config, thread_shared) = (identity.clone(), config.clone(), shared.clone());
         let thread = thread::Builder::new()
-            .name("reception".to_owned())
-            .spawn(move || serve(&thread_identity, life, &thread_config, &inbox, &thread_shared, &ready))
-            .map_err(|error| ReceptionError::transport(&error))?;
+            .name("receiver".to_owned())
+            .spawn(move || {
+                serve(
+                    &thread_identity,
+                    incarnation,
+                    &thread_config,
+                    &inbox,
+                    &thread_shared,
+                    &ready,
+                )
+            })
+            .map_err(|error| ReceiverError::transport(&error))?;
         match is_ready.recv_timeout(OPENING_PATIENCE) {
             Ok(opened) => opened?,
-            Err(error) => return Err(ReceptionError::transport(&error)),
+            Err(error) => return Err(ReceiverError::transport(&error)),
         }
-        let waker = LearnerWaker::open(identity, life, config).map_err(|error| ReceptionError::transport(&error))?;
+        let waker =
+            LearnerWaker::open(identity, incarnation, config).map_err(|error| ReceiverError::transport(&error))?;
         Ok(Self {
             commands,
             waker,
@@ -132,17 +146,17 @@ impl Reception {
     /// Publishes `snapshot` to all actors, those still to come included.
     ///
     /// # Errors
-    /// [`ReceptionError`] when the receiving thread has ended.
-    pub fn publish(&self, snapshot: Snapshot) -> Result<(), ReceptionError> {
+    /// [`ReceiverError`] when the receiving thread has ended.
+    pub fn publish(&self, snapshot: Snapshot) -> Result<(), ReceiverError> {
         self.send(Command::Publish(snapshot))
     }
 
-    /// Orders flights; they are flown after those ordered before, and delivered in the order of `tickets`.
+    /// Orders episodes; they are flown after those ordered before, and delivered in the order of `tickets`.
     ///
     /// # Errors
-    /// [`ReceptionError`] when the receiving thread has ended.
-    pub fn fly(&mut self, epoch: Epoch, keep: Keep, tickets: Vec<Ticket>) -> Result<Batch, ReceptionError> {
-        let (deliver, flights) = mpsc::channel();
+    /// [`ReceiverError`] when the receiving thread has ended.
+    pub fn fly(&mut self, epoch: Epoch, keep: Keep, tickets: Vec<Ticket>) -> Result<Batch, ReceiverError> {
+        let (deliver, episodes) = mpsc::channel();
         let remaining = tickets.len();
         let batch = self.next_batch;
         self.next_batch += 1;
@@ -154,7 +168,7 @@ impl Reception {
             deliver,
         })?;
         Ok(Batch {
-            flights,
+            episodes,
             remaining,
             shared: self.shared.clone(),
         })
@@ -178,7 +192,7 @@ impl Reception {
         }
     }
 
-    fn send(&self, command: Command) -> Result<(), ReceptionError> {
+    fn send(&self, command: Command) -> Result<(), ReceiverError> {
         self.commands.send(command).map_err(|_| self.shared.failed())?;
         if let Err(error) = self.waker.wake() {
             // It looks by itself at every heartbeat.
@@ -204,7 +218,7 @@ impl Shared {
         *self.times.read().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Where the flights are, as of the receiving thread's last heartbeat, and how long ago that was; `None` before the first.
+    /// Where the episodes are, as of the receiving thread's last heartbeat, and how long ago that was; `None` before the first.
     pub fn situation(&self) -> Option<(Duration, Situation)> {
         let situation = self.situation.read().unwrap_or_else(PoisonError::into_inner);
         situation
@@ -213,24 +227,24 @@ impl Shared {
     }
 
     /// Why the receiving thread has ended. A panic leaves no word, and comes from a transport that is out of order: nothing else there may panic.
-    fn failed(&self) -> ReceptionError {
+    fn failed(&self) -> ReceiverError {
         let failure = self.failure.read().unwrap_or_else(PoisonError::into_inner);
         failure
             .clone()
-            .unwrap_or_else(|| ReceptionError::Transport("the receiving thread has ended".to_owned()))
+            .unwrap_or_else(|| ReceiverError::Transport("the receiving thread has ended".to_owned()))
     }
 
-    fn fail(&self, error: ReceptionError) {
+    fn fail(&self, error: ReceiverError) {
         tracing::error!(%error, "receiving thread failed");
         *self.failure.write().unwrap_or_else(PoisonError::into_inner) = Some(error);
     }
 
-    pub(super) fn update(&self, desk: &Desk) {
+    pub(super) fn update(&self, dispatcher: &Dispatcher) {
         let mut live = self.live_actors.write().unwrap_or_else(PoisonError::into_inner);
-        if !desk.actors().map(|actor| actor.0).eq(live.iter().copied()) {
-            *live = desk.actors().map(|actor| actor.0).collect();
+        if !dispatcher.actors().map(|actor| actor.0).eq(live.iter().copied()) {
+            *live = dispatcher.actors().map(|actor| actor.0).collect();
         }
-        *self.faults.write().unwrap_or_else(PoisonError::into_inner) = desk.faults();
+        *self.faults.write().unwrap_or_else(PoisonError::into_inner) = dispatcher.faults();
     }
 
     pub(super) fn update_times(&self, times: Times) {
@@ -243,18 +257,18 @@ impl Shared {
 }
 
 impl Batch {
-    /// Flights that were not taken out yet.
+    /// Episodes that were not taken out yet.
     pub fn remaining(&self) -> usize {
         self.remaining
     }
 
-    /// Waits for the next flight, in order; `None` after the last.
+    /// Waits for the next episode, in order; `None` after the last.
     ///
     /// # Errors
-    /// [`ReceptionError`] when `stop` is set or the receiving thread has ended.
-    pub fn next(&mut self, stop: &AtomicBool) -> Result<Option<CommittedFlight>, ReceptionError> {
+    /// [`ReceiverError`] when `stop` is set or the receiving thread has ended.
+    pub fn next(&mut self, stop: &AtomicBool) -> Result<Option<CommittedEpisode>, ReceiverError> {
         self.next_unless(|| match stop.load(Ordering::Relaxed) {
-            true => Err(ReceptionError::Stopped),
+            true => Err(ReceiverError::Stopped),
             false => Ok(()),
         })
     }
@@ -262,17 +276,17 @@ impl Batch {
     /// The same, until `look` has a reason not to wait any longer; it is asked ten times a second.
     ///
     /// # Errors
-    /// [`ReceptionError`] when the receiving thread has ended, or what `look` returns.
-    pub fn next_unless<E: From<ReceptionError>>(
+    /// [`ReceiverError`] when the receiving thread has ended, or what `look` returns.
+    pub fn next_unless<E: From<ReceiverError>>(
         &mut self,
         mut look: impl FnMut() -> Result<(), E>,
-    ) -> Result<Option<CommittedFlight>, E> {
+    ) -> Result<Option<CommittedEpisode>, E> {
         while self.remaining > 0 {
             look()?;
-            match self.flights.recv_timeout(STOP_CHECK) {
-                Ok(flight) => {
+            match self.episodes.recv_timeout(STOP_CHECK) {
+                Ok(episode) => {
                     self.remaining -= 1;
-                    return Ok(Some(flight));
+                    return Ok(Some(episode));
                 }
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return Err(self.shared.failed().into()),
@@ -285,17 +299,17 @@ impl Batch {
 /// The receiving thread.
 fn serve(
     identity: &RunIdentity,
-    life: Life,
+    incarnation: LearnerIncarnation,
     config: &Config,
     inbox: &Receiver<Command>,
     shared: &Shared,
-    ready: &Sender<Result<(), ReceptionError>>,
+    ready: &Sender<Result<(), ReceiverError>>,
 ) {
-    let ports = match LearnerPorts::open(identity, life, config) {
+    let ports = match LearnerPorts::open(identity, incarnation, config) {
         Ok(ports) => ports,
         Err(error) => {
             // The starter waits for exactly this word; if it is gone, nobody needs it.
-            let _ = ready.send(Err(ReceptionError::transport(&error)));
+            let _ = ready.send(Err(ReceiverError::transport(&error)));
             return;
         }
     };

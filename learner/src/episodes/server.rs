@@ -18,9 +18,9 @@ use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::{ControlRecord, Message};
 
-use super::desk::{Desk, HopelessFlight, Order, Place};
-use super::reception::{Command, ReceptionError, Shared};
-use crate::flight::CommittedFlight;
+use super::dispatcher::{Dispatcher, HopelessEpisode, Order, Place};
+use super::receiver::{Command, ReceiverError, Shared};
+use crate::episode::CommittedEpisode;
 
 /// How long every round may meet a failure before the transport is given up.
 pub(super) const TRANSPORT_PATIENCE: Duration = Duration::from_secs(10);
@@ -32,7 +32,7 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 /// The receiving thread's state.
 pub(super) struct Server {
     run: RunId,
-    desk: Desk,
+    dispatcher: Dispatcher,
     deliveries: BTreeMap<u64, Delivery>,
     ports: LearnerPorts,
     /// What is still to be sent, in this order.
@@ -45,12 +45,12 @@ pub(super) struct Server {
     timer: LapTimer,
 }
 
-/// Flights of one batch that wait for an earlier one.
+/// Episodes of one batch that wait for an earlier one.
 struct Delivery {
     next: usize,
     count: usize,
-    early: BTreeMap<usize, CommittedFlight>,
-    to: Sender<CommittedFlight>,
+    early: BTreeMap<usize, CommittedEpisode>,
+    to: Sender<CommittedEpisode>,
 }
 
 enum Outgoing {
@@ -65,7 +65,7 @@ enum Wish {
     Serve,
     /// That it sends the actors home.
     Finish,
-    /// It is gone without a word: it panicked. The actors stay, for the learner's next life needs them.
+    /// It is gone without a word: it panicked. The actors stay, for the learner's next incarnation needs them.
     Vanish,
 }
 
@@ -82,7 +82,7 @@ impl Server {
     pub(super) fn new(identity: &RunIdentity, config: &Config, ports: LearnerPorts) -> Self {
         Self {
             run: identity.run,
-            desk: Desk::new(identity.run, &config.transport, config.vae.latent),
+            dispatcher: Dispatcher::new(identity.run, &config.transport, config.vae.latent),
             deliveries: BTreeMap::new(),
             ports,
             outbox: VecDeque::new(),
@@ -97,8 +97,8 @@ impl Server {
     /// Serves until it is told to finish.
     ///
     /// # Errors
-    /// [`ReceptionError::Hopeless`] and [`ReceptionError::Transport`].
-    pub(super) fn run(&mut self, inbox: &Receiver<Command>, shared: &Shared) -> Result<(), ReceptionError> {
+    /// [`ReceiverError::Hopeless`] and [`ReceiverError::Transport`].
+    pub(super) fn run(&mut self, inbox: &Receiver<Command>, shared: &Shared) -> Result<(), ReceiverError> {
         loop {
             match self.take_commands(inbox) {
                 Wish::Serve => {}
@@ -112,15 +112,15 @@ impl Server {
             self.take_status(now, shared);
             self.timer.lap(Stage::HandOut, 0);
             let next = self.take_records(now)?;
-            self.desk.on_time(now);
+            self.dispatcher.on_time(now);
             self.hand_out(now);
-            self.give_sign_of_life(now, shared);
+            self.send_heartbeat(now, shared);
             self.send_out();
             self.wake_actors();
-            shared.update(&self.desk);
+            shared.update(&self.dispatcher);
             self.timer.lap(Stage::HandOut, 1);
             if let Some(error) = self.trouble.lasting(now) {
-                return Err(ReceptionError::Transport(error));
+                return Err(ReceiverError::Transport(error));
             }
             if next == Next::Wait {
                 self.wait();
@@ -148,7 +148,7 @@ impl Server {
                     };
                     self.deliveries.insert(batch, delivery);
                     for (index, ticket) in tickets.into_iter().enumerate() {
-                        self.desk.order(Order {
+                        self.dispatcher.order(Order {
                             ticket,
                             epoch,
                             keep,
@@ -170,11 +170,11 @@ impl Server {
             match record.read(self.run) {
                 Some(status) => {
                     anyone_empty_handed |= status.newest_policy.is_none();
-                    self.desk.on_status(&status, now);
+                    self.dispatcher.on_status(&status, now);
                 }
                 None => {
                     tracing::debug!(?record, "status record refused");
-                    self.desk.refuse_status();
+                    self.dispatcher.refuse_status();
                 }
             }
         }
@@ -189,11 +189,11 @@ impl Server {
     }
 
     fn tell_times(&self, shared: &Shared) {
-        shared.update_times(self.desk.actor_times().plus(self.timer.times()));
+        shared.update_times(self.dispatcher.actor_times().plus(self.timer.times()));
     }
 
     /// Takes records in.
-    fn take_records(&mut self, now: Instant) -> Result<Next, HopelessFlight> {
+    fn take_records(&mut self, now: Instant) -> Result<Next, HopelessEpisode> {
         let mut unbooked = 0;
         let mut next = Next::AtOnce;
         for _ in 0..RECORDS_AT_ONCE {
@@ -202,8 +202,8 @@ impl Server {
                 break;
             };
             unbooked += 1;
-            if let Some((place, flight)) = self.desk.on_record(&record, now)? {
-                self.deliver(place, flight);
+            if let Some((place, episode)) = self.dispatcher.on_record(&record, now)? {
+                self.deliver(place, episode);
                 self.timer.lap(Stage::Assemble, std::mem::take(&mut unbooked));
                 self.hand_out(now);
                 self.send_out();
@@ -215,16 +215,16 @@ impl Server {
     }
 
     /// Passes on what is next in its batch, and keeps what is early.
-    fn deliver(&mut self, place: Place, flight: CommittedFlight) {
+    fn deliver(&mut self, place: Place, episode: CommittedEpisode) {
         let Some(delivery) = self.deliveries.get_mut(&place.batch) else {
             return;
         };
-        delivery.early.insert(place.index, flight);
-        while let Some(flight) = delivery.early.remove(&delivery.next) {
+        delivery.early.insert(place.index, episode);
+        while let Some(episode) = delivery.early.remove(&delivery.next) {
             delivery.next += 1;
-            pass(FaultPoint::LearnerFlightCommitted);
+            pass(FaultPoint::LearnerEpisodeCommitted);
             // A training thread that no longer waits has been told to stop.
-            let _ = delivery.to.send(flight);
+            let _ = delivery.to.send(episode);
         }
         if delivery.next == delivery.count {
             self.deliveries.remove(&place.batch);
@@ -233,7 +233,7 @@ impl Server {
 
     fn hand_out(&mut self, now: Instant) {
         self.outbox
-            .extend(self.desk.issue(now).into_iter().map(Outgoing::Message));
+            .extend(self.dispatcher.issue(now).into_iter().map(Outgoing::Message));
     }
 
     /// Sends what is to be sent, as far as that works.
@@ -253,20 +253,20 @@ impl Server {
 
     /// Wakes the actors to what was sent in this round, if one of them may wait.
     fn wake_actors(&mut self) {
-        self.is_wake_due |= self.desk.take_wake();
+        self.is_wake_due |= self.dispatcher.take_wake();
         // What could not be sent yet is nothing to wake anybody for.
         if self.is_wake_due && self.outbox.is_empty() {
             self.is_wake_due = self.trouble.unless(self.ports.wake_actors()).is_none();
         }
     }
 
-    fn give_sign_of_life(&mut self, now: Instant, shared: &Shared) {
+    fn send_heartbeat(&mut self, now: Instant, shared: &Shared) {
         let last = self.last_heartbeat;
         if last.is_some_and(|last| now.duration_since(last) < self.heartbeat) {
             return;
         }
         self.last_heartbeat = Some(now);
-        shared.update_situation(self.desk.situation(now), now);
+        shared.update_situation(self.dispatcher.situation(now), now);
         self.tell_times(shared);
         self.trouble.unless(self.ports.maintain());
         let heartbeat = ControlRecord::heartbeat(self.run);

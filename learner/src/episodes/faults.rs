@@ -1,4 +1,4 @@
-//! What went wrong on the way from ticket to committed flight and was made good, counted by reason.
+//! What went wrong on the way from ticket to committed episode and was made good, counted by reason.
 
 use std::collections::BTreeMap;
 
@@ -38,11 +38,11 @@ reasons! {
         Hole => "has a hole", ReissuedHole,
         /// What came of it makes no sense, or the simulator broke down.
         Failed => "failed", ReissuedFailed,
-        /// It took longer than `transport.flight_deadline_secs`.
+        /// It took longer than `transport.episode_deadline_secs`.
         Late => "took too long", ReissuedLate,
-        /// Its actor gave no sign of life for `transport.actor_silence_secs`.
+        /// Its actor gave no heartbeat for `transport.actor_silence_secs`.
         Silent => "is silent", ReissuedSilent,
-        /// Its actor began another life.
+        /// Its actor began another incarnation.
         Restarted => "restarted", ReissuedRestarted,
         /// Its actor left.
         Left => "left", ReissuedLeft,
@@ -52,21 +52,21 @@ reasons! {
 reasons! {
     /// Why a record was refused.
     Refusal {
-        /// It is of no actor that lives, or of a former life of one.
+        /// It is of no actor that lives, or of a former incarnation of one.
         Stranger => "of no living actor", RefusedStranger,
-        /// It belongs to no ticket that its actor holds: the rest of a flight that was given up.
+        /// It belongs to no ticket that its actor holds: the rest of an episode that was given up.
         NoTicket => "of no ticket", RefusedNoTicket,
         /// It does not follow the one before, or belongs to something else.
         OutOfOrder => "out of order", RefusedOutOfOrder,
-        /// A field has a value that no flight gives it.
+        /// A field has a value that no episode gives it.
         Impossible => "impossible value", RefusedImpossible,
         /// A number is infinite or none.
         NotFinite => "not finite", RefusedNotFinite,
-        /// A number, an action or the flight is larger than any can be.
+        /// A number, an action or the episode is larger than any can be.
         TooLarge => "too large", RefusedTooLarge,
         /// It contradicts itself or the records before it.
         Contradiction => "contradiction", RefusedContradiction,
-        /// A sign of life that makes no sense.
+        /// A heartbeat that makes no sense.
         Status => "status", RefusedStatus,
     }
 }

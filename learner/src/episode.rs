@@ -1,11 +1,11 @@
-//! A flight as the learner keeps it: committed, complete, in order.
+//! An episode as the learner keeps it: committed, complete, in order.
 //!
 //! The assembler builds it from streamed records; metrics and replay take it from there. It holds one observation more than it has steps: the closing
-//! observation is what the last step led to, and a flight that was cut off bootstraps from it. Of a flight in legs each leg is one of these, and what has been
+//! observation is what the last step led to, and an episode that was cut off bootstraps from it. Of an episode in segments each segment is one of these, and what has been
 //! flown of it so far is one as well.
 
 use skein_protocol::config::View;
-use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
+use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
 
@@ -36,22 +36,22 @@ const TRUTH_SCALE: [f32; GROUND_TRUTH] = [
     3.0, 3.0, 3.0,      // gust
 ];
 
-/// One whole flight of T steps, or T steps of one.
+/// One whole episode of T steps, or T steps of one.
 #[derive(Debug, Clone, PartialEq)]
-pub struct CommittedFlight {
+pub struct CommittedEpisode {
     /// Its number.
-    pub flight: FlightId,
+    pub episode: EpisodeId,
     /// The epoch it belongs to.
     pub epoch: Epoch,
-    /// The one snapshot all of it was flown with; of several legs, the first one's.
+    /// The one snapshot all of it was flown with; of several segments, the first one's.
     pub policy_version: PolicyVersion,
-    /// Who flew it, or the first leg of it; without influence on learning.
+    /// Who flew it, or the first segment of it; without influence on learning.
     pub actor: ActorId,
     /// The level (1 is the first) whose start it took off from.
     pub level: u8,
-    /// Steps of the flight that were flown before these; 0 if it is whole.
+    /// Steps of the episode that were flown before these; 0 if it is whole.
     pub first_step: usize,
-    /// The action before the first; zero at take-off.
+    /// The action before the first; zero at reset.
     pub action_before: [f32; ACTION],
     /// `[T + 1]`, the closing observation last.
     pub observations: Vec<StepObservation>,
@@ -63,24 +63,24 @@ pub struct CommittedFlight {
     pub reward_terms: Vec<[f32; 4]>,
     /// Whether a wall was crossed or the destination reached in the step; `[T]`.
     pub level_up: Vec<bool>,
-    /// How it ended; `None` of a leg whose flight goes on.
+    /// How it ended; `None` of a segment whose episode goes on.
     pub outcome: Option<Outcome>,
-    /// Walls passed since take-off; the end wall is none.
+    /// Walls passed since reset; the end wall is none.
     pub walls_passed: u8,
-    /// Walls of the course; 0 while the flight goes on.
+    /// Walls of the course; 0 while the episode goes on.
     pub course_walls: u8,
-    /// The wall that was hit, from 1 in flight order, if it collided with one and not with the corridor.
+    /// The wall that was hit, from 1 in episode order, if it collided with one and not with the corridor.
     pub hit_wall: Option<u8>,
     /// Depth images of all observations, `[T + 1, 72, 128]`, while the VAE is trained.
     pub depth: Option<Vec<u8>>,
 }
 
-/// Why a flight's parts do not belong together.
+/// Why an episode's parts do not belong together.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("flight {flight} of {steps} steps has {found} {what} where {expected} are expected")]
-pub struct FlightFault {
-    /// The flight.
-    pub flight: FlightId,
+#[error("episode {episode} of {steps} steps has {found} {what} where {expected} are expected")]
+pub struct EpisodeFault {
+    /// The episode.
+    pub episode: EpisodeId,
     /// Its steps, by the number of its actions.
     pub steps: usize,
     /// The part that is too short or too long.
@@ -91,7 +91,7 @@ pub struct FlightFault {
     pub expected: usize,
 }
 
-impl CommittedFlight {
+impl CommittedEpisode {
     /// Steps flown, T.
     pub fn steps(&self) -> usize {
         self.actions.len()
@@ -105,13 +105,13 @@ impl CommittedFlight {
     /// How it ended.
     ///
     /// # Panics
-    /// When it is a leg whose flight goes on.
+    /// When it is a segment whose episode goes on.
     pub fn ending(&self) -> Outcome {
         self.outcome
-            .expect("only of flights that have ended is asked how they did")
+            .expect("only of episodes that have ended is asked how they did")
     }
 
-    /// Whether it ended in a state without a future. A flight that reached its step limit did not, and its last step still bootstraps.
+    /// Whether it ended in a state without a future. An episode that reached its step limit did not, and its last step still bootstraps.
     pub fn terminated(&self) -> bool {
         match self.outcome {
             Some(Outcome::Collided | Outcome::ReachedEnd) => true,
@@ -133,19 +133,19 @@ impl CommittedFlight {
         }
     }
 
-    /// Appends the leg that was flown next, but for its images.
-    pub fn extend(&mut self, leg: &Self) {
+    /// Appends the segment that was flown next, but for its images.
+    pub fn extend(&mut self, segment: &Self) {
         // Its first observation is this one's last, seen by another encoder perhaps.
         self.observations.pop();
-        self.observations.extend_from_slice(&leg.observations);
-        self.actions.extend_from_slice(&leg.actions);
-        self.rewards.extend_from_slice(&leg.rewards);
-        self.reward_terms.extend_from_slice(&leg.reward_terms);
-        self.level_up.extend_from_slice(&leg.level_up);
-        self.outcome = leg.outcome;
-        self.walls_passed = leg.walls_passed;
-        self.course_walls = leg.course_walls;
-        self.hit_wall = leg.hit_wall;
+        self.observations.extend_from_slice(&segment.observations);
+        self.actions.extend_from_slice(&segment.actions);
+        self.rewards.extend_from_slice(&segment.rewards);
+        self.reward_terms.extend_from_slice(&segment.reward_terms);
+        self.level_up.extend_from_slice(&segment.level_up);
+        self.outcome = segment.outcome;
+        self.walls_passed = segment.walls_passed;
+        self.course_walls = segment.course_walls;
+        self.hit_wall = segment.hit_wall;
     }
 
     /// Writes the observation vector at the beginning of `step`, at most T, as the actor saw it.
@@ -182,8 +182,8 @@ impl CommittedFlight {
     /// Checks that every part has the length that the number of actions asks for, and that there is a step.
     ///
     /// # Errors
-    /// [`FlightFault`] names the first part that has not.
-    pub fn check(&self) -> Result<(), FlightFault> {
+    /// [`EpisodeFault`] names the first part that has not.
+    pub fn check(&self) -> Result<(), EpisodeFault> {
         let steps = self.steps();
         let images = self.depth.as_ref().map_or((steps + 1) * IMAGE_PIXELS, Vec::len);
         for (what, found, expected) in [
@@ -195,8 +195,8 @@ impl CommittedFlight {
             ("bytes of depth images", images, (steps + 1) * IMAGE_PIXELS),
         ] {
             if found != expected {
-                return Err(FlightFault {
-                    flight: self.flight,
+                return Err(EpisodeFault {
+                    episode: self.episode,
                     steps,
                     what,
                     found,
@@ -210,24 +210,24 @@ impl CommittedFlight {
 
 #[cfg(test)]
 pub(crate) mod samples {
-    //! Flights for tests, every number in them recognisable.
+    //! Episodes for tests, every number in them recognisable.
 
     use super::*;
 
-    /// A flight of `steps` steps whose every quantity is a function of (`flight`, step). Image t is filled with [`shade`]; its latent is [`code`] of that.
-    pub(crate) fn flight(flight: u64, steps: usize, outcome: Outcome) -> CommittedFlight {
-        let at = |step: usize| flight as f32 * 1000.0 + step as f32;
-        CommittedFlight {
-            flight: FlightId(flight),
-            epoch: Epoch(flight / 10),
-            policy_version: PolicyVersion(flight / 10),
+    /// An episode of `steps` steps whose every quantity is a function of (`episode`, step). Image t is filled with [`shade`]; its latent is [`code`] of that.
+    pub(crate) fn episode(episode: u64, steps: usize, outcome: Outcome) -> CommittedEpisode {
+        let at = |step: usize| episode as f32 * 1000.0 + step as f32;
+        CommittedEpisode {
+            episode: EpisodeId(episode),
+            epoch: Epoch(episode / 10),
+            policy_version: PolicyVersion(episode / 10),
             actor: ActorId(0),
             level: 1,
             first_step: 0,
             action_before: [0.0; ACTION],
             observations: (0..=steps)
                 .map(|step| StepObservation {
-                    latent: code(shade(flight, step)),
+                    latent: code(shade(episode, step)),
                     velocity_mps: [1.0, at(step) + 0.25, at(step) + 0.5],
                     position_m: [step as f32, 0.0, 3.5],
                     orientation: [0.0, 0.0, 0.0, 1.0],
@@ -247,19 +247,19 @@ pub(crate) mod samples {
     }
 
     /// The same with its images.
-    pub(crate) fn with_images(mut committed: CommittedFlight) -> CommittedFlight {
-        let flight = committed.flight.0;
+    pub(crate) fn with_images(mut committed: CommittedEpisode) -> CommittedEpisode {
+        let episode = committed.episode.0;
         committed.depth = Some(
             (0..=committed.steps())
-                .flat_map(|step| [shade(flight, step); IMAGE_PIXELS])
+                .flat_map(|step| [shade(episode, step); IMAGE_PIXELS])
                 .collect(),
         );
         committed
     }
 
-    /// Gray value of image `step` of `flight`.
-    pub(crate) fn shade(flight: u64, step: usize) -> u8 {
-        ((flight * 37 + step as u64 * 11) % 251) as u8
+    /// Gray value of image `step` of `episode`.
+    pub(crate) fn shade(episode: u64, step: usize) -> u8 {
+        ((episode * 37 + step as u64 * 11) % 251) as u8
     }
 
     /// Latent code of an image of gray value `shade`.
@@ -277,40 +277,42 @@ mod tests {
 
     #[test]
     fn a_part_of_the_wrong_length_is_named() {
-        let sound = samples::with_images(samples::flight(3, 5, Outcome::Collided));
+        let sound = samples::with_images(samples::episode(3, 5, Outcome::Collided));
         assert_eq!(sound.check(), Ok(()));
-        type Damage = fn(&mut CommittedFlight);
+        type Damage = fn(&mut CommittedEpisode);
         let damage: [(&str, Damage); 6] = [
-            ("actions", |flight| flight.actions.clear()),
-            ("observations", |flight| flight.observations.truncate(5)),
-            ("rewards", |flight| flight.rewards.push(0.0)),
-            ("reward terms", |flight| flight.reward_terms.truncate(4)),
-            ("level-up flags", |flight| flight.level_up.push(true)),
-            ("bytes of depth images", |flight| flight.depth.as_mut().unwrap().push(0)),
+            ("actions", |episode| episode.actions.clear()),
+            ("observations", |episode| episode.observations.truncate(5)),
+            ("rewards", |episode| episode.rewards.push(0.0)),
+            ("reward terms", |episode| episode.reward_terms.truncate(4)),
+            ("level-up flags", |episode| episode.level_up.push(true)),
+            ("bytes of depth images", |episode| {
+                episode.depth.as_mut().unwrap().push(0)
+            }),
         ];
         for (what, damage) in damage {
-            let mut flight = sound.clone();
-            damage(&mut flight);
-            assert_eq!(flight.check().unwrap_err().what, what);
+            let mut episode = sound.clone();
+            damage(&mut episode);
+            assert_eq!(episode.check().unwrap_err().what, what);
         }
     }
 
     #[test]
-    fn the_previous_action_is_zero_at_take_off_and_then_the_one_before() {
-        let flight = samples::flight(3, 5, Outcome::Collided);
+    fn the_previous_action_is_zero_at_reset_and_then_the_one_before() {
+        let episode = samples::episode(3, 5, Outcome::Collided);
         let view = View::present(Observation::LatentVelocityAction, 16);
         let mut vector = [f32::NAN; 16 + 2 + ACTION];
-        flight.write_observation(0, &view, &mut vector);
+        episode.write_observation(0, &view, &mut vector);
         assert_eq!(vector[18..], [0.0, 0.0]);
-        flight.write_observation(5, &view, &mut vector);
-        assert_eq!(vector[18..], flight.actions[4]);
-        assert_eq!(vector[..16], flight.observations[5].latent[..16]);
-        assert_eq!(vector[16..18], flight.observations[5].velocity_mps[1..]);
+        episode.write_observation(5, &view, &mut vector);
+        assert_eq!(vector[18..], episode.actions[4]);
+        assert_eq!(vector[..16], episode.observations[5].latent[..16]);
+        assert_eq!(vector[16..18], episode.observations[5].velocity_mps[1..]);
     }
 
     #[test]
-    fn earlier_moments_follow_the_present_and_before_take_off_all_was_as_at_take_off() {
-        let flight = samples::flight(3, 5, Outcome::Collided);
+    fn earlier_moments_follow_the_present_and_before_reset_all_was_as_at_reset() {
+        let episode = samples::episode(3, 5, Outcome::Collided);
         let view = View {
             moment: Observation::LatentVelocity,
             latent: 8,
@@ -318,9 +320,9 @@ mod tests {
         };
         let mut vector = vec![f32::NAN; view.len()];
         for (step, moments) in [(5, [5, 4, 1]), (2, [2, 1, 0]), (0, [0, 0, 0])] {
-            flight.write_observation(step, &view, &mut vector);
+            episode.write_observation(step, &view, &mut vector);
             for (seen, moment) in vector.chunks_exact(8 + 2).zip(moments) {
-                let observation = &flight.observations[moment];
+                let observation = &episode.observations[moment];
                 assert_eq!(seen[..8], observation.latent[..8]);
                 assert_eq!(seen[8..], observation.velocity_mps[1..]);
             }
@@ -329,22 +331,22 @@ mod tests {
 
     #[test]
     fn the_true_state_is_the_ground_truth_the_motion_and_the_action_before() {
-        let flight = samples::flight(3, 5, Outcome::Collided);
+        let episode = samples::episode(3, 5, Outcome::Collided);
         let mut state = [f32::NAN; TRUE_STATE];
-        flight.write_true_state(4, &mut state);
-        let seen = &flight.observations[4];
+        episode.write_true_state(4, &mut state);
+        let seen = &episode.observations[4];
         assert_eq!(state[0], seen.ground_truth[0] * TRUTH_SCALE[0]);
         assert_eq!(state[15], seen.ground_truth[15] * TRUTH_SCALE[15]);
         assert_eq!(state[16..19], seen.velocity_mps);
-        assert_eq!(state[21..], flight.actions[3]);
-        flight.write_true_state(0, &mut state);
+        assert_eq!(state[21..], episode.actions[3]);
+        episode.write_true_state(0, &mut state);
         assert_eq!(state[21..], [0.0, 0.0]);
     }
 
     #[test]
     fn only_collision_and_destination_terminate() {
-        assert!(samples::flight(0, 1, Outcome::Collided).terminated());
-        assert!(samples::flight(0, 1, Outcome::ReachedEnd).terminated());
-        assert!(!samples::flight(0, 1, Outcome::TimedOut).terminated());
+        assert!(samples::episode(0, 1, Outcome::Collided).terminated());
+        assert!(samples::episode(0, 1, Outcome::ReachedEnd).terminated());
+        assert!(!samples::episode(0, 1, Outcome::TimedOut).terminated());
     }
 }

@@ -1,57 +1,57 @@
-//! Assembles streamed records into a whole flight, or into a whole leg of one.
+//! Assembles streamed records into a whole episode, or into a whole segment of one.
 //!
-//! A flight is committed once, complete and in order, or not at all; nothing downstream ever sees half of one, or one flown with two policies. Of a flight in legs
-//! the same holds for each leg, and each begins where the one before it ended.
+//! An episode is committed once, complete and in order, or not at all; nothing downstream ever sees half of one, or one flown with two policies. Of an episode in segments
+//! the same holds for each segment, and each begins where the one before it ended.
 
-use skein_protocol::ids::{ActorId, FlightId, Incarnation};
+use skein_protocol::ids::{ActorId, ActorIncarnation, EpisodeId};
 use skein_protocol::transition::{Outcome, RecordFault, RecordKind, TransitionRecord};
 use skein_protocol::{ACTION, IMAGE_PIXELS};
 
 use super::order::Order;
-use crate::flight::{CommittedFlight, StepObservation};
+use crate::episode::{CommittedEpisode, StepObservation};
 
 pub use super::order::Keep;
 
-/// A flight under way.
+/// An episode under way.
 #[derive(Debug)]
 pub struct Assembly {
     order: Order,
     actor: ActorId,
-    incarnation: Incarnation,
-    flight: CommittedFlight,
-    /// Of a later leg: where it is to begin.
-    begins: Option<LegEnd>,
+    incarnation: ActorIncarnation,
+    episode: CommittedEpisode,
+    /// Of a later segment: where it is to begin.
+    begins: Option<SegmentEnd>,
     longest_records: usize,
     latent: usize,
-    /// How the last step left the flight; its walls passed are in `flight`.
+    /// How the last step left the episode; its walls passed are in `episode`.
     last_step: StepEnd,
 }
 
-/// Where a leg ended whose flight goes on.
+/// Where a segment ended whose episode goes on.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LegEnd {
-    flight: FlightId,
-    /// Steps flown since take-off.
+pub struct SegmentEnd {
+    episode: EpisodeId,
+    /// Steps flown since reset.
     steps: usize,
     walls_passed: u8,
     seen: StepObservation,
 }
 
-impl LegEnd {
-    /// Where `leg` ended; `None` if its flight did, too.
-    pub fn of(leg: &CommittedFlight) -> Option<Self> {
-        let seen = *leg.observations.last()?;
-        leg.outcome.is_none().then_some(Self {
-            flight: leg.flight,
-            steps: leg.first_step + leg.steps(),
-            walls_passed: leg.walls_passed,
+impl SegmentEnd {
+    /// Where `segment` ended; `None` if its episode did, too.
+    pub fn of(segment: &CommittedEpisode) -> Option<Self> {
+        let seen = *segment.observations.last()?;
+        segment.outcome.is_none().then_some(Self {
+            episode: segment.episode,
+            steps: segment.first_step + segment.steps(),
+            walls_passed: segment.walls_passed,
             seen,
         })
     }
 
     /// Whether what `order` asks for is what comes next.
     pub fn is_before(&self, order: &Order) -> bool {
-        (self.flight, self.steps) == (order.ticket.flight, order.ticket.first_step() as usize)
+        (self.episode, self.steps) == (order.ticket.episode, order.ticket.first_step() as usize)
     }
 
     /// Whether the vehicle is where it was, to the last bit. The image may have been encoded anew.
@@ -62,7 +62,7 @@ impl LegEnd {
     }
 }
 
-/// How a step left its flight.
+/// How a step left its episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum StepEnd {
     /// It goes on.
@@ -73,29 +73,29 @@ enum StepEnd {
     Truncated,
 }
 
-/// What a record did to its flight.
+/// What a record did to its episode.
 #[derive(Debug)]
 pub enum Assembled {
     /// It is one more step.
     Step,
-    /// It was the last, of the flight or of the leg.
-    Whole(Box<CommittedFlight>),
-    /// The simulator failed; the flight is void.
+    /// It was the last, of the episode or of the segment.
+    Whole(Box<CommittedEpisode>),
+    /// The simulator failed; the episode is void.
     Failed,
 }
 
 impl Assembly {
-    /// Nothing yet of what `order` asks for, of a flight of at most `longest_records` with codes of `latent` numbers. A later leg `begins` where the one before it ended.
+    /// Nothing yet of what `order` asks for, of an episode of at most `longest_records` with codes of `latent` numbers. A later segment `begins` where the one before it ended.
     pub fn new(
         order: Order,
-        begins: Option<LegEnd>,
+        begins: Option<SegmentEnd>,
         longest_records: usize,
         latent: usize,
         actor: ActorId,
-        incarnation: Incarnation,
+        incarnation: ActorIncarnation,
     ) -> Self {
         Self {
-            flight: CommittedFlight {
+            episode: CommittedEpisode {
                 walls_passed: begins.map_or(0, |begins| begins.walls_passed),
                 ..nothing_of(&order, actor)
             },
@@ -121,106 +121,106 @@ impl Assembly {
 
     /// Whether nothing has arrived yet.
     pub fn is_empty(&self) -> bool {
-        self.flight.observations.is_empty()
+        self.episode.observations.is_empty()
     }
 
     /// Records that have arrived.
     pub fn records(&self) -> usize {
-        self.flight.observations.len()
+        self.episode.observations.len()
     }
 
     /// Takes the next record in.
     ///
     /// # Errors
-    /// [`RecordFault`] when it is not the next record of this flight, or makes no sense; the flight is void then.
+    /// [`RecordFault`] when it is not the next record of this episode, or makes no sense; the episode is void then.
     pub fn push(&mut self, record: &TransitionRecord) -> Result<Assembled, RecordFault> {
-        let step = self.order.ticket.first_step() + self.flight.observations.len() as u32;
+        let step = self.order.ticket.first_step() + self.episode.observations.len() as u32;
         let kind = record.check(&self.order.ticket, self.actor, self.incarnation, step)?;
         if kind == RecordKind::Failed {
             return Ok(Assembled::Failed);
         }
         record.check_latent(self.latent)?;
-        if self.flight.observations.len() == self.longest_records {
+        if self.episode.observations.len() == self.longest_records {
             let most = self.longest_records;
             return Err(RecordFault::TooLong { most });
         }
         match kind {
             RecordKind::Closing => self.check_ending(record)?,
-            RecordKind::LegEnd => self.check_leg_end(record)?,
+            RecordKind::SegmentEnd => self.check_segment_end(record)?,
             RecordKind::Step | RecordKind::Failed => self.check_step(record)?,
         }
         if self.is_empty() {
             self.check_begin(record)?;
             self.make_room();
         }
-        self.flight.observations.push(StepObservation {
+        self.episode.observations.push(StepObservation {
             latent: record.latent,
             velocity_mps: record.velocity_mps,
             position_m: record.position_m,
             orientation: record.orientation,
             ground_truth: record.ground_truth,
         });
-        if let Some(depth) = &mut self.flight.depth {
+        if let Some(depth) = &mut self.episode.depth {
             depth.extend_from_slice(&record.depth);
         }
         match kind {
             RecordKind::Closing => self.close(record)?,
-            RecordKind::LegEnd => {}
+            RecordKind::SegmentEnd => {}
             RecordKind::Step | RecordKind::Failed => {
                 self.take_step(record);
                 return Ok(Assembled::Step);
             }
         }
-        self.finish().map(|flight| Assembled::Whole(Box::new(flight)))
+        self.finish().map(|episode| Assembled::Whole(Box::new(episode)))
     }
 
     fn take_step(&mut self, record: &TransitionRecord) {
-        self.flight.actions.push(record.action);
-        self.flight.rewards.push(record.reward);
-        self.flight.reward_terms.push(record.reward_terms);
-        self.flight.level_up.push(record.level_up == 1);
-        self.flight.walls_passed = record.walls_passed;
+        self.episode.actions.push(record.action);
+        self.episode.rewards.push(record.reward);
+        self.episode.reward_terms.push(record.reward_terms);
+        self.episode.level_up.push(record.level_up == 1);
+        self.episode.walls_passed = record.walls_passed;
         self.last_step = StepEnd::of(record);
     }
 
-    /// Makes room for the images of the longest flight at once. The system gives memory as it is written to, so what is not needed costs nothing; images that
+    /// Makes room for the images of the longest episode at once. The system gives memory as it is written to, so what is not needed costs nothing; images that
     /// grew would be moved again and again, with as much fresh memory each time.
     fn make_room(&mut self) {
-        let longest = self.leg_steps().map_or(self.longest_records, |steps| steps + 1);
-        if let Some(depth) = &mut self.flight.depth {
+        let longest = self.segment_steps().map_or(self.longest_records, |steps| steps + 1);
+        if let Some(depth) = &mut self.episode.depth {
             depth.reserve_exact(longest.min(self.longest_records) * IMAGE_PIXELS);
         }
     }
 
-    /// Steps of the leg, if it is one.
-    fn leg_steps(&self) -> Option<usize> {
-        self.order.ticket.leg.as_ref().map(|leg| leg.steps as usize)
+    /// Steps of the segment, if it is one.
+    fn segment_steps(&self) -> Option<usize> {
+        self.order.ticket.segment.as_ref().map(|segment| segment.steps as usize)
     }
 
-    /// Whether a later leg begins where the one before it ended: a record of a machine whose physics come to something else must not go on with the flight.
+    /// Whether a later segment begins where the one before it ended: a record of a machine whose physics come to something else must not go on with the episode.
     fn check_begin(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
         let is_elsewhere = self.begins.is_some_and(|begins| !begins.is_at(record));
-        refuse_contradictions([("the leg does not begin where the one before it ended", is_elsewhere)])
+        refuse_contradictions([("the segment does not begin where the one before it ended", is_elsewhere)])
     }
 
-    /// Whether the flight goes on, and walls are passed as the step says.
+    /// Whether the episode goes on, and walls are passed as the step says.
     fn check_step(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
-        let passed_before = self.flight.walls_passed;
+        let passed_before = self.episode.walls_passed;
         let passes = record.walls_passed > passed_before;
         let levels_up = record.level_up == 1;
-        // Reaching the end wall is a level-up too, and terminates the flight.
+        // Reaching the end wall is a level-up too, and terminates the episode.
         let may_level_up = passes || record.terminated == 1;
-        let is_over = self.leg_steps() == Some(self.flight.steps());
+        let is_over = self.segment_steps() == Some(self.episode.steps());
         refuse_contradictions([
-            ("a step after the flight's end", self.last_step != StepEnd::Onward),
-            ("a step after the leg's last", is_over),
+            ("a step after the episode's end", self.last_step != StepEnd::Onward),
+            ("a step after the segment's last", is_over),
             ("walls passed grow fewer", record.walls_passed < passed_before),
             ("a wall passed without a level-up", passes && !levels_up),
             ("a level-up without a wall passed", levels_up && !may_level_up),
         ])
     }
 
-    /// Whether the last step ended the flight as the closing record says.
+    /// Whether the last step ended the episode as the closing record says.
     fn check_ending(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
         if self.is_empty() {
             // It is told from one that is out of its place.
@@ -234,43 +234,49 @@ impl Assembly {
                 outcome == Some(Outcome::Collided) || (outcome == Some(Outcome::ReachedEnd) && level_up)
             }
         };
-        let passed = self.flight.walls_passed;
+        let passed = self.episode.walls_passed;
         refuse_contradictions([
-            ("the flight did not end as it closes", !fits),
+            ("the episode did not end as it closes", !fits),
             ("walls passed after the last step", record.walls_passed != passed),
         ])
     }
 
-    /// Whether the leg is over, and its flight is not.
-    fn check_leg_end(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
-        let steps = self.leg_steps();
+    /// Whether the segment is over, and its episode is not.
+    fn check_segment_end(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
+        let steps = self.segment_steps();
         refuse_contradictions([
-            ("a leg ends in a flight that is flown whole", steps.is_none()),
-            ("the leg ends before its last step", steps != Some(self.flight.steps())),
-            ("the flight ended before the leg", self.last_step != StepEnd::Onward),
+            ("a segment ends in an episode that is flown whole", steps.is_none()),
+            (
+                "the segment ends before its last step",
+                steps != Some(self.episode.steps()),
+            ),
+            (
+                "the episode ended before the segment",
+                self.last_step != StepEnd::Onward,
+            ),
             (
                 "walls passed after the last step",
-                record.walls_passed != self.flight.walls_passed,
+                record.walls_passed != self.episode.walls_passed,
             ),
         ])
     }
 
-    /// Ends the flight as the closing record says.
+    /// Ends the episode as the closing record says.
     fn close(&mut self, record: &TransitionRecord) -> Result<(), RecordFault> {
         let outcome = Outcome::from_code(record.outcome).ok_or(RecordFault::Code {
             name: "outcome",
             value: record.outcome,
         })?;
-        self.flight.outcome = Some(outcome);
-        self.flight.walls_passed = record.walls_passed;
-        self.flight.course_walls = record.course_walls;
-        self.flight.hit_wall = (record.hit_wall > 0).then_some(record.hit_wall);
+        self.episode.outcome = Some(outcome);
+        self.episode.walls_passed = record.walls_passed;
+        self.episode.course_walls = record.course_walls;
+        self.episode.hit_wall = (record.hit_wall > 0).then_some(record.hit_wall);
         Ok(())
     }
 
     /// Hands out what was assembled.
-    fn finish(&mut self) -> Result<CommittedFlight, RecordFault> {
-        if self.flight.actions.is_empty() {
+    fn finish(&mut self) -> Result<CommittedEpisode, RecordFault> {
+        if self.episode.actions.is_empty() {
             let step = self.order.ticket.first_step().into();
             return Err(RecordFault::Mismatch {
                 name: "step",
@@ -278,20 +284,20 @@ impl Assembly {
                 expected: step + 1,
             });
         }
-        if let Some(depth) = &mut self.flight.depth {
+        if let Some(depth) = &mut self.episode.depth {
             depth.shrink_to_fit();
         }
         let nothing = nothing_of(&self.order, self.actor);
-        Ok(std::mem::replace(&mut self.flight, nothing))
+        Ok(std::mem::replace(&mut self.episode, nothing))
     }
 }
 
-/// The flight or leg that `order` asks for, before its first record.
-fn nothing_of(order: &Order, actor: ActorId) -> CommittedFlight {
+/// The episode or segment that `order` asks for, before its first record.
+fn nothing_of(order: &Order, actor: ActorId) -> CommittedEpisode {
     let ticket = &order.ticket;
-    let flown: &[[f32; ACTION]] = ticket.leg.as_ref().map_or(&[], |leg| &leg.flown);
-    CommittedFlight {
-        flight: ticket.flight,
+    let flown: &[[f32; ACTION]] = ticket.segment.as_ref().map_or(&[], |segment| &segment.flown);
+    CommittedEpisode {
+        episode: ticket.episode,
         epoch: order.epoch,
         policy_version: ticket.policy_version,
         actor,

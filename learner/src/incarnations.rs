@@ -1,4 +1,4 @@
-//! `lives.csv`: when the learner of a run was started, and from where it went on.
+//! `incarnations.csv`: when the learner of a run was started, and from where it went on.
 
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -6,18 +6,18 @@ use std::{fs, io};
 
 use skein_protocol::durable;
 
-const HEADER: &str = "life,unix_secs,flights\n";
+const HEADER: &str = "incarnation,unix_secs,episodes\n";
 
-/// Notes that a learner begins to live, with the state after `flights` flights; returns how many lives there were before. A file that cannot be read as
+/// Notes that a learner begins to live, with the state after `episodes` episodes; returns how many incarnations there were before. A file that cannot be read as
 /// text is begun anew: nothing learned depends on it.
 ///
 /// # Errors
 /// Of the file system.
-pub fn begin_life(path: &Path, flights: u64) -> io::Result<u64> {
+pub fn begin_incarnation(path: &Path, episodes: u64) -> io::Result<u64> {
     let mut text = match fs::read_to_string(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => HEADER.to_owned(),
         Err(error) if error.kind() == io::ErrorKind::InvalidData => {
-            tracing::warn!(path = %path.display(), "damaged: begun anew, earlier lives are no longer counted");
+            tracing::warn!(path = %path.display(), "damaged: begun anew, earlier incarnations are no longer counted");
             HEADER.to_owned()
         }
         text => text?,
@@ -31,7 +31,7 @@ pub fn begin_life(path: &Path, flights: u64) -> io::Result<u64> {
     let now = SystemTime::now()
         .duration_since(UNIX_EPOCH)
         .map_or(0, |elapsed| elapsed.as_secs());
-    text.push_str(&format!("{earlier},{now},{flights}\n"));
+    text.push_str(&format!("{earlier},{now},{episodes}\n"));
     durable::replace(path, text.as_bytes())?;
     Ok(earlier)
 }
@@ -41,12 +41,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_life_has_a_row() {
+    fn each_incarnation_has_a_row() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("lives.csv");
-        assert_eq!(begin_life(&path, 0).unwrap(), 0);
-        assert_eq!(begin_life(&path, 0).unwrap(), 1);
-        assert_eq!(begin_life(&path, 500).unwrap(), 2);
+        let path = directory.path().join("incarnations.csv");
+        assert_eq!(begin_incarnation(&path, 0).unwrap(), 0);
+        assert_eq!(begin_incarnation(&path, 0).unwrap(), 1);
+        assert_eq!(begin_incarnation(&path, 500).unwrap(), 2);
         let text = fs::read_to_string(path).unwrap();
         let rows: Vec<_> = text.lines().collect();
         assert_eq!(rows.len(), 4);
@@ -56,17 +56,17 @@ mod tests {
     #[test]
     fn a_damaged_file_is_begun_anew() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("lives.csv");
-        begin_life(&path, 0).unwrap();
+        let path = directory.path().join("incarnations.csv");
+        begin_incarnation(&path, 0).unwrap();
         let mut bytes = fs::read(&path).unwrap();
         // The end of the last line is lost.
         bytes.pop();
         fs::write(&path, &bytes).unwrap();
-        assert_eq!(begin_life(&path, 500).unwrap(), 1);
+        assert_eq!(begin_incarnation(&path, 500).unwrap(), 1);
         assert_eq!(fs::read_to_string(&path).unwrap().lines().count(), 3);
         bytes.push(0xff);
         fs::write(&path, bytes).unwrap();
-        assert_eq!(begin_life(&path, 500).unwrap(), 0);
-        assert_eq!(begin_life(&path, 500).unwrap(), 1);
+        assert_eq!(begin_incarnation(&path, 500).unwrap(), 0);
+        assert_eq!(begin_incarnation(&path, 500).unwrap(), 1);
     }
 }

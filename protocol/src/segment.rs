@@ -1,9 +1,9 @@
-//! A leg: some steps of a flight, flown on a ticket of their own, so that the rest can be flown with what was learned meanwhile.
+//! A segment: some steps of an episode, flown on a ticket of their own, so that the rest can be flown with what was learned meanwhile.
 //!
-//! A leg is a function of its ticket as a flight is: the ticket carries the actions flown so far. An actor that has flown the leg before still has the drone
+//! A segment is a function of its ticket as an episode is: the ticket carries the actions flown so far. An actor that has flown the segment before still has the drone
 //! where that ended; any other takes off and repeats them, and as the simulator is deterministic it comes to the same.
 //!
-//! Tickets of legs have a service of their own. The actions make them thirty times as long as other messages, of which shared memory has room for thousands.
+//! Tickets of segments have a service of their own. The actions make them thirty times as long as other messages, of which shared memory has room for thousands.
 
 use std::sync::Arc;
 
@@ -11,26 +11,26 @@ use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::ACTION;
-use crate::ids::{ActorId, Incarnation, RunId};
+use crate::ids::{ActorId, ActorIncarnation, RunId};
 use crate::ticket::{Control, ControlFault, ControlRecord, Ticket};
 
-/// Actions that a leg's ticket has room for.
+/// Actions that a segment's ticket has room for.
 pub const MOST_FLOWN: usize = 256;
 
-/// Which part of its flight a ticket is for.
+/// Which part of its episode a ticket is for.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Leg {
-    /// Steps to be flown, unless the flight ends before.
+pub struct Segment {
+    /// Steps to be flown, unless the episode ends before.
     pub steps: u32,
-    /// Actions flown before, from take-off on, [`MOST_FLOWN`] at most.
+    /// Actions flown before, from reset on, [`MOST_FLOWN`] at most.
     pub flown: Arc<[[f32; ACTION]]>,
 }
 
-/// The [`Ticket`] of a leg on the wire.
+/// The [`Ticket`] of a segment on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
-#[type_name("skein.LegRecord.v1")]
-pub struct LegRecord {
+#[type_name("skein.SegmentRecord.v1")]
+pub struct SegmentRecord {
     ticket: ControlRecord,
     steps: u32,
     /// How many of `actions` there are.
@@ -39,55 +39,55 @@ pub struct LegRecord {
 }
 
 // Whole fields of eight bytes: no padding, so no uninitialised byte ever leaves the process.
-const _: () = assert!(size_of::<LegRecord>() == size_of::<ControlRecord>() + 2 * 4 + MOST_FLOWN * ACTION * 4);
+const _: () = assert!(size_of::<SegmentRecord>() == size_of::<ControlRecord>() + 2 * 4 + MOST_FLOWN * ACTION * 4);
 
-impl LegRecord {
-    /// `leg` of `ticket`'s flight, for one life of one actor.
+impl SegmentRecord {
+    /// `segment` of `ticket`'s episode, for one incarnation of one actor.
     ///
     /// # Panics
-    /// When more than [`MOST_FLOWN`] actions were flown before; the configuration allows no flight to become so long.
-    pub fn fly(ticket: &Ticket, leg: &Leg, actor: ActorId, incarnation: Incarnation) -> Self {
+    /// When more than [`MOST_FLOWN`] actions were flown before; the configuration allows no episode to become so long.
+    pub fn fly(ticket: &Ticket, segment: &Segment, actor: ActorId, incarnation: ActorIncarnation) -> Self {
         let mut actions = [[0.0; ACTION]; MOST_FLOWN];
-        actions[..leg.flown.len()].copy_from_slice(&leg.flown);
+        actions[..segment.flown.len()].copy_from_slice(&segment.flown);
         Self {
             ticket: ControlRecord::fly(ticket, actor, incarnation),
-            steps: leg.steps,
-            flown: leg.flown.len() as u32,
+            steps: segment.steps,
+            flown: segment.flown.len() as u32,
             actions,
         }
     }
 
-    /// Whether this life of this actor is meant.
-    pub fn is_for(&self, actor: ActorId, incarnation: Incarnation) -> bool {
+    /// Whether this incarnation of this actor is meant.
+    pub fn is_for(&self, actor: ActorId, incarnation: ActorIncarnation) -> bool {
         self.ticket.is_for(actor, incarnation)
     }
 
-    /// What is said: to fly a leg.
+    /// What is said: to fly a segment.
     ///
     /// # Errors
     /// [`ControlFault`] when the record holds what no learner of this version and run writes.
     pub fn read(&self, run: RunId) -> Result<Control, ControlFault> {
         let Control::Fly(ticket) = self.ticket.read(run)? else {
-            return Err(ControlFault::Leg("is no ticket"));
+            return Err(ControlFault::Segment("is no ticket"));
         };
         let flown = self
             .actions
             .get(..self.flown as usize)
-            .ok_or(ControlFault::Leg("has more actions than it has room for"))?;
+            .ok_or(ControlFault::Segment("has more actions than it has room for"))?;
         // No number is within bounds that is none.
         let are_actions = flown.iter().flatten().all(|command| (-1.0..=1.0).contains(command));
         if !are_actions {
-            return Err(ControlFault::Leg("has an action outside [-1, 1]"));
+            return Err(ControlFault::Segment("has an action outside [-1, 1]"));
         }
         if self.steps == 0 {
-            return Err(ControlFault::Leg("is of no step"));
+            return Err(ControlFault::Segment("is of no step"));
         }
-        let leg = Leg {
+        let segment = Segment {
             steps: self.steps,
             flown: flown.into(),
         };
         Ok(Control::Fly(Ticket {
-            leg: Some(leg),
+            segment: Some(segment),
             ..ticket
         }))
     }
@@ -96,41 +96,41 @@ impl LegRecord {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ticket::tests::ticket as whole_flight;
+    use crate::ticket::tests::ticket as whole_episode;
 
     const RUN: RunId = RunId(3);
     const ACTOR: ActorId = ActorId(4);
-    const LIFE: Incarnation = Incarnation(8);
+    const INCARNATION: ActorIncarnation = ActorIncarnation(8);
 
     fn ticket(flown: usize) -> Ticket {
         let actions = (0..flown).map(|step| [step as f32 / 256.0, -1.0]);
-        let leg = Leg {
+        let segment = Segment {
             steps: 3,
             flown: actions.collect(),
         };
         Ticket {
-            leg: Some(leg),
-            ..whole_flight()
+            segment: Some(segment),
+            ..whole_episode()
         }
     }
 
-    fn record(flown: usize) -> LegRecord {
+    fn record(flown: usize) -> SegmentRecord {
         let ticket = ticket(flown);
-        LegRecord::fly(&ticket, ticket.leg.as_ref().unwrap(), ACTOR, LIFE)
+        SegmentRecord::fly(&ticket, ticket.segment.as_ref().unwrap(), ACTOR, INCARNATION)
     }
 
     #[test]
-    fn a_leg_survives_the_wire_with_all_that_was_flown_before_it() {
+    fn a_segment_survives_the_wire_with_all_that_was_flown_before_it() {
         for flown in [0, 1, MOST_FLOWN] {
             let record = record(flown);
             assert_eq!(record.read(RUN), Ok(Control::Fly(ticket(flown))));
-            assert!(record.is_for(ACTOR, LIFE) && !record.is_for(ACTOR, Incarnation(9)));
+            assert!(record.is_for(ACTOR, INCARNATION) && !record.is_for(ACTOR, ActorIncarnation(9)));
         }
     }
 
     #[test]
     fn garbage_is_refused_with_what_is_wrong() {
-        let refused = |damage: fn(&mut LegRecord)| {
+        let refused = |damage: fn(&mut SegmentRecord)| {
             let mut record = record(2);
             damage(&mut record);
             record.read(RUN).unwrap_err().to_string()

@@ -1,20 +1,20 @@
-//! The seats of a run: exactly one learner, with a transport of its own for each of its lives, and exactly one supervisor.
+//! The locks of a run: exactly one learner, with a transport of its own for each of its incarnations, and exactly one supervisor.
 //!
-//! A seat is taken by two locks, one on the run's directory and one in the transport's folder: a copy of the directory is the same run.
+//! A lock is taken by two locks, one on the run's directory and one in the transport's folder: a copy of the directory is the same run.
 
 use std::fs::{self, File, TryLockError};
 use std::path::PathBuf;
 
 use super::RunDirectory;
-use super::identity::{Announcement, Life, RunIdentity};
+use super::identity::{Announcement, LearnerIncarnation, RunIdentity};
 use super::place::{HeldLock, Locked, PlaceError, is_locked, lock, make_folder};
 use super::presence::Presence;
 use super::sweep::MACHINE;
 
-/// The learner's seat of a run, taken. To be held as long as the learner lives, and longer than its ports.
+/// The learner's lock of a run, taken. To be held as long as the learner lives, and longer than its ports.
 #[derive(Debug)]
-pub struct LearnerSeat {
-    life: Life,
+pub struct LearnerLock {
+    incarnation: LearnerIncarnation,
     announcement: PathBuf,
     // In this order: locks are let go before the presence, which may remove their files.
     _in_transport: HeldLock,
@@ -22,18 +22,18 @@ pub struct LearnerSeat {
     _presence: Presence,
 }
 
-/// The supervisor's seat of a run, taken. To be held as long as the run is supervised.
+/// The supervisor's lock of a run, taken. To be held as long as the run is supervised.
 #[derive(Debug)]
-pub struct SupervisorSeat {
+pub struct SupervisorLock {
     // Locks are let go before the presence, which may remove their files.
     _in_transport: HeldLock,
     _directory: File,
     _presence: Presence,
 }
 
-/// Why there is no seat for this process.
+/// Why there is no lock for this process.
 #[derive(Debug, thiserror::Error)]
-pub enum SeatError {
+pub enum LockError {
     /// Another process of this run has it.
     #[error("another {who} of this run lives{}: it holds {}", pid.map_or(String::new(), |pid| format!(" (process {pid})")), lock.display())]
     Taken {
@@ -49,30 +49,31 @@ pub enum SeatError {
     Place(#[from] PlaceError),
 }
 
-impl LearnerSeat {
-    /// Takes the seat, removes what dead lives of this run left, and begins a new life.
+impl LearnerLock {
+    /// Takes the lock, removes what dead incarnations of this run left, and begins a new incarnation.
     ///
     /// # Errors
-    /// [`SeatError::Taken`] when another learner of this run lives.
-    pub fn take(directory: &RunDirectory, identity: &RunIdentity) -> Result<Self, SeatError> {
+    /// [`LockError::Taken`] when another learner of this run incarnations.
+    pub fn take(directory: &RunDirectory, identity: &RunIdentity) -> Result<Self, LockError> {
         let in_directory = take_lock("learner", directory.learner_lock())?;
         let presence = Presence::enter(identity)?;
         let in_transport = take_lock("learner", identity.learner_lock())?;
 
-        // The last life's number stands in both files: the transport's folder may have been removed from under its processes, and of a directory there
+        // The last incarnation's number stands in both files: the transport's folder may have been removed from under its processes, and of a directory there
         // may be copies.
-        let life = Life::after(last_life(&in_transport)?.max(last_life(&in_directory)?));
-        let words = format!("{} {life}", std::process::id());
+        let incarnation =
+            LearnerIncarnation::after(last_incarnation(&in_transport)?.max(last_incarnation(&in_directory)?));
+        let words = format!("{} {incarnation}", std::process::id());
         in_transport.write(&words)?;
         in_directory.write(&words)?;
 
         let announcement = identity.announcement_file();
         remove_announcement(&announcement)?;
-        MACHINE.remove_lives(identity.run);
-        let folder = identity.life_folder(life);
+        MACHINE.remove_incarnations(identity.run);
+        let folder = identity.incarnation_folder(incarnation);
         make_folder(&folder).map_err(PlaceError::at(&folder))?;
         Ok(Self {
-            life,
+            incarnation,
             announcement,
             _in_transport: in_transport,
             _in_directory: in_directory,
@@ -80,31 +81,31 @@ impl LearnerSeat {
         })
     }
 
-    /// This learner's life.
-    pub fn life(&self) -> Life {
-        self.life
+    /// This learner's incarnation.
+    pub fn incarnation(&self) -> LearnerIncarnation {
+        self.incarnation
     }
 }
 
-impl Drop for LearnerSeat {
+impl Drop for LearnerLock {
     fn drop(&mut self) {
         // Actors look at the lock too, so a file that stays behind misleads nobody.
         let _ = fs::remove_file(&self.announcement);
     }
 }
 
-impl SupervisorSeat {
-    /// Takes the seat.
+impl SupervisorLock {
+    /// Takes the lock.
     ///
     /// # Errors
-    /// [`SeatError::Taken`] when another process supervises this run.
-    pub fn take(directory: &RunDirectory, identity: &RunIdentity) -> Result<Self, SeatError> {
+    /// [`LockError::Taken`] when another process supervises this run.
+    pub fn take(directory: &RunDirectory, identity: &RunIdentity) -> Result<Self, LockError> {
         let root = directory.root();
         let locked = File::open(root).map_err(PlaceError::at(root))?;
         match locked.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
-                return Err(SeatError::Taken {
+                return Err(LockError::Taken {
                     who: "supervisor",
                     lock: root.to_owned(),
                     pid: None,
@@ -134,7 +135,7 @@ impl RunDirectory {
 }
 
 impl RunIdentity {
-    /// Tells actors that the services of `announcement`'s life are open. For the learner that holds the seat.
+    /// Tells actors that the services of `announcement`'s incarnation are open. For the learner that holds the lock.
     ///
     /// # Errors
     /// [`PlaceError`] when the file cannot be written.
@@ -148,10 +149,10 @@ impl RunIdentity {
     }
 }
 
-fn take_lock(who: &'static str, path: PathBuf) -> Result<HeldLock, SeatError> {
+fn take_lock(who: &'static str, path: PathBuf) -> Result<HeldLock, LockError> {
     match lock(&path)? {
         Locked::Mine(lock) => Ok(lock),
-        Locked::Taken { words } => Err(SeatError::Taken {
+        Locked::Taken { words } => Err(LockError::Taken {
             who,
             lock: path,
             pid: words.split_whitespace().next().and_then(|pid| pid.parse().ok()),
@@ -159,9 +160,13 @@ fn take_lock(who: &'static str, path: PathBuf) -> Result<HeldLock, SeatError> {
     }
 }
 
-/// The life that whoever held `lock` last wrote into it.
-fn last_life(lock: &HeldLock) -> Result<Option<Life>, PlaceError> {
-    Ok(lock.words()?.split_whitespace().nth(1).and_then(Life::parse))
+/// The incarnation that whoever held `lock` last wrote into it.
+fn last_incarnation(lock: &HeldLock) -> Result<Option<LearnerIncarnation>, PlaceError> {
+    Ok(lock
+        .words()?
+        .split_whitespace()
+        .nth(1)
+        .and_then(LearnerIncarnation::parse))
 }
 
 fn remove_announcement(path: &std::path::Path) -> Result<(), PlaceError> {
@@ -182,8 +187,8 @@ mod tests {
         let run = RunDirectory::new(directory.path());
         let identity = run.create(&Config::default()).unwrap();
         let _supervisor = Presence::enter(&identity).unwrap();
-        let seat = LearnerSeat::take(&run, &identity).unwrap();
-        let refusal = LearnerSeat::take(&run, &identity).unwrap_err().to_string();
+        let lock = LearnerLock::take(&run, &identity).unwrap();
+        let refusal = LearnerLock::take(&run, &identity).unwrap_err().to_string();
         let told = format!(
             "another learner of this run lives (process {}): it holds {}",
             std::process::id(),
@@ -193,7 +198,7 @@ mod tests {
 
         let copied = tempfile::tempdir().unwrap();
         fs::copy(run.identity(), copied.path().join("run.json")).unwrap();
-        let refusal = LearnerSeat::take(&RunDirectory::new(copied.path()), &identity)
+        let refusal = LearnerLock::take(&RunDirectory::new(copied.path()), &identity)
             .unwrap_err()
             .to_string();
         assert!(refusal.contains("another learner of this run lives"), "{refusal}");
@@ -202,9 +207,9 @@ mod tests {
             "{refusal}"
         );
 
-        let first = seat.life();
-        drop(seat);
-        assert!(LearnerSeat::take(&run, &identity).unwrap().life() > first);
+        let first = lock.incarnation();
+        drop(lock);
+        assert!(LearnerLock::take(&run, &identity).unwrap().incarnation() > first);
     }
 
     #[test]
@@ -217,54 +222,58 @@ mod tests {
         let copy = RunDirectory::new(copied.path());
 
         assert!(!run.is_under_way().unwrap());
-        let seat = SupervisorSeat::take(&run, &identity).unwrap();
+        let lock = SupervisorLock::take(&run, &identity).unwrap();
         assert!(run.is_under_way().unwrap() && !copy.is_under_way().unwrap());
         for (other, lock) in [(&run, run.root().to_owned()), (&copy, identity.supervisor_lock())] {
-            let refusal = SupervisorSeat::take(other, &identity).unwrap_err().to_string();
+            let refusal = SupervisorLock::take(other, &identity).unwrap_err().to_string();
             assert!(refusal.starts_with("another supervisor of this run lives"), "{refusal}");
             assert!(refusal.contains(&lock.display().to_string()), "{refusal}");
         }
-        drop(seat);
+        drop(lock);
         assert!(!identity.transport_folder().exists());
-        drop(SupervisorSeat::take(&copy, &identity).unwrap());
-        SupervisorSeat::take(&run, &identity).unwrap();
+        drop(SupervisorLock::take(&copy, &identity).unwrap());
+        SupervisorLock::take(&run, &identity).unwrap();
     }
 
     #[test]
-    fn a_life_whose_folder_was_removed_is_not_lived_again() {
+    fn an_incarnation_whose_folder_was_removed_is_not_lived_again() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         let identity = run.create(&Config::default()).unwrap();
-        let first = LearnerSeat::take(&run, &identity).unwrap();
-        let life = first.life();
+        let first = LearnerLock::take(&run, &identity).unwrap();
+        let incarnation = first.incarnation();
         fs::remove_dir_all(identity.transport_folder()).unwrap();
         drop(first);
-        assert!(LearnerSeat::take(&run, &identity).unwrap().life() > life);
+        assert!(LearnerLock::take(&run, &identity).unwrap().incarnation() > incarnation);
     }
 
     #[test]
-    fn a_new_life_removes_what_the_dead_ones_left_and_meets_nothing_of_it() {
+    fn a_new_incarnation_removes_what_the_dead_ones_left_and_meets_nothing_of_it() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         let identity = run.create(&Config::default()).unwrap();
         let supervisor = Presence::enter(&identity).unwrap();
-        let seat = LearnerSeat::take(&run, &identity).unwrap();
-        let dead = seat.life();
-        let segment = PathBuf::from(format!("/dev/shm/{}x", identity.life_prefix(dead)));
+        let lock = LearnerLock::take(&run, &identity).unwrap();
+        let dead = lock.incarnation();
+        let segment = PathBuf::from(format!("/dev/shm/{}x", identity.incarnation_prefix(dead)));
         fs::write(&segment, "").unwrap();
-        fs::write(identity.life_folder(dead).join("details"), "").unwrap();
+        fs::write(identity.incarnation_folder(dead).join("details"), "").unwrap();
         identity
             .announce(&Announcement::new(&identity, dead, &Config::default()))
             .unwrap();
-        assert_eq!(identity.present_life().unwrap().unwrap().life, dead);
-        drop(seat);
+        assert_eq!(identity.present_incarnation().unwrap().unwrap().incarnation, dead);
+        drop(lock);
         assert!(segment.exists());
 
-        let seat = LearnerSeat::take(&run, &identity).unwrap();
-        assert!(!segment.exists() && !identity.life_folder(dead).exists());
-        assert!(identity.life_folder(seat.life()).exists());
-        assert_eq!(identity.present_life().unwrap(), None, "its services are not open");
-        drop((seat, supervisor));
+        let lock = LearnerLock::take(&run, &identity).unwrap();
+        assert!(!segment.exists() && !identity.incarnation_folder(dead).exists());
+        assert!(identity.incarnation_folder(lock.incarnation()).exists());
+        assert_eq!(
+            identity.present_incarnation().unwrap(),
+            None,
+            "its services are not open"
+        );
+        drop((lock, supervisor));
         assert!(!identity.transport_folder().exists());
     }
 }

@@ -1,31 +1,31 @@
-//! A flight is whole, in order and makes sense, and so is a leg, or it is refused by what is wrong with it.
+//! An episode is whole, in order and makes sense, and so is a segment, or it is refused by what is wrong with it.
 
 use bytemuck::Zeroable;
 use skein_protocol::ids::{Attempt, Epoch, PolicyVersion, RunId};
-use skein_protocol::leg::Leg;
+use skein_protocol::segment::Segment;
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 
 use super::super::order::Place;
 use super::*;
 
 const ACTOR: ActorId = ActorId(2);
-const LIFE: Incarnation = Incarnation(11);
+const INCARNATION: ActorIncarnation = ActorIncarnation(11);
 /// Length of the latent codes.
 const LATENT: usize = 16;
-/// Steps of the flight here.
+/// Steps of the episode here.
 const STEPS: u32 = 3;
 
 fn ticket() -> Ticket {
     Ticket {
         run: RunId(1),
-        flight: FlightId(5),
+        episode: EpisodeId(5),
         attempt: Attempt(0),
         policy_version: PolicyVersion(3),
         course: CourseChoice::Training,
         start_level: 1,
         exploration: Exploration::Sample,
         seed: 9,
-        leg: None,
+        segment: None,
     }
 }
 
@@ -39,13 +39,20 @@ fn order(ticket: Ticket, keep: Keep) -> Order {
 }
 
 fn assembly(keep: Keep) -> Assembly {
-    Assembly::new(order(ticket(), keep), None, STEPS as usize + 1, LATENT, ACTOR, LIFE)
+    Assembly::new(
+        order(ticket(), keep),
+        None,
+        STEPS as usize + 1,
+        LATENT,
+        ACTOR,
+        INCARNATION,
+    )
 }
 
 /// Record `step`, its image filled with its number.
 fn record(step: u32) -> TransitionRecord {
     let mut record = TransitionRecord::zeroed();
-    record.begin(&ticket(), ACTOR, LIFE, step);
+    record.begin(&ticket(), ACTOR, INCARNATION, step);
     record.depth.fill(step as u8);
     record.truncated = u8::from(step == STEPS - 1);
     if step == STEPS {
@@ -55,19 +62,19 @@ fn record(step: u32) -> TransitionRecord {
     record
 }
 
-fn assemble(keep: Keep) -> CommittedFlight {
+fn assemble(keep: Keep) -> CommittedEpisode {
     let mut assembly = assembly(keep);
     for step in 0..STEPS {
         assert!(matches!(assembly.push(&record(step)), Ok(Assembled::Step)));
     }
     match assembly.push(&record(STEPS)) {
-        Ok(Assembled::Whole(flight)) => *flight,
+        Ok(Assembled::Whole(episode)) => *episode,
         other => panic!("the closing record gives {other:?}"),
     }
 }
 
 #[test]
-fn no_flight_mixes_policy_versions() {
+fn no_episode_mixes_policy_versions() {
     for strange in 1..=STEPS {
         let mut assembly = assembly(Keep::Latents);
         for step in 0..strange {
@@ -95,7 +102,7 @@ fn a_code_that_is_longer_than_configured_is_refused() {
 }
 
 #[test]
-fn a_flight_that_never_ends_is_refused_at_its_limit() {
+fn an_episode_that_never_ends_is_refused_at_its_limit() {
     let mut assembly = assembly(Keep::Depth);
     let onward = |step| {
         let mut record = record(step);
@@ -117,16 +124,16 @@ fn a_flight_that_never_ends_is_refused_at_its_limit() {
 }
 
 /// The assembly of two steps that follow one that led to `seen`.
-fn leg(begins: Option<LegEnd>) -> Assembly {
-    let leg = Leg {
+fn segment(begins: Option<SegmentEnd>) -> Assembly {
+    let segment = Segment {
         steps: 2,
         flown: vec![[0.25, -0.5]].into(),
     };
     let ticket = Ticket {
-        leg: Some(leg),
+        segment: Some(segment),
         ..ticket()
     };
-    Assembly::new(order(ticket, Keep::Depth), begins, 100, LATENT, ACTOR, LIFE)
+    Assembly::new(order(ticket, Keep::Depth), begins, 100, LATENT, ACTOR, INCARNATION)
 }
 
 fn changed(mut record: TransitionRecord, change: impl FnOnce(&mut TransitionRecord)) -> TransitionRecord {
@@ -134,11 +141,11 @@ fn changed(mut record: TransitionRecord, change: impl FnOnce(&mut TransitionReco
     record
 }
 
-fn leg_end(step: u32) -> TransitionRecord {
-    changed(onward(step), |record| record.kind = RecordKind::LegEnd.code())
+fn segment_end(step: u32) -> TransitionRecord {
+    changed(onward(step), |record| record.kind = RecordKind::SegmentEnd.code())
 }
 
-/// A step after which the flight goes on.
+/// A step after which the episode goes on.
 fn onward(step: u32) -> TransitionRecord {
     changed(record(step), |record| {
         (record.kind, record.truncated, record.outcome) = (RecordKind::Step.code(), 0, 0);
@@ -146,49 +153,50 @@ fn onward(step: u32) -> TransitionRecord {
 }
 
 #[test]
-fn a_leg_is_its_steps_and_what_they_led_to_and_knows_what_came_before() {
-    let mut assembly = leg(None);
+fn a_segment_is_its_steps_and_what_they_led_to_and_knows_what_came_before() {
+    let mut assembly = segment(None);
     assert!(matches!(assembly.push(&onward(1)), Ok(Assembled::Step)));
     assert!(matches!(assembly.push(&onward(2)), Ok(Assembled::Step)));
-    let Ok(Assembled::Whole(leg)) = assembly.push(&leg_end(3)) else {
-        panic!("a leg's end ends it");
+    let Ok(Assembled::Whole(segment)) = assembly.push(&segment_end(3)) else {
+        panic!("a segment's end ends it");
     };
-    assert_eq!((leg.first_step, leg.steps(), leg.outcome), (1, 2, None));
-    assert_eq!((leg.action_before, leg.check()), ([0.25, -0.5], Ok(())));
-    assert!(!leg.terminated());
-    let end = LegEnd::of(&leg).unwrap();
-    assert_eq!((end.flight, end.steps), (FlightId(5), 3));
-    // The flight may end in a leg, of which no other begins then.
-    let mut last = self::leg(None);
+    assert_eq!((segment.first_step, segment.steps(), segment.outcome), (1, 2, None));
+    assert_eq!((segment.action_before, segment.check()), ([0.25, -0.5], Ok(())));
+    assert!(!segment.terminated());
+    let end = SegmentEnd::of(&segment).unwrap();
+    assert_eq!((end.episode, end.steps), (EpisodeId(5), 3));
+    // The episode may end in a segment, of which no other begins then.
+    let mut last = self::segment(None);
     last.push(&changed(onward(1), |record| record.terminated = 1)).unwrap();
     let closing = changed(onward(2), |record| {
         (record.kind, record.outcome) = (RecordKind::Closing.code(), Outcome::Collided.code());
     });
     let Ok(Assembled::Whole(last)) = last.push(&closing) else {
-        panic!("a closing record ends a leg, too");
+        panic!("a closing record ends a segment, too");
     };
-    assert_eq!((last.outcome, LegEnd::of(&last)), (Some(Outcome::Collided), None));
+    assert_eq!((last.outcome, SegmentEnd::of(&last)), (Some(Outcome::Collided), None));
 }
 
 #[test]
-fn a_leg_that_is_too_short_or_too_long_or_of_a_whole_flight_is_refused() {
+fn a_segment_that_is_too_short_or_too_long_or_of_a_whole_episode_is_refused() {
     let refusal = |records: &[TransitionRecord], mut assembly: Assembly| {
         let fault = records.iter().find_map(|record| assembly.push(record).err());
         fault.expect("it makes no sense").to_string()
     };
-    assert!(refusal(&[onward(1), leg_end(2)], leg(None)).contains("before its last step"));
-    assert!(refusal(&[onward(1), onward(2), onward(3)], leg(None)).contains("after the leg's last"));
-    assert!(refusal(&[onward(0)], leg(None)).contains("step is 0 where 1"));
-    assert!(refusal(&[leg_end(1)], leg(None)).contains("before its last step"));
-    assert!(refusal(&[onward(0), leg_end(1)], assembly(Keep::Latents)).contains("flown whole"));
-    let end =
-        |change: fn(&mut TransitionRecord)| refusal(&[onward(1), changed(onward(2), change), leg_end(3)], leg(None));
-    assert!(end(|last| last.truncated = 1).contains("ended before the leg"));
+    assert!(refusal(&[onward(1), segment_end(2)], segment(None)).contains("before its last step"));
+    assert!(refusal(&[onward(1), onward(2), onward(3)], segment(None)).contains("after the segment's last"));
+    assert!(refusal(&[onward(0)], segment(None)).contains("step is 0 where 1"));
+    assert!(refusal(&[segment_end(1)], segment(None)).contains("before its last step"));
+    assert!(refusal(&[onward(0), segment_end(1)], assembly(Keep::Latents)).contains("flown whole"));
+    let end = |change: fn(&mut TransitionRecord)| {
+        refusal(&[onward(1), changed(onward(2), change), segment_end(3)], segment(None))
+    };
+    assert!(end(|last| last.truncated = 1).contains("ended before the segment"));
     assert!(end(|last| (last.walls_passed, last.level_up) = (1, 1)).contains("walls passed after"));
 }
 
 #[test]
-fn a_leg_begins_where_the_one_before_it_ended_with_the_walls_that_were_passed() {
+fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passed() {
     let seen = StepObservation {
         latent: [9.0; skein_protocol::LONGEST_LATENT],
         velocity_mps: [1.0, 0.5, 0.0],
@@ -196,9 +204,9 @@ fn a_leg_begins_where_the_one_before_it_ended_with_the_walls_that_were_passed() 
         orientation: [0.0, 0.0, 0.0, 1.0],
         ground_truth: [0.0; skein_protocol::GROUND_TRUTH],
     };
-    let (flight, steps, walls_passed) = (FlightId(5), 1, 2);
-    let begins = LegEnd {
-        flight,
+    let (episode, steps, walls_passed) = (EpisodeId(5), 1, 2);
+    let begins = SegmentEnd {
+        episode,
         steps,
         walls_passed,
         seen,
@@ -209,7 +217,7 @@ fn a_leg_begins_where_the_one_before_it_ended_with_the_walls_that_were_passed() 
     });
     // An encoder that has learned since sees it otherwise.
     assert_ne!(there.latent, seen.latent);
-    assert!(matches!(leg(Some(begins)).push(&there), Ok(Assembled::Step)));
+    assert!(matches!(segment(Some(begins)).push(&there), Ok(Assembled::Step)));
     let changes: [fn(&mut TransitionRecord); 3] = [
         |record| record.position_m[2] += 1e-6,
         |record| record.velocity_mps[1] = -0.5,
@@ -217,11 +225,11 @@ fn a_leg_begins_where_the_one_before_it_ended_with_the_walls_that_were_passed() 
     ];
     for change in changes {
         let elsewhere = changed(there, change);
-        let fault = leg(Some(begins)).push(&elsewhere).unwrap_err().to_string();
+        let fault = segment(Some(begins)).push(&elsewhere).unwrap_err().to_string();
         assert!(fault.contains("does not begin where"), "{fault}");
     }
     let fewer = changed(there, |record| record.walls_passed = 1);
-    assert!(leg(Some(begins)).push(&fewer).is_err());
+    assert!(segment(Some(begins)).push(&fewer).is_err());
 }
 
 #[test]
@@ -233,22 +241,22 @@ fn depth_images_are_copied_only_for_who_wants_them() {
 }
 
 #[test]
-fn a_flight_that_contradicts_itself_is_refused() {
+fn an_episode_that_contradicts_itself_is_refused() {
     // A change of one record, by its step, and what is said of it or of the first one that shows it.
     type Case = (u32, fn(&mut TransitionRecord), &'static str);
     let cases: [Case; 9] = [
-        (0, |r| r.truncated = 1, "a step after the flight's end"),
-        (0, |r| r.terminated = 1, "a step after the flight's end"),
-        (2, |r| r.truncated = 0, "the flight did not end as it closes"),
+        (0, |r| r.truncated = 1, "a step after the episode's end"),
+        (0, |r| r.terminated = 1, "a step after the episode's end"),
+        (2, |r| r.truncated = 0, "the episode did not end as it closes"),
         (
             3,
             |r| r.outcome = Outcome::Collided.code(),
-            "the flight did not end as it closes",
+            "the episode did not end as it closes",
         ),
         (
             2,
             |r| (r.truncated, r.terminated) = (0, 1),
-            "the flight did not end as it closes",
+            "the episode did not end as it closes",
         ),
         (1, |r| r.walls_passed = 1, "a wall passed without a level-up"),
         (1, |r| r.level_up = 1, "a level-up without a wall passed"),
@@ -270,7 +278,7 @@ fn a_flight_that_contradicts_itself_is_refused() {
 }
 
 #[test]
-fn what_was_hit_is_known_of_the_committed_flight() {
+fn what_was_hit_is_known_of_the_committed_episode() {
     for (hit_wall, expected) in [(0, None), (1, Some(1))] {
         let mut assembly = assembly(Keep::Latents);
         let mut last = record(0);
@@ -280,10 +288,10 @@ fn what_was_hit_is_known_of_the_committed_flight() {
         closing.kind = RecordKind::Closing.code();
         closing.outcome = Outcome::Collided.code();
         (closing.course_walls, closing.hit_wall) = (5, hit_wall);
-        let Assembled::Whole(flight) = assembly.push(&closing).unwrap() else {
-            panic!("a closing record ends a flight");
+        let Assembled::Whole(episode) = assembly.push(&closing).unwrap() else {
+            panic!("a closing record ends an episode");
         };
-        assert_eq!(flight.hit_wall, expected);
+        assert_eq!(episode.hit_wall, expected);
     }
 }
 

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use skein_protocol::ids::Epoch;
 use skein_protocol::ticket::Ticket;
 
-/// A flight to be flown, or a leg of one.
+/// An episode to be flown, or a segment of one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Order {
     /// What to fly.
@@ -13,11 +13,11 @@ pub struct Order {
     pub epoch: Epoch,
     /// What is kept of it.
     pub keep: Keep,
-    /// Who waits for it, and at which place among the flights ordered together.
+    /// Who waits for it, and at which place among the episodes ordered together.
     pub place: Place,
 }
 
-/// What the learner wants of a flight, besides that it is flown.
+/// What the learner wants of an episode, besides that it is flown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Keep {
     /// Latent codes and telemetry only.
@@ -26,11 +26,11 @@ pub enum Keep {
     Depth,
 }
 
-/// A place in a batch of flights that were ordered together.
+/// A place in a batch of episodes that were ordered together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Place {
     /// The batch.
     pub batch: u64,
-    /// The flight's position in it.
+    /// The episode's position in it.
     pub index: usize,
 }

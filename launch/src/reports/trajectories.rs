@@ -1,4 +1,4 @@
-//! Evaluation flights from above and from the side, through the openings of the walls.
+//! Evaluation episodes from above and from the side, through the openings of the walls.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -25,30 +25,30 @@ const CORRIDOR: RGBColor = RGBColor(0xf3, 0xf5, 0xf8);
 const WALL: RGBColor = RGBColor(0x4a, 0x50, 0x5a);
 const TIMED_OUT: RGBColor = RGBColor(0x8a, 0x5f, 0xb5);
 
-/// One evaluation flight.
+/// One evaluation episode.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct FlightPath {
+pub(super) struct Trajectory {
     /// Where the vehicle's centre was at each step, world frame, metres.
     points_m: Vec<[f32; 3]>,
     /// How it ended.
     outcome: Outcome,
 }
 
-/// The evaluation flights of each course, under the course's name.
-pub(super) type PathsByCourse = BTreeMap<String, Vec<FlightPath>>;
+/// The evaluation episodes of each course, under the course's name.
+pub(super) type PathsByCourse = BTreeMap<String, Vec<Trajectory>>;
 
-/// A row of `evaluation_paths.csv`.
+/// A row of `evaluation_trajectories.csv`.
 #[derive(Deserialize)]
 struct Row {
     course: String,
-    flight: u64,
+    episode: u64,
     x_m: f32,
     y_m: f32,
     z_m: f32,
     outcome: Outcome,
 }
 
-/// Reads `evaluation_paths.csv`: the steps of a flight follow each other.
+/// Reads `evaluation_trajectories.csv`: the steps of an episode follow each other.
 ///
 /// # Errors
 /// [`ReportError::Malformed`] names the line.
@@ -70,25 +70,25 @@ pub(super) fn read_paths(path: &Path) -> Result<PathsByCourse, ReportError> {
             .all(|metres| (-LARGEST_NUMBER..=LARGEST_NUMBER).contains(metres))
         {
             let line = rows.reader().position().line() - 1;
-            return Err(malformed(format!("line {line}: no flight comes to {at_m:?}")));
+            return Err(malformed(format!("line {line}: no episode comes to {at_m:?}")));
         }
-        let flights = courses.entry(row.course.clone()).or_default();
-        let key = Some((row.course, row.flight));
+        let episodes = courses.entry(row.course.clone()).or_default();
+        let key = Some((row.course, row.episode));
         if current != key {
-            flights.push(FlightPath {
+            episodes.push(Trajectory {
                 points_m: Vec::new(),
                 outcome: row.outcome,
             });
             current = key;
         }
-        if let Some(flight) = flights.last_mut() {
-            flight.points_m.push(at_m);
+        if let Some(episode) = episodes.last_mut() {
+            episode.points_m.push(at_m);
         }
     }
     Ok(courses)
 }
 
-/// Draws the flights of each course from above and from the side. Courses nobody flew are left out.
+/// Draws the episodes of each course from above and from the side. Courses nobody flew are left out.
 ///
 /// # Errors
 /// [`ReportError`] if the picture cannot be drawn or written.
@@ -102,8 +102,8 @@ pub(super) fn draw(courses: &[NamedCourse], paths: &PathsByCourse, path: &Path) 
     canvas.draw(|area| {
         draw_legend(area)?;
         let mut top = TOP;
-        for (name, course, flights) in &flown {
-            draw_course(area, name, course, flights, top)?;
+        for (name, course, episodes) in &flown {
+            draw_course(area, name, course, episodes, top)?;
             top += block_height(course);
         }
         Ok(())
@@ -193,7 +193,7 @@ impl Panel<'_> {
         [self.at(x_m.0, across_m.1), self.at(x_m.1, across_m.0)]
     }
 
-    fn draw(&self, area: &Area<'_>, flights: &[FlightPath]) -> Result<(), Box<dyn std::error::Error>> {
+    fn draw(&self, area: &Area<'_>, episodes: &[Trajectory]) -> Result<(), Box<dyn std::error::Error>> {
         let length_m = self.course.corridor().length_m;
         let (low, high) = self.view.range_m(self.course);
         area.draw(&Rectangle::new(
@@ -201,9 +201,11 @@ impl Panel<'_> {
             CORRIDOR.filled(),
         ))?;
         // What went wrong is drawn over what went well: it is what the reader looks for.
-        let (well, wrong): (Vec<_>, Vec<_>) = flights.iter().partition(|flight| flight.outcome == Outcome::ReachedEnd);
-        for flight in well.into_iter().chain(wrong) {
-            self.draw_flight(area, flight)?;
+        let (well, wrong): (Vec<_>, Vec<_>) = episodes
+            .iter()
+            .partition(|episode| episode.outcome == Outcome::ReachedEnd);
+        for episode in well.into_iter().chain(wrong) {
+            self.draw_episode(area, episode)?;
         }
         for wall in self.course.walls() {
             let x_m = (wall.x_m(), wall.x_m() + self.course.wall_thickness_m());
@@ -217,13 +219,13 @@ impl Panel<'_> {
         self.draw_scale(area)
     }
 
-    fn draw_flight(&self, area: &Area<'_>, flight: &FlightPath) -> Result<(), Box<dyn std::error::Error>> {
-        let points: Vec<_> = flight
+    fn draw_episode(&self, area: &Area<'_>, episode: &Trajectory) -> Result<(), Box<dyn std::error::Error>> {
+        let points: Vec<_> = episode
             .points_m
             .iter()
             .map(|&point| self.at(point[0], self.view.across_m(point)))
             .collect();
-        let (colour, opacity) = match flight.outcome {
+        let (colour, opacity) = match episode.outcome {
             Outcome::ReachedEnd => (STRONG, 0.3),
             Outcome::Collided => (REFERENCE, 0.9),
             Outcome::TimedOut => (TIMED_OUT, 0.9),
@@ -232,7 +234,7 @@ impl Panel<'_> {
             points.clone(),
             colour.mix(opacity).stroke_width(px(1)),
         ))?;
-        if let Some(&end) = points.last().filter(|_| flight.outcome != Outcome::ReachedEnd) {
+        if let Some(&end) = points.last().filter(|_| episode.outcome != Outcome::ReachedEnd) {
             area.draw(&Cross::new(end, px(5), colour.stroke_width(px(2))))?;
         }
         Ok(())
@@ -259,14 +261,14 @@ fn draw_course(
     area: &Area<'_>,
     name: &str,
     course: &Course,
-    flights: &[FlightPath],
+    episodes: &[Trajectory],
     top: u32,
 ) -> Result<(), Box<dyn std::error::Error>> {
     use plotters::style::text_anchor::{HPos, Pos, VPos};
-    let count = |outcome| flights.iter().filter(|flight| flight.outcome == outcome).count();
+    let count = |outcome| episodes.iter().filter(|episode| episode.outcome == outcome).count();
     let caption = format!(
-        "{name}: {} flights, {} reached the end, {} collided, {} timed out",
-        flights.len(),
+        "{name}: {} episodes, {} reached the end, {} collided, {} timed out",
+        episodes.len(),
         count(Outcome::ReachedEnd),
         count(Outcome::Collided),
         count(Outcome::TimedOut)
@@ -282,8 +284,8 @@ fn draw_course(
         view: View::Side,
         top: above.top + panel_height(course, View::Above) + PANEL_GAP,
     };
-    above.draw(area, flights)?;
-    side.draw(area, flights)?;
+    above.draw(area, episodes)?;
+    side.draw(area, episodes)?;
     let centred = font(14).pos(Pos::new(HPos::Center, VPos::Top));
     for x_m in (0..=course.corridor().length_m as u32).step_by(10) {
         let (x, y) = side.at(x_m as f32, 0.0);
@@ -294,7 +296,7 @@ fn draw_course(
 
 fn draw_legend(area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
     let y = px(22) as i32;
-    area.draw_text("Evaluation flights", &font(22), (px(LEFT) as i32, y - px(11) as i32))?;
+    area.draw_text("Evaluation episodes", &font(22), (px(LEFT) as i32, y - px(11) as i32))?;
     let mut x = px(LEFT + 230) as i32;
     for (label, colour) in [
         ("reached the end", STRONG),
@@ -317,17 +319,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn flights_are_told_apart_by_course_and_number() {
+    fn episodes_are_told_apart_by_course_and_number() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("evaluation_paths.csv");
-        let rows = "course,flight,step,x_m,y_m,z_m,outcome\n\
+        let path = directory.path().join("evaluation_trajectories.csv");
+        let rows = "course,episode,step,x_m,y_m,z_m,outcome\n\
                     a,0,0,1,0,3,collided\na,0,1,2,0,3,collided\na,1,0,1,0,3,reached_end\nb,1,0,1,0,3,timed_out\n";
         std::fs::write(&path, rows).unwrap();
         let paths = read_paths(&path).unwrap();
         let lengths = |name: &str| {
             paths[name]
                 .iter()
-                .map(|flight| flight.points_m.len())
+                .map(|episode| episode.points_m.len())
                 .collect::<Vec<_>>()
         };
         assert_eq!((lengths("a"), lengths("b")), (vec![2, 1], vec![1]));
@@ -346,14 +348,14 @@ mod tests {
     }
 
     #[test]
-    fn a_place_that_no_flight_comes_to_is_named_by_its_line() {
+    fn a_place_that_no_episode_comes_to_is_named_by_its_line() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("evaluation_paths.csv");
+        let path = directory.path().join("evaluation_trajectories.csv");
         for place in ["nan,0,0", "0,-inf,0", "0,0,1e30"] {
-            let rows = format!("course,flight,step,x_m,y_m,z_m,outcome\na,0,0,{place},collided\n");
+            let rows = format!("course,episode,step,x_m,y_m,z_m,outcome\na,0,0,{place},collided\n");
             std::fs::write(&path, rows).unwrap();
             let error = read_paths(&path).unwrap_err().to_string();
-            assert!(error.contains("line 2: no flight comes to"), "{error}");
+            assert!(error.contains("line 2: no episode comes to"), "{error}");
         }
     }
 }

@@ -1,7 +1,7 @@
-//! Flies the oracle pilot through every shipped course with every drone and prints how many flights arrived.
+//! Flies the oracle through every shipped course with every drone and prints how many episodes arrived.
 //!
-//! `cargo run --release -p skein-simulator --example oracle_flight [flights]` (100 per course, drone and start level by default).
-//! Below 99 % either the course or the drone is wrong. What the same pilot makes of an evaluation suite: `oracle_suite`.
+//! `cargo run --release -p skein-simulator --example oracle_episode [episodes]` (100 per course, drone and start level by default).
+//! Below 99 % either the course or the drone is wrong. What the same policy makes of an evaluation suite: `oracle_suite`.
 
 use std::error::Error;
 use std::path::Path;
@@ -15,14 +15,14 @@ use skein_simulator::simulator::{Outcome, Simulator, SimulatorSettings};
 use skein_simulator::vehicle::{Preset, VehicleSettings};
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let flights: u64 = std::env::args().nth(1).map_or(Ok(100), |argument| argument.parse())?;
+    let episodes: u64 = std::env::args().nth(1).map_or(Ok(100), |argument| argument.parse())?;
     let mut files: Vec<_> = std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses"))?
         .map(|entry| entry.map(|entry| entry.path()))
         .collect::<Result<_, _>>()?;
     files.sort();
 
     println!(
-        "{:<20} {:<12} arrived of {flights}, from the start of each level",
+        "{:<20} {:<12} arrived of {episodes}, from the start of each level",
         "course", "drone"
     );
     for file in &files {
@@ -39,8 +39,8 @@ fn main() -> Result<(), Box<dyn Error>> {
             print!("{:<20} {:<12}", course.name(), format!("{preset:?}").to_lowercase());
             for level in 1..=course.levels() {
                 let mut arrived = 0;
-                for flight in 0..flights {
-                    if fly(&mut simulator, level, flight)? == Outcome::ReachedEnd {
+                for episode in 0..episodes {
+                    if fly(&mut simulator, level, episode)? == Outcome::ReachedEnd {
                         arrived += 1;
                     }
                 }

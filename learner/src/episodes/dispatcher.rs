@@ -1,8 +1,8 @@
-//! The ticket desk: who flies what, what has come of it, what must be flown again.
+//! The ticket dispatcher: who flies what, what has come of it, what must be flown again.
 //!
-//! Actors fly only against tickets and get another one only as a flight is taken in, so what is in flight is bounded and no buffer can overflow. A flight
+//! Actors fly only against tickets and get another one only as an episode is taken in, so what is outstanding is bounded and no buffer can overflow. An episode
 //! that arrives with a hole, from a dead actor, or too late is discarded whole and its ticket issued again, with the next attempt number: exactly-once
-//! commit from at-least-once flying. Which actor flies a ticket, and how often, changes nothing in the flight.
+//! commit from at-least-once flying. Which actor flies a ticket, and how often, changes nothing in the episode.
 //!
 //! Deliberately absent: clocks and transport. Time is passed in, messages are passed in and out, so that every path can be tested.
 
@@ -10,27 +10,27 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use skein_protocol::config::TransportSection;
-use skein_protocol::ids::{ActorId, Attempt, FlightId, Incarnation, RunId};
+use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, RunId};
 use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus};
 use skein_protocol::ticket::{ControlRecord, Message, Ticket};
 use skein_protocol::transition::{RecordFault, TransitionRecord};
 
-use super::assembly::{Assembled, Assembly, LegEnd};
+use super::assembly::{Assembled, Assembly, SegmentEnd};
 use super::failures::Failures;
 use super::faults::{Faults, Refusal, Reissue};
-use super::situation::{FlightOut, Situation};
-use crate::flight::CommittedFlight;
+use super::situation::{EpisodeOut, Situation};
+use crate::episode::CommittedEpisode;
 
-pub use super::failures::HopelessFlight;
+pub use super::failures::HopelessEpisode;
 pub use super::order::{Order, Place};
 
-/// Flights that an actor may spoil one after the other before others are preferred to it.
+/// Episodes that an actor may spoil one after the other before others are preferred to it.
 const MOST_SPOILED: u32 = 3;
 
 /// The book-keeping.
 #[derive(Debug)]
-pub struct Desk {
+pub struct Dispatcher {
     run: RunId,
     limits: TransportSection,
     /// Length of the latent codes that actors send.
@@ -46,17 +46,17 @@ pub struct Desk {
     letters: Vec<Message>,
     /// Whether something was said to an actor that may not look by itself.
     is_wake_due: bool,
-    /// Where the last leg ended, if its flight goes on.
-    leg_end: Option<LegEnd>,
+    /// Where the last segment ended, if its episode goes on.
+    segment_end: Option<SegmentEnd>,
 }
 
 #[derive(Debug)]
 struct Actor {
-    incarnation: Incarnation,
+    incarnation: ActorIncarnation,
     last_sign: Instant,
     /// Tickets it holds, in the order it flies them.
     tickets: VecDeque<Issued>,
-    /// Flights it has spoiled since the last one that was committed.
+    /// Episodes it has spoiled since the last one that was committed.
     spoiled: u32,
     /// What its time had gone into when it was first heard of: an actor that was taken for dead and is not is not counted twice.
     first_times: Times,
@@ -89,8 +89,8 @@ impl Issued {
     }
 }
 
-impl Desk {
-    /// A desk of `run` without orders and actors; records hold codes of `latent` numbers.
+impl Dispatcher {
+    /// A dispatcher of `run` without orders and actors; records hold codes of `latent` numbers.
     pub fn new(run: RunId, limits: &TransportSection, latent: usize) -> Self {
         Self {
             run,
@@ -103,7 +103,7 @@ impl Desk {
             times_of_the_gone: Times::default(),
             letters: Vec::new(),
             is_wake_due: false,
-            leg_end: None,
+            segment_end: None,
         }
     }
 
@@ -123,7 +123,7 @@ impl Desk {
         living.fold(self.times_of_the_gone, |sum, times| sum.plus(&times))
     }
 
-    /// Counts a sign of life that makes no sense.
+    /// Counts a heartbeat that makes no sense.
     pub fn refuse_status(&mut self) {
         self.faults.refuse(Refusal::Status);
     }
@@ -132,8 +132,8 @@ impl Desk {
     pub fn situation(&self, now: Instant) -> Situation {
         let since = |then| now.saturating_duration_since(then);
         let out = self.actors.iter().flat_map(|(id, actor)| {
-            actor.tickets.iter().map(move |issued| FlightOut {
-                flight: issued.ticket().flight,
+            actor.tickets.iter().map(move |issued| EpisodeOut {
+                episode: issued.ticket().episode,
                 actor: *id,
                 records: issued.assembly.records(),
                 issued: since(issued.since),
@@ -141,7 +141,7 @@ impl Desk {
             })
         });
         let mut out: Vec<_> = out.collect();
-        out.sort_by_key(|out| out.flight);
+        out.sort_by_key(|out| out.episode);
         Situation {
             actors: self.actors.len(),
             waiting: self.waiting.len(),
@@ -159,7 +159,7 @@ impl Desk {
         self.waiting.push_back(order);
     }
 
-    /// Takes an actor's sign of life: a new actor, or a new life of a known one, can be given tickets from now on.
+    /// Takes an actor's heartbeat: a new actor, or a new incarnation of a known one, can be given tickets from now on.
     pub fn on_status(&mut self, status: &ActorStatus, now: Instant) {
         let known = self.actors.get(&status.actor).map(|actor| actor.incarnation);
         match status.state {
@@ -171,7 +171,7 @@ impl Desk {
                     self.dismiss(status.actor, Reissue::Left);
                 }
             }
-            // An older life's late word is not believed: incarnations grow.
+            // An older incarnation's late word is not believed: incarnations grow.
             ActorState::Serving if known.is_some_and(|known| known > status.incarnation) => {}
             ActorState::Serving => {
                 if known.is_some_and(|known| known != status.incarnation) {
@@ -207,15 +207,15 @@ impl Desk {
         }
     }
 
-    /// Takes a record; returns the flight it completes.
+    /// Takes a record; returns the episode it completes.
     ///
     /// # Errors
-    /// [`HopelessFlight`] when a flight has failed too often.
+    /// [`HopelessEpisode`] when an episode has failed too often.
     pub fn on_record(
         &mut self,
         record: &TransitionRecord,
         now: Instant,
-    ) -> Result<Option<(Place, CommittedFlight)>, HopelessFlight> {
+    ) -> Result<Option<(Place, CommittedEpisode)>, HopelessEpisode> {
         let id = ActorId(record.actor);
         let Some(actor) = self
             .actors
@@ -226,10 +226,11 @@ impl Desk {
             return Ok(None);
         };
         actor.last_sign = now;
-        let is_of =
-            |issued: &Issued| issued.ticket().flight.0 == record.flight && issued.ticket().attempt.0 == record.attempt;
+        let is_of = |issued: &Issued| {
+            issued.ticket().episode.0 == record.episode && issued.ticket().attempt.0 == record.attempt
+        };
         let Some(position) = actor.tickets.iter().position(is_of) else {
-            // The rest of a flight that was given up.
+            // The rest of an episode that was given up.
             self.faults.refuse(Refusal::NoTicket);
             return Ok(None);
         };
@@ -243,32 +244,32 @@ impl Desk {
         self.advance(id, record, now)
     }
 
-    /// Takes the record into the first flight of actor `id`.
+    /// Takes the record into the first episode of actor `id`.
     fn advance(
         &mut self,
         id: ActorId,
         record: &TransitionRecord,
         now: Instant,
-    ) -> Result<Option<(Place, CommittedFlight)>, HopelessFlight> {
+    ) -> Result<Option<(Place, CommittedEpisode)>, HopelessEpisode> {
         let Some(issued) = self.actors.get_mut(&id).and_then(|actor| actor.tickets.front_mut()) else {
             return Ok(None);
         };
         match issued.assembly.push(record) {
             Ok(Assembled::Step) => Ok(None),
-            Ok(Assembled::Whole(flight)) => {
+            Ok(Assembled::Whole(episode)) => {
                 let place = issued.assembly.order().place;
                 self.remove_first(id, now);
-                self.failures.flown(flight.flight);
-                self.leg_end = LegEnd::of(&flight);
-                Ok(Some((place, *flight)))
+                self.failures.flown(episode.episode);
+                self.segment_end = SegmentEnd::of(&episode);
+                Ok(Some((place, *episode)))
             }
             Ok(Assembled::Failed) => {
-                let flight = issued.ticket().flight;
-                self.fail(id, flight, "the simulator broke down").map(|()| None)
+                let episode = issued.ticket().episode;
+                self.fail(id, episode, "the simulator broke down").map(|()| None)
             }
             Err(fault) => {
-                let flight = issued.ticket().flight;
-                self.refuse(id, flight, record, &fault).map(|()| None)
+                let episode = issued.ticket().episode;
+                self.refuse(id, episode, record, &fault).map(|()| None)
             }
         }
     }
@@ -276,13 +277,13 @@ impl Desk {
     fn refuse(
         &mut self,
         id: ActorId,
-        flight: FlightId,
+        episode: EpisodeId,
         record: &TransitionRecord,
         fault: &RecordFault,
-    ) -> Result<(), HopelessFlight> {
+    ) -> Result<(), HopelessEpisode> {
         self.faults.refuse(fault.into());
         if self.is_worth_telling(id) {
-            tracing::warn!(actor = %id, %flight, step = record.step, %fault, "record refused");
+            tracing::warn!(actor = %id, %episode, step = record.step, %fault, "record refused");
         }
         match fault {
             // Something got lost on the way, which need not happen again.
@@ -291,29 +292,29 @@ impl Desk {
                 Ok(())
             }
             // What an actor computed makes no sense.
-            fault => self.fail(id, flight, &fault.to_string()),
+            fault => self.fail(id, episode, &fault.to_string()),
         }
     }
 
-    /// Has the first flight of actor `id` flown again, but not for ever.
-    fn fail(&mut self, id: ActorId, flight: FlightId, why: &str) -> Result<(), HopelessFlight> {
-        self.failures.failed(flight, id, why)?;
+    /// Has the first episode of actor `id` flown again, but not for ever.
+    fn fail(&mut self, id: ActorId, episode: EpisodeId, why: &str) -> Result<(), HopelessEpisode> {
+        self.failures.failed(episode, id, why)?;
         self.spoil_first(id, Reissue::Failed);
         Ok(())
     }
 
-    /// Has the first flight of actor `id` flown again, and remembers it of the actor.
+    /// Has the first episode of actor `id` flown again, and remembers it of the actor.
     fn spoil_first(&mut self, id: ActorId, why: Reissue) {
         self.reissue_first(id, why);
         if let Some(actor) = self.actors.get_mut(&id) {
             actor.spoiled += 1;
             if actor.spoiled == MOST_SPOILED {
-                tracing::warn!(actor = %id, flights = actor.spoiled, "actor spoils every flight; others are preferred to it");
+                tracing::warn!(actor = %id, episodes = actor.spoiled, "actor spoils every episode; others are preferred to it");
             }
         }
     }
 
-    /// An actor that spoils flights for ever must not fill the log: every doubling is told.
+    /// An actor that spoils episodes for ever must not fill the log: every doubling is told.
     fn is_worth_telling(&self, id: ActorId) -> bool {
         let spoiled = self.actors.get(&id).map_or(0, |actor| actor.spoiled);
         spoiled == 0 || spoiled.is_power_of_two()
@@ -322,7 +323,7 @@ impl Desk {
     /// Gives up actors that are silent and tickets that take too long.
     pub fn on_time(&mut self, now: Instant) {
         let silence = Duration::from_secs_f64(self.limits.actor_silence_secs);
-        let deadline = Duration::from_secs_f64(self.limits.flight_deadline_secs);
+        let deadline = Duration::from_secs_f64(self.limits.episode_deadline_secs);
         let ids: Vec<ActorId> = self.actors.keys().copied().collect();
         for id in ids {
             let actor = &self.actors[&id];
@@ -344,7 +345,7 @@ impl Desk {
     }
 
     /// Hands out tickets as far as there are orders and actors with credit: each actor its first before any its second, and none to an actor that spoils
-    /// every flight while there are others. Returns what to send.
+    /// every episode while there are others. Returns what to send.
     pub fn issue(&mut self, now: Instant) -> Vec<Message> {
         let mut messages = std::mem::take(&mut self.letters);
         self.is_wake_due |= !messages.is_empty();
@@ -362,8 +363,8 @@ impl Desk {
                 break;
             };
             messages.push(Message::fly(&order.ticket, id, actor.incarnation));
-            let begins = self.leg_end.filter(|end| end.is_before(&order));
-            let longest = self.limits.max_records_per_flight;
+            let begins = self.segment_end.filter(|end| end.is_before(&order));
+            let longest = self.limits.max_records_per_episode;
             let assembly = Assembly::new(order, begins, longest, self.latent, id, actor.incarnation);
             self.is_wake_due |= actor.may_wait || actor.tickets.is_empty();
             actor.tickets.push_back(Issued {
@@ -376,7 +377,7 @@ impl Desk {
     }
 
     /// Whether an actor may wait that was given something since this was last asked. One that flies looks by itself before each step, and to wake all actors
-    /// for every flight costs the more, the more of them there are.
+    /// for every episode costs the more, the more of them there are.
     pub fn take_wake(&mut self) -> bool {
         std::mem::take(&mut self.is_wake_due)
     }
@@ -422,20 +423,20 @@ impl Desk {
     fn reissue(&mut self, issued: Issued, id: ActorId, why: Reissue) {
         let mut order = issued.assembly.into_order();
         if self.is_worth_telling(id) {
-            tracing::warn!(actor = %id, flight = %order.ticket.flight, attempt = %order.ticket.attempt, "ticket issued again: it or its actor {}", why.name());
+            tracing::warn!(actor = %id, episode = %order.ticket.episode, attempt = %order.ticket.attempt, "ticket issued again: it or its actor {}", why.name());
         }
         order.ticket.attempt = Attempt(order.ticket.attempt.0.wrapping_add(1));
         self.faults.reissue(why);
-        // Others wait for the oldest flights: back to the front.
+        // Others wait for the oldest episodes: back to the front.
         self.waiting.push_front(order);
     }
 }
 
 #[cfg(test)]
-#[path = "leg_tests.rs"]
-mod leg_tests;
+#[path = "segment_tests.rs"]
+mod segment_tests;
 #[cfg(test)]
-#[path = "desk_tests.rs"]
+#[path = "dispatcher_tests.rs"]
 mod tests;
 #[cfg(test)]
 #[path = "waking_tests.rs"]

@@ -3,27 +3,27 @@
 use std::fmt;
 use std::time::Duration;
 
-use skein_protocol::ids::{ActorId, FlightId};
+use skein_protocol::ids::{ActorId, EpisodeId};
 
-/// Flights that are named at most.
+/// Episodes that are named at most.
 const NAMED: usize = 4;
 
-/// What of the flights ordered is where.
+/// What of the episodes ordered is where.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Situation {
     /// Actors that live.
     pub actors: usize,
-    /// Flights that no actor holds a ticket for.
+    /// Episodes that no actor holds a ticket for.
     pub waiting: usize,
-    /// Flights that an actor holds a ticket for, in order of their numbers.
-    pub out: Vec<FlightOut>,
+    /// Episodes that an actor holds a ticket for, in order of their numbers.
+    pub out: Vec<EpisodeOut>,
 }
 
-/// A flight in an actor's hands.
+/// An episode in an actor's hands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct FlightOut {
-    /// The flight.
-    pub flight: FlightId,
+pub struct EpisodeOut {
+    /// The episode.
+    pub episode: EpisodeId,
     /// Who has the ticket.
     pub actor: ActorId,
     /// Records that have arrived.
@@ -37,19 +37,19 @@ pub struct FlightOut {
 impl fmt::Display for Situation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match (self.actors, self.waiting) {
-            (0, waiting) => return write!(f, "no actor is attached; flights that wait for one: {waiting}"),
-            (actors, 0) => write!(f, "actors: {actors}; flights out: {}", self.out.len())?,
+            (0, waiting) => return write!(f, "no actor is attached; episodes that wait for one: {waiting}"),
+            (actors, 0) => write!(f, "actors: {actors}; episodes out: {}", self.out.len())?,
             (actors, waiting) => write!(
                 f,
-                "actors: {actors}; flights out: {}, waiting: {waiting}",
+                "actors: {actors}; episodes out: {}, waiting: {waiting}",
                 self.out.len()
             )?,
         }
         for out in self.out.iter().take(NAMED) {
             write!(
                 f,
-                "; flight {} with actor {} for {:.0} s, {} records, the actor heard {:.1} s ago",
-                out.flight,
+                "; episode {} with actor {} for {:.0} s, {} records, the actor heard {:.1} s ago",
+                out.episode,
                 out.actor,
                 out.issued.as_secs_f64(),
                 out.records,
@@ -68,9 +68,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_names_the_first_flights_out_and_who_has_them() {
-        let out = |flight| FlightOut {
-            flight: FlightId(flight),
+    fn it_names_the_first_episodes_out_and_who_has_them() {
+        let out = |episode| EpisodeOut {
+            episode: EpisodeId(episode),
             actor: ActorId(3),
             records: 12,
             issued: Duration::from_secs(31),
@@ -82,12 +82,15 @@ mod tests {
             out: (7..12).map(out).collect(),
         };
         let told = situation.to_string();
-        assert!(told.starts_with("actors: 2; flights out: 5, waiting: 1; flight 7 with actor 3 for 31 s, 12 records, the actor heard 0.3 s ago"));
+        assert!(told.starts_with("actors: 2; episodes out: 5, waiting: 1; episode 7 with actor 3 for 31 s, 12 records, the actor heard 0.3 s ago"));
         assert!(told.ends_with("; and 1 more"), "{told}");
         let nobody = Situation {
             waiting: 5,
             ..Situation::default()
         };
-        assert_eq!(nobody.to_string(), "no actor is attached; flights that wait for one: 5");
+        assert_eq!(
+            nobody.to_string(),
+            "no actor is attached; episodes that wait for one: 5"
+        );
     }
 }
