@@ -1,4 +1,5 @@
-//! Tells the linker where libtorch lies at run time, so that tests start without `LD_LIBRARY_PATH`; and the tests what they are built for.
+//! Tells the linker where libtorch lies at run time, so that tests start without `LD_LIBRARY_PATH`;
+//! and the tests what they are built for.
 
 fn main() {
     println!("cargo:rerun-if-changed=build.rs");

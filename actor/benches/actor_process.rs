@@ -1,6 +1,8 @@
-//! An actor as a process: how soon after its start the first record is there, and how much memory it takes.
+//! An actor as a process: how soon after its start the first record is there, and how much memory
+//! it takes.
 //!
-//! The learner's ends are this program's, and answer at once: what is measured is the actor alone. Each figure is a line of JSON; `--quick` tries once.
+//! The learner's ends are this program's, and answer at once: what is measured is the actor alone.
+//! Each figure is a line of JSON; `--quick` tries once.
 
 mod common;
 
@@ -19,7 +21,8 @@ use common::{Learner, ticket};
 
 /// Longer than any machine takes for a step.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Episodes after which memory is looked at, each with a snapshot of its own: the actor then holds as many as it ever does, and has let go of others.
+/// Episodes after which memory is looked at, each with a snapshot of its own: the actor then holds
+/// as many as it ever does, and has let go of others.
 const EPISODES: u64 = 12;
 const ACTOR: ActorId = ActorId(0);
 
@@ -40,7 +43,12 @@ fn main() {
         resident_bytes = resident_bytes.max(bytes);
     }
     start_secs.sort_by(f64::total_cmp);
-    let line = |name, figure, unit| println!("{}", json!({ "name": name, "figure": figure, "unit": unit }));
+    let line = |name, figure, unit| {
+        println!(
+            "{}",
+            json!({ "name": name, "figure": figure, "unit": unit })
+        )
+    };
     line("actor_process/start", start_secs[starts / 2] * 1e3, "ms");
     line("actor_process/resident", resident_bytes as f64 / 1e6, "MB");
 }
@@ -54,13 +62,16 @@ impl Learner {
         self.ports.publish(&snapshot).expect("there is memory");
     }
 
-    /// Starts an actor and lets it fly, first with the snapshot of this `version`, then with newer ones; seconds until its first record, and the most bytes that
-    /// were resident.
+    /// Starts an actor and lets it fly, first with the snapshot of this `version`, then with newer
+    /// ones; seconds until its first record, and the most bytes that were resident.
     fn watch_an_actor(&self, version: &mut u64) -> (f64, u64) {
         let started = Instant::now();
         let actor = Actor::start(self.directory.path());
         let incarnation = self.until(|| {
-            let status = self.ports.receive_status().expect("its memory can be mapped")?;
+            let status = self
+                .ports
+                .receive_status()
+                .expect("its memory can be mapped")?;
             // Late words of the actor before are none of this one's.
             let status = status.read(self.identity.run)?;
             (status.pid == actor.0.id()).then_some(status.incarnation)
@@ -69,7 +80,10 @@ impl Learner {
         self.until(|| self.record(incarnation));
         let secs = started.elapsed().as_secs_f64();
         for episode in 1..EPISODES {
-            self.until(|| Some(self.record(incarnation)?.kind == RecordKind::Closing.code()).filter(|closed| *closed));
+            self.until(|| {
+                Some(self.record(incarnation)?.kind == RecordKind::Closing.code())
+                    .filter(|closed| *closed)
+            });
             *version += 1;
             self.publish(*version);
             self.fly(episode, *version, incarnation);
@@ -82,7 +96,9 @@ impl Learner {
             policy_version: PolicyVersion(version),
             ..ticket(self.identity.run, episode, 1)
         };
-        self.ports.maintain().expect("the actor's memory can be mapped");
+        self.ports
+            .maintain()
+            .expect("the actor's memory can be mapped");
         self.ports
             .send_control(ControlRecord::fly(&ticket, ACTOR, incarnation))
             .expect("there is memory");
@@ -127,7 +143,8 @@ impl Actor {
 
     /// The most memory that it had to itself or shared, as the kernel counts it.
     fn resident_bytes(&self) -> u64 {
-        let status = fs::read_to_string(format!("/proc/{}/status", self.0.id())).expect("it is there");
+        let status =
+            fs::read_to_string(format!("/proc/{}/status", self.0.id())).expect("it is there");
         let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
         let kib: Option<u64> = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
         kib.expect("the kernel tells it in KiB") << 10

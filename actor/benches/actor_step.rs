@@ -1,9 +1,11 @@
 //! One actor's whole step, from the camera to the record sent, against the sum of its stages.
 //!
-//! An iteration is a training episode through real shared memory, no longer than it must be: the shorter, the more of them nobody disturbs. Every stage is
-//! given exactly what it was made of, so that whatever the whole takes beyond the sum of the stages is the loop's own. The learner's end is emptied after
-//! each episode, outside the time taken. What an actor does for the learner's sake between two steps, to listen and to give heartbeats (`control` in the table
-//! of a run), is in neither: it depends on what the learner says.
+//! An iteration is a training episode through real shared memory, no longer than it must be: the
+//! shorter, the more of them nobody disturbs. Every stage is given exactly what it was made of, so
+//! that whatever the whole takes beyond the sum of the stages is the loop's own. The learner's end
+//! is emptied after each episode, outside the time taken. What an actor does for the learner's sake
+//! between two steps, to listen and to give heartbeats (`control` in the table of a run), is in
+//! neither: it depends on what the learner says.
 
 mod common;
 
@@ -57,25 +59,43 @@ fn main() {
             transport.received()
         })
         .collect();
-    let steps = episodes.iter().map(|records| records.len() - 1).sum::<usize>();
+    let steps = episodes
+        .iter()
+        .map(|records| records.len() - 1)
+        .sum::<usize>();
 
     let mut group = criterion.benchmark_group("actor_step");
     group.throughput(Throughput::Elements(steps as u64));
     group.bench_function("whole", |bencher| {
         bencher.iter_custom(|iterations| {
             timed(iterations, episodes.len(), &transport, |episode| {
-                fly(&mut environment_loop, &tickets[episode], &network, &transport);
+                fly(
+                    &mut environment_loop,
+                    &tickets[episode],
+                    &network,
+                    &transport,
+                );
             })
         });
     });
-    environment(&mut group, &tickets, &episodes, &mut Simulators::new(courses));
+    environment(
+        &mut group,
+        &tickets,
+        &episodes,
+        &mut Simulators::new(courses),
+    );
     inference(&mut group, &episodes, &network, &config.view());
     sending(&mut group, &tickets, &episodes, &transport);
     group.finish();
     criterion.final_summary();
 }
 
-fn fly(environment_loop: &mut EnvironmentLoop, ticket: &Ticket, network: &Network, transport: &Transport) {
+fn fly(
+    environment_loop: &mut EnvironmentLoop,
+    ticket: &Ticket,
+    network: &Network,
+    transport: &Transport,
+) {
     let flown = environment_loop.fly(ticket, network, &mut Link(&transport.actor));
     black_box(flown.expect("memory is free, as all records were taken in"));
 }
@@ -99,7 +119,11 @@ fn environment(
                     .expect("it has this level");
                 simulator.render(&mut image);
                 for record in steps_of(records) {
-                    black_box(simulator.step(record.action).expect("the episode was flown before"));
+                    black_box(
+                        simulator
+                            .step(record.action)
+                            .expect("the episode was flown before"),
+                    );
                     simulator.render(&mut image);
                     black_box(&image);
                 }
@@ -128,8 +152,17 @@ fn inference(
     group.bench_function("policy", |bencher| {
         bencher.iter(|| {
             for record in episodes.iter().flat_map(|records| steps_of(records)) {
-                view.write_moment(&record.latent, &record.velocity_mps, &[0.0; ACTION], &mut observed);
-                black_box(network.distribution(&observed, &mut scratch).sample(&mut noise));
+                view.write_moment(
+                    &record.latent,
+                    &record.velocity_mps,
+                    &[0.0; ACTION],
+                    &mut observed,
+                );
+                black_box(
+                    network
+                        .distribution(&observed, &mut scratch)
+                        .sample(&mut noise),
+                );
             }
         });
     });
@@ -143,11 +176,19 @@ fn sending(
     transport: &Transport,
 ) {
     let begin = |ticket: &Ticket, step| {
-        let mut record = transport.actor.loan_transition().expect("all records were taken in");
+        let mut record = transport
+            .actor
+            .loan_transition()
+            .expect("all records were taken in");
         record.begin(ticket, ACTOR, INCARNATION, step);
         record
     };
-    let send = |record| transport.actor.send_transition(record).expect("the learner is there");
+    let send = |record| {
+        transport
+            .actor
+            .send_transition(record)
+            .expect("the learner is there")
+    };
     group.bench_function("sending", |bencher| {
         bencher.iter_custom(|iterations| {
             timed(iterations, episodes.len(), transport, |episode| {
@@ -162,8 +203,14 @@ fn sending(
     });
 }
 
-/// Time that `work` takes on all of so many episodes, `iterations` times; the learner's end is emptied after each, at nobody's cost.
-fn timed(iterations: u64, episodes: usize, transport: &Transport, mut work: impl FnMut(usize)) -> Duration {
+/// Time that `work` takes on all of so many episodes, `iterations` times; the learner's end is
+/// emptied after each, at nobody's cost.
+fn timed(
+    iterations: u64,
+    episodes: usize,
+    transport: &Transport,
+    mut work: impl FnMut(usize),
+) -> Duration {
     let mut spent = Duration::ZERO;
     for _ in 0..iterations {
         for episode in 0..episodes {
@@ -177,7 +224,9 @@ fn timed(iterations: u64, episodes: usize, transport: &Transport, mut work: impl
 }
 
 fn steps_of(records: &[TransitionRecord]) -> impl Iterator<Item = &TransitionRecord> {
-    records.iter().filter(|record| record.kind == RecordKind::Step.code())
+    records
+        .iter()
+        .filter(|record| record.kind == RecordKind::Step.code())
 }
 
 /// Both ends of a run's services, on one thread.
@@ -189,8 +238,12 @@ struct Transport {
 impl Transport {
     fn open() -> Self {
         let learner = Learner::open();
-        let actor = ActorPorts::join(&learner.identity, &learner.config).expect("the learner is there");
-        learner.ports.maintain().expect("the actor's memory can be mapped");
+        let actor =
+            ActorPorts::join(&learner.identity, &learner.config).expect("the learner is there");
+        learner
+            .ports
+            .maintain()
+            .expect("the actor's memory can be mapped");
         Self { actor, learner }
     }
 

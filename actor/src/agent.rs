@@ -32,7 +32,8 @@ impl Agent {
         }
     }
 
-    /// Looks through the drone's camera: the image is rendered into `record`, wherever that lies, and encoded from there. `lap` is called after each.
+    /// Looks through the drone's camera: the image is rendered into `record`, wherever that lies,
+    /// and encoded from there. `lap` is called after each.
     pub fn observe(
         &mut self,
         simulator: &mut Simulator,
@@ -51,8 +52,9 @@ impl Agent {
         lap(Stage::Encoder);
     }
 
-    /// Chooses an action on the observation in `record`, each command in [-1, 1]. `noise` is drawn from unless the policy's mode is asked for. Called for each step
-    /// of an episode, in order; the record of step 0 begins another one.
+    /// Chooses an action on the observation in `record`, each command in [-1, 1]. `noise` is drawn
+    /// from unless the policy's mode is asked for. Called for each step of an episode, in order;
+    /// the record of step 0 begins another one.
     pub fn act(
         &mut self,
         exploration: Exploration,
@@ -82,7 +84,8 @@ impl Agent {
         }
     }
 
-    /// Keeps what is seen of the moment in `record`, and forgets what was seen in an earlier episode.
+    /// Keeps what is seen of the moment in `record`, and forgets what was seen in an earlier
+    /// episode.
     fn remember(&mut self, record: &TransitionRecord, previous_action: &[f32; ACTION]) {
         let len = self.view.moment_len();
         let first = record.step as usize * len;

@@ -21,7 +21,8 @@ pub struct Courses {
     evaluation: Vec<EvaluationEntry>,
 }
 
-/// What a ticket of [`CourseChoice::Evaluation`] names: a course, or several that its episodes fly in turn.
+/// What a ticket of [`CourseChoice::Evaluation`] names: a course, or several that its episodes fly
+/// in turn.
 #[derive(Debug)]
 pub struct EvaluationEntry {
     /// Courses, and what reports call them.
@@ -34,7 +35,8 @@ pub struct EvaluationEntry {
 pub struct Simulators {
     courses: Arc<Courses>,
     fixed: HashMap<CourseChoice, Simulator>,
-    /// Where every episode has a course of its own, only the last is kept: a ticket issued again may come back to it.
+    /// Where every episode has a course of its own, only the last is kept: a ticket issued again
+    /// may come back to it.
     passing: Option<(Passing, Simulator)>,
 }
 
@@ -71,7 +73,10 @@ impl Courses {
                 settings: settings.clone(),
             })
         };
-        let evaluation = paths.iter().map(entry).collect::<Result<_, CoursesError>>()?;
+        let evaluation = paths
+            .iter()
+            .map(entry)
+            .collect::<Result<_, CoursesError>>()?;
         Ok(Self {
             settings,
             training: None,
@@ -141,12 +146,18 @@ impl Courses {
         let choice = ticket.course;
         let (course, settings) = match choice {
             CourseChoice::Training => {
-                let course = self.training.clone().ok_or(NoCourse::NotLoaded { choice })?;
+                let course = self
+                    .training
+                    .clone()
+                    .ok_or(NoCourse::NotLoaded { choice })?;
                 (course, &self.settings)
             }
             CourseChoice::Evaluation(index) => {
                 let EvaluationEntry { entry, settings } = self.entry(choice, index)?;
-                (entry.courses.of_episode(evaluation_episode(ticket))?, settings)
+                (
+                    entry.courses.of_episode(evaluation_episode(ticket))?,
+                    settings,
+                )
             }
             CourseChoice::Generated(seed) => (
                 Arc::new(Course::generate(seed, &self.settings.generator)?),
@@ -170,9 +181,13 @@ impl Courses {
     }
 }
 
-/// The episode's number within its evaluation, from 0: the one that says which of several courses it flies.
+/// The episode's number within its evaluation, from 0: the one that says which of several courses
+/// it flies.
 fn evaluation_episode(ticket: &Ticket) -> u64 {
-    ticket.episode.0.saturating_sub(EpisodeId::FIRST_EVALUATION.0)
+    ticket
+        .episode
+        .0
+        .saturating_sub(EpisodeId::FIRST_EVALUATION.0)
 }
 
 impl Simulators {
@@ -222,7 +237,9 @@ fn load(path: &Path) -> Result<Arc<Course>, CoursesError> {
 fn simulator_settings(config: &Config) -> Result<SimulatorSettings, CoursesError> {
     toml::Value::Table(config.simulator.clone())
         .try_into()
-        .map_err(|error: toml::de::Error| CoursesError::Settings(error.to_string().trim_end().replace('\n', " ")))
+        .map_err(|error: toml::de::Error| {
+            CoursesError::Settings(error.to_string().trim_end().replace('\n', " "))
+        })
 }
 
 /// Why the courses of a run or an evaluation cannot be had.
@@ -303,10 +320,18 @@ mod tests {
     #[test]
     fn evaluation_courses_go_by_their_files_names_in_order() {
         let courses = Courses::of_run(&config("")).unwrap();
-        let names: Vec<_> = courses.evaluation().map(|entry| entry.name.as_str()).collect();
+        let names: Vec<_> = courses
+            .evaluation()
+            .map(|entry| entry.name.as_str())
+            .collect();
         assert_eq!(
             names,
-            ["training", "rearranged_34125", "rearranged_53412", "non_rectangular"]
+            [
+                "training",
+                "rearranged_34125",
+                "rearranged_53412",
+                "non_rectangular"
+            ]
         );
     }
 
@@ -321,7 +346,10 @@ mod tests {
         }
         assert_eq!(of(CourseChoice::Training), training);
         assert_eq!(simulators.fixed.len(), 1);
-        assert_eq!(simulators.passing.unwrap().0, (CourseChoice::Generated(2), 0));
+        assert_eq!(
+            simulators.passing.unwrap().0,
+            (CourseChoice::Generated(2), 0)
+        );
     }
 
     #[test]
@@ -342,7 +370,8 @@ mod tests {
         "#;
         let path = config("").courses.training;
         let suite = Suite::parse(text, &path).unwrap();
-        let courses = Arc::new(Courses::of_suite(&config("disturbances.mass_spread = 0.1"), suite).unwrap());
+        let courses =
+            Arc::new(Courses::of_suite(&config("disturbances.mass_spread = 0.1"), suite).unwrap());
         let mut simulators = Simulators::new(Arc::clone(&courses));
         let mut order = |entry, episode| {
             let simulator = simulators
@@ -355,7 +384,13 @@ mod tests {
         assert_eq!(order(0, 0), order(0, 120));
         assert_ne!(order(1, 0), order(1, 120));
         let disturbances = |entry: usize| &courses.evaluation[entry].settings.disturbances;
-        assert_eq!((disturbances(0).latency_periods, disturbances(0).mass_spread), (0, 0.0));
-        assert_eq!((disturbances(1).latency_periods, disturbances(1).mass_spread), (1, 0.0));
+        assert_eq!(
+            (disturbances(0).latency_periods, disturbances(0).mass_spread),
+            (0, 0.0)
+        );
+        assert_eq!(
+            (disturbances(1).latency_periods, disturbances(1).mass_spread),
+            (1, 0.0)
+        );
     }
 }

@@ -1,8 +1,10 @@
 //! The environment loop: one ticket in, one episode out, or one segment of an episode.
 //!
-//! [`EnvironmentLoop::fly`] is the whole of it, and the only one: training, evaluation during training and evaluation of a file differ in the ticket and in where
-//! the records go. An episode is a function of its ticket and of the snapshot the ticket names, so nothing is remembered from one episode to the next, and
-//! start, exploration noise and disturbances are drawn from generators of their own. What is remembered from one segment to the next saves time alone.
+//! [`EnvironmentLoop::fly`] is the whole of it, and the only one: training, evaluation during
+//! training and evaluation of a file differ in the ticket and in where the records go. An episode
+//! is a function of its ticket and of the snapshot the ticket names, so nothing is remembered from
+//! one episode to the next, and start, exploration noise and disturbances are drawn from generators
+//! of their own. What is remembered from one segment to the next saves time alone.
 
 use std::ops::DerefMut;
 
@@ -37,7 +39,12 @@ pub struct EnvironmentLoop {
 
 impl EnvironmentLoop {
     /// A environment_loop who signs records as `incarnation` of `actor`.
-    pub fn new(actor: ActorId, incarnation: ActorIncarnation, simulators: Simulators, agent: Agent) -> Self {
+    pub fn new(
+        actor: ActorId,
+        incarnation: ActorIncarnation,
+        simulators: Simulators,
+        agent: Agent,
+    ) -> Self {
         let reward = simulators.settings().reward.clone();
         Self {
             actor,
@@ -54,8 +61,8 @@ impl EnvironmentLoop {
         self.incarnation = incarnation;
     }
 
-    /// Flies `ticket` with `network` to the end of its episode or its segment: each step a record into `link`, and a closing one at last. `None` when the episode
-    /// goes on after the segment.
+    /// Flies `ticket` with `network` to the end of its episode or its segment: each step a record
+    /// into `link`, and a closing one at last. `None` when the episode goes on after the segment.
     ///
     /// # Errors
     /// [`EpisodeError`]; what was sent on this ticket is void then.
@@ -65,7 +72,8 @@ impl EnvironmentLoop {
         network: &Network,
         link: &mut L,
     ) -> Result<Option<EpisodeScore>, EpisodeError<L::Error>> {
-        // Each segment draws from a generator of its own: who flies a later one need not know how often the earlier ones drew.
+        // Each segment draws from a generator of its own: who flies a later one need not know how
+        // often the earlier ones drew.
         let mut noise = generator(ticket, Purpose::ActionNoise, ticket.first_step());
         let begin = |link: &mut L, step| {
             let mut record = link.loan().map_err(EpisodeError::Link)?;
@@ -74,10 +82,11 @@ impl EnvironmentLoop {
         };
 
         let mut record = begin(link, ticket.first_step())?;
-        let (simulator, mut flown) = match take_up(&mut self.simulators, self.under_way.take(), ticket) {
-            Ok(taken_up) => taken_up,
-            Err(fault) => return Err(give_up(fault, record, link)),
-        };
+        let (simulator, mut flown) =
+            match take_up(&mut self.simulators, self.under_way.take(), ticket) {
+                Ok(taken_up) => taken_up,
+                Err(fault) => return Err(give_up(fault, record, link)),
+            };
         link.lap(Stage::Reset);
         self.agent
             .observe(simulator, network, &mut record, |stage| link.lap(stage));
@@ -88,9 +97,13 @@ impl EnvironmentLoop {
                 return Err(EpisodeError::Abandoned);
             }
             let previous_action = flown.last().copied().unwrap_or_default();
-            let action = self
-                .agent
-                .act(ticket.exploration, network, &record, &previous_action, &mut noise);
+            let action = self.agent.act(
+                ticket.exploration,
+                network,
+                &record,
+                &previous_action,
+                &mut noise,
+            );
             link.lap(Stage::Policy);
             let report = match simulator.step(action) {
                 Ok(report) => report,
@@ -98,7 +111,8 @@ impl EnvironmentLoop {
             };
             link.lap(Stage::Physics);
 
-            // The reward looks at what the action led to, so the next image comes before this record is complete.
+            // The reward looks at what the action led to, so the next image comes before this
+            // record is complete.
             let mut next = begin(link, step)?;
             self.agent
                 .observe(simulator, network, &mut next, |stage| link.lap(stage));
@@ -110,7 +124,13 @@ impl EnvironmentLoop {
             flown.push(action);
             record = next;
             if let Some(ended) = report.outcome {
-                let score = close(&mut record, outcome(ended), &report, simulator.course(), episode_return);
+                let score = close(
+                    &mut record,
+                    outcome(ended),
+                    &report,
+                    simulator.course(),
+                    episode_return,
+                );
                 link.send(record).map_err(EpisodeError::Link)?;
                 return Ok(Some(score));
             }
@@ -122,7 +142,9 @@ impl EnvironmentLoop {
                 return Ok(None);
             }
         }
-        unreachable!("the simulator's step limit ends every episode before the step numbers run out")
+        unreachable!(
+            "the simulator's step limit ends every episode before the step numbers run out"
+        )
     }
 }
 
@@ -151,7 +173,8 @@ pub trait RecordLink {
     /// When that cannot be known.
     fn directive(&mut self) -> Result<Directive, Self::Error>;
 
-    /// Told at the end of each stage of a step, for whoever wants to know where the time goes; what it does itself, a link books itself.
+    /// Told at the end of each stage of a step, for whoever wants to know where the time goes; what
+    /// it does itself, a link books itself.
     fn lap(&mut self, _stage: Stage) {}
 }
 
@@ -170,7 +193,8 @@ pub enum EpisodeError<E: std::error::Error + 'static> {
     /// It was told to stop.
     #[error("the episode was abandoned")]
     Abandoned,
-    /// The ticket or the physics is at fault; the link has been told by a record of kind [`RecordKind::Failed`].
+    /// The ticket or the physics is at fault; the link has been told by a record of kind
+    /// [`RecordKind::Failed`].
     #[error("the episode failed: {0}")]
     Fault(#[source] EpisodeFault),
     /// Records cannot be sent.
@@ -191,7 +215,9 @@ pub enum EpisodeFault {
     #[error(transparent)]
     Simulation(#[from] SimulationError),
     /// The actions before a segment do not lead to it.
-    #[error("the episode ends in step {step} of the {flown} that are said to have been flown before the segment")]
+    #[error(
+        "the episode ends in step {step} of the {flown} that are said to have been flown before the segment"
+    )]
     EndedBefore {
         /// The step, from 1.
         step: usize,
@@ -224,13 +250,16 @@ impl UnderWay {
                 ticket.seed,
             )
         };
-        let bits = |actions: &[[f32; ACTION]]| -> Vec<_> { actions.iter().flatten().map(|x| x.to_bits()).collect() };
+        let bits = |actions: &[[f32; ACTION]]| -> Vec<_> {
+            actions.iter().flatten().map(|x| x.to_bits()).collect()
+        };
         episode(&self.ticket) == episode(ticket) && bits(&self.flown) == bits(&segment.flown)
     }
 }
 
-/// The simulator where `ticket` begins, and the actions that led there: at reset or, of a later segment, where the one before ended. If that was not flown here,
-/// or something else was since, the actions are repeated, which leads to the same place.
+/// The simulator where `ticket` begins, and the actions that led there: at reset or, of a later
+/// segment, where the one before ended. If that was not flown here, or something else was since,
+/// the actions are repeated, which leads to the same place.
 fn take_up<'a>(
     simulators: &'a mut Simulators,
     under_way: Option<UnderWay>,
@@ -259,7 +288,10 @@ fn is_last_of_segment(ticket: &Ticket, step: u32) -> bool {
     segment.is_some_and(|segment| step == ticket.first_step() + segment.steps)
 }
 
-fn reset<'a>(simulators: &'a mut Simulators, ticket: &Ticket) -> Result<&'a mut Simulator, EpisodeFault> {
+fn reset<'a>(
+    simulators: &'a mut Simulators,
+    ticket: &Ticket,
+) -> Result<&'a mut Simulator, EpisodeFault> {
     let simulator = simulators.of(ticket)?;
     simulator.reset(
         ticket.start_level,
@@ -275,11 +307,21 @@ fn generator(ticket: &Ticket, purpose: Purpose, step: u32) -> Pcg64Mcg {
 }
 
 /// Writes into the record of an observation what was done on it and what came of that.
-fn complete(record: &mut TransitionRecord, action: [f32; ACTION], report: &StepReport, reward: &RewardTerms) {
+fn complete(
+    record: &mut TransitionRecord,
+    action: [f32; ACTION],
+    report: &StepReport,
+    reward: &RewardTerms,
+) {
     record.action = action;
     record.walls_passed = report.walls_passed;
     record.reward = reward.total();
-    record.reward_terms = [reward.collision, reward.level_up, reward.destination, reward.action];
+    record.reward_terms = [
+        reward.collision,
+        reward.level_up,
+        reward.destination,
+        reward.action,
+    ];
     let arrived = report.outcome == Some(simulator::Outcome::ReachedEnd);
     record.level_up = u8::from(report.level_up == LevelUp::Yes || arrived);
     record.terminated = u8::from(arrived || report.outcome == Some(simulator::Outcome::Collided));
@@ -318,7 +360,11 @@ fn hit_wall(report: &StepReport) -> Option<u8> {
 }
 
 /// Sends `record` as the word that the episode has failed.
-fn give_up<L: RecordLink>(fault: EpisodeFault, mut record: L::Loan, link: &mut L) -> EpisodeError<L::Error> {
+fn give_up<L: RecordLink>(
+    fault: EpisodeFault,
+    mut record: L::Loan,
+    link: &mut L,
+) -> EpisodeError<L::Error> {
     record.kind = RecordKind::Failed.code();
     match link.send(record) {
         Ok(()) => EpisodeError::Fault(fault),

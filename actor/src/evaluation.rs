@@ -1,7 +1,9 @@
-//! Evaluation without a learner: how a snapshot flies, entry by entry: a course, or a suite's several.
+//! Evaluation without a learner: how a snapshot flies, entry by entry: a course, or a suite's
+//! several.
 //!
-//! The episodes are those of the environment loop, with tickets written here: mode action, start of level 1, seeds from the run's. They are spread over all
-//! cores; which thread flies which changes nothing.
+//! The episodes are those of the environment loop, with tickets written here: mode action, start of
+//! level 1, seeds from the run's. They are spread over all cores; which thread flies which changes
+//! nothing.
 
 use std::convert::Infallible;
 use std::io;
@@ -23,7 +25,8 @@ use crate::courses::{Courses, Simulators};
 use crate::environment_loop::{Directive, EnvironmentLoop, EpisodeError, EpisodeFault, RecordLink};
 use skein_inference::Network;
 
-/// Most threads of an evaluation: more cores than any machine we know of has, few enough for every system's limits.
+/// Most threads of an evaluation: more cores than any machine we know of has, few enough for every
+/// system's limits.
 pub const MAX_THREADS: usize = 512;
 
 /// What is to be flown.
@@ -106,7 +109,8 @@ impl Evaluation<'_> {
     /// Flies all episodes.
     ///
     /// # Errors
-    /// [`EvaluationError`] names the first episode, in entry and episode order, that cannot be flown, or the thread that cannot be had.
+    /// [`EvaluationError`] names the first episode, in entry and episode order, that cannot be
+    /// flown, or the thread that cannot be had.
     pub fn run(&self) -> Result<Evaluated, EvaluationError> {
         let mut episodes = self.fly_all()?.into_iter();
         let mut courses = Vec::new();
@@ -120,7 +124,11 @@ impl Evaluation<'_> {
                 .iter()
                 .map(|episode: &EvaluatedEpisode| episode.score)
                 .collect();
-            let walls = episodes.iter().map(|episode| episode.walls).max().unwrap_or(0);
+            let walls = episodes
+                .iter()
+                .map(|episode| episode.walls)
+                .max()
+                .unwrap_or(0);
             courses.push(CourseEvaluation::of(&entry.name, walls, &scores));
             by_course.push(episodes);
         }
@@ -162,7 +170,11 @@ impl Evaluation<'_> {
             let started = (1..=threads).map(start).collect::<Result<Vec<_>, _>>()?;
             Ok(started
                 .into_iter()
-                .flat_map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+                .flat_map(|thread| {
+                    thread
+                        .join()
+                        .unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+                })
                 .collect())
         })?;
         flown.sort_by_key(|(index, _)| *index);
@@ -185,7 +197,8 @@ impl Evaluation<'_> {
         None
     }
 
-    /// One thread's share: whatever episode is next. The number counts episodes through all entries.
+    /// One thread's share: whatever episode is next. The number counts episodes through all
+    /// entries.
     fn fly_next_until_done(
         &self,
         network: &Network,
@@ -193,14 +206,18 @@ impl Evaluation<'_> {
     ) -> Vec<(u64, Result<EvaluatedEpisode, EvaluationError>)> {
         let simulators = Simulators::new(Arc::clone(&self.courses));
         let agent = Agent::new(self.config.view());
-        let mut environment_loop = EnvironmentLoop::new(ActorId(0), ActorIncarnation(0), simulators, agent);
+        let mut environment_loop =
+            EnvironmentLoop::new(ActorId(0), ActorIncarnation(0), simulators, agent);
         let mut flown = Vec::new();
         loop {
             let index = next.fetch_add(1, Ordering::Relaxed);
             let Some((entry, episode)) = self.place(index) else {
                 return flown;
             };
-            flown.push((index, self.fly(&mut environment_loop, network, entry, episode)));
+            flown.push((
+                index,
+                self.fly(&mut environment_loop, network, entry, episode),
+            ));
         }
     }
 
@@ -237,7 +254,11 @@ impl Evaluation<'_> {
             Err(EpisodeError::Fault(fault)) => {
                 let names = self.courses.evaluation().map(|entry| entry.name.clone());
                 let course = names.into_iter().nth(entry as usize).unwrap_or_default();
-                Err(EvaluationError::Episode { course, episode, fault })
+                Err(EvaluationError::Episode {
+                    course,
+                    episode,
+                    fault,
+                })
             }
             Err(EpisodeError::Link(never)) => match never {},
             Ok(None) => unreachable!("its ticket is for a whole episode"),
@@ -260,7 +281,10 @@ impl RecordLink for Memory {
     type Error = Infallible;
 
     fn loan(&mut self) -> Result<Box<TransitionRecord>, Infallible> {
-        Ok(self.spare.pop().unwrap_or_else(|| Box::new(TransitionRecord::zeroed())))
+        Ok(self
+            .spare
+            .pop()
+            .unwrap_or_else(|| Box::new(TransitionRecord::zeroed())))
     }
 
     fn send(&mut self, record: Box<TransitionRecord>) -> Result<(), Infallible> {
@@ -283,7 +307,12 @@ mod tests {
     use crate::testing::{config, random_snapshot};
 
     /// What `look` sees of an evaluation on two courses.
-    fn look_at<T>(episodes: u64, threads: usize, keep: Keep, look: impl Fn(&Evaluation<'_>) -> T) -> T {
+    fn look_at<T>(
+        episodes: u64,
+        threads: usize,
+        keep: Keep,
+        look: impl Fn(&Evaluation<'_>) -> T,
+    ) -> T {
         let mut config = config("");
         config.courses.evaluation.truncate(2);
         look(&Evaluation {
@@ -305,7 +334,11 @@ mod tests {
 
     #[test]
     fn threads_are_limited_by_episodes_and_absolutely() {
-        let threads = |episodes, threads| look_at(episodes, threads, Keep::Scores, |evaluation| evaluation.threads());
+        let threads = |episodes, threads| {
+            look_at(episodes, threads, Keep::Scores, |evaluation| {
+                evaluation.threads()
+            })
+        };
         assert_eq!(threads(5, 3), 3);
         assert_eq!(threads(5, 100_000), 10);
         assert_eq!(threads(1_000_000, 100_000), MAX_THREADS);
@@ -315,7 +348,11 @@ mod tests {
     fn the_number_of_threads_changes_nothing() {
         let one = evaluated(1, Keep::Records);
         let bytes = |evaluated: &Evaluated| {
-            let records = evaluated.episodes.iter().flatten().flat_map(|episode| &episode.records);
+            let records = evaluated
+                .episodes
+                .iter()
+                .flatten()
+                .flat_map(|episode| &episode.records);
             records
                 .flat_map(|record| bytemuck::bytes_of(&**record).to_vec())
                 .collect::<Vec<u8>>()
@@ -340,7 +377,10 @@ mod tests {
                 .collect::<Vec<_>>(),
             [5, 5]
         );
-        assert_ne!(scores.report.courses[0].course, scores.report.courses[1].course);
+        assert_ne!(
+            scores.report.courses[0].course,
+            scores.report.courses[1].course
+        );
         assert!(
             scores
                 .episodes

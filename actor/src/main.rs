@@ -23,9 +23,11 @@ use tracing::{error, info};
 
 /// Flies for a run, beside its learner and other actors, until the run is over.
 ///
-/// Actors come and go as they like: what is learned does not depend on them. One whose learner dies waits for the learner's next incarnation. The log goes to
-/// logs/actor-ID.log in the run's directory (RUST_LOG says what is logged, SKEIN_LOG_FORMAT=json how). Exit status: 0 when the run is over or on SIGTERM
-/// or SIGINT, 1 on an error, 3 when no learner sent a heartbeat for transport.learner_silence_secs.
+/// Actors come and go as they like: what is learned does not depend on them. One whose learner dies
+/// waits for the learner's next incarnation. The log goes to logs/actor-ID.log in the run's
+/// directory (RUST_LOG says what is logged, SKEIN_LOG_FORMAT=json how). Exit status: 0 when the run
+/// is over or on SIGTERM or SIGINT, 1 on an error, 3 when no learner sent a heartbeat for
+/// transport.learner_silence_secs.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
@@ -69,7 +71,8 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
         }
     };
     let log = directory.actor_log(actor);
-    log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
+    log_to_file(&log, LogFormat::from_environment())
+        .with_context(|| format!("cannot write {}", log.display()))?;
 
     let (isa, camera) = (Isa::best(), Instructions::best());
     let encoder = config.vae.encoder_precision;
@@ -77,7 +80,12 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
     let _presence = Presence::enter(&identity)?;
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config)?));
     // Each learner that is joined gives it an incarnation.
-    let mut environment_loop = EnvironmentLoop::new(actor, ActorIncarnation(0), simulators, Agent::new(config.view()));
+    let mut environment_loop = EnvironmentLoop::new(
+        actor,
+        ActorIncarnation(0),
+        simulators,
+        Agent::new(config.view()),
+    );
     Ok(Service::new(&identity, &config, actor, &told_to_end).serve(&mut environment_loop)?)
 }
 

@@ -1,7 +1,8 @@
 //! Recordings of evaluation episodes: a `.npz` file, which NumPy alone reads (`numpy.load(FILE)`).
 //!
-//! One row for every observation: the steps of an episode in order, its closing observation last; episodes in order, courses in order. [`COLUMNS`] lists the
-//! arrays. The format is a zip file with one `.npy` file an array; rows are written as they lie in memory, so nothing is held twice.
+//! One row for every observation: the steps of an episode in order, its closing observation last;
+//! episodes in order, courses in order. [`COLUMNS`] lists the arrays. The format is a zip file with
+//! one `.npy` file an array; rows are written as they lie in memory, so nothing is held twice.
 
 use std::fmt;
 use std::fs::{self, File};
@@ -70,15 +71,27 @@ struct Row<'a> {
 
 /// Every array with a row for each observation. `course_names` comes besides them.
 pub const COLUMNS: [Column; 15] = [
-    Column::new("course", "<i4", &[], "index into course_names", |row, out| {
-        put(out, &[row.course])
-    }),
-    Column::new("episode", "<i4", &[], "episode on that course, from 0", |row, out| {
-        put(out, &[row.episode])
-    }),
-    Column::new("step", "<i4", &[], "step of the episode, from 0", |row, out| {
-        put(out, &[row.record.step])
-    }),
+    Column::new(
+        "course",
+        "<i4",
+        &[],
+        "index into course_names",
+        |row, out| put(out, &[row.course]),
+    ),
+    Column::new(
+        "episode",
+        "<i4",
+        &[],
+        "episode on that course, from 0",
+        |row, out| put(out, &[row.episode]),
+    ),
+    Column::new(
+        "step",
+        "<i4",
+        &[],
+        "step of the episode, from 0",
+        |row, out| put(out, &[row.record.step]),
+    ),
     Column::new(
         "closing",
         "|u1",
@@ -210,7 +223,8 @@ pub struct RecordingError {
     pub source: io::Error,
 }
 
-/// Writes the records of `episodes`, course by course, to `path`; in place at once, or not at all. Their codes have `latent` numbers.
+/// Writes the records of `episodes`, course by course, to `path`; in place at once, or not at all.
+/// Their codes have `latent` numbers.
 ///
 /// # Errors
 /// [`RecordingError`] names the file.
@@ -230,13 +244,15 @@ pub fn write_recording(
         })
 }
 
-/// Checks, before anything is flown, that [`write_recording`] can write to `path`. Leaves nothing behind and an existing file as it is.
+/// Checks, before anything is flown, that [`write_recording`] can write to `path`. Leaves nothing
+/// behind and an existing file as it is.
 ///
 /// # Errors
 /// [`RecordingError`] names the file.
 pub fn check_recordable(path: &Path) -> Result<(), RecordingError> {
     if fs::metadata(path).is_ok_and(|there| !there.is_file()) {
-        let source = io::Error::other("it is there and no regular file, so no recording can replace it");
+        let source =
+            io::Error::other("it is there and no regular file, so no recording can replace it");
         return Err(failed(path, source));
     }
     let aside = aside(path);
@@ -257,7 +273,12 @@ fn failed(path: &Path, source: io::Error) -> RecordingError {
     }
 }
 
-fn write_npz(path: &Path, courses: &[&str], latent: usize, episodes: &[Vec<EvaluatedEpisode>]) -> io::Result<()> {
+fn write_npz(
+    path: &Path,
+    courses: &[&str],
+    latent: usize,
+    episodes: &[Vec<EvaluatedEpisode>],
+) -> io::Result<()> {
     let rows: Vec<Row<'_>> = (0i32..)
         .zip(episodes)
         .flat_map(|(course, episodes)| rows_of(course, latent, episodes))
@@ -280,15 +301,32 @@ fn write_npz(path: &Path, courses: &[&str], latent: usize, episodes: &[Vec<Evalu
         .max()
         .unwrap_or(0)
         .max(1);
-    start_array(&mut zip, "course_names", &format!("<U{longest}"), courses.len(), &[])?;
+    start_array(
+        &mut zip,
+        "course_names",
+        &format!("<U{longest}"),
+        courses.len(),
+        &[],
+    )?;
     for name in courses {
-        let letters = name.chars().map(u32::from).chain(std::iter::repeat(0)).take(longest);
+        let letters = name
+            .chars()
+            .map(u32::from)
+            .chain(std::iter::repeat(0))
+            .take(longest);
         zip.write_all(&letters.flat_map(u32::to_le_bytes).collect::<Vec<_>>())?;
     }
-    zip.finish().map_err(io::Error::from)?.into_inner()?.sync_all()
+    zip.finish()
+        .map_err(io::Error::from)?
+        .into_inner()?
+        .sync_all()
 }
 
-fn rows_of(course: i32, latent: usize, episodes: &[EvaluatedEpisode]) -> impl Iterator<Item = Row<'_>> {
+fn rows_of(
+    course: i32,
+    latent: usize,
+    episodes: &[EvaluatedEpisode],
+) -> impl Iterator<Item = Row<'_>> {
     (0i32..).zip(episodes).flat_map(move |(episode, flown)| {
         flown.records.iter().map(move |record| Row {
             course,
@@ -308,11 +346,14 @@ fn start_array(
     shape: &[usize],
 ) -> io::Result<()> {
     const PREFIX: usize = 10;
-    let options = SimpleFileOptions::default().compression_level(Some(1)).large_file(true);
+    let options = SimpleFileOptions::default()
+        .compression_level(Some(1))
+        .large_file(true);
     zip.start_file(format!("{name}.npy"), options)
         .map_err(io::Error::from)?;
     let axes: String = shape.iter().map(|length| format!(" {length},")).collect();
-    let mut header = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({rows},{axes}), }}");
+    let mut header =
+        format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({rows},{axes}), }}");
     // The data begins at a multiple of 64 bytes, after the newline that ends the header.
     let padding = (PREFIX + header.len() + 1).next_multiple_of(64) - PREFIX - header.len() - 1;
     header.extend(std::iter::repeat_n(' ', padding));
@@ -391,7 +432,8 @@ mod tests {
 
         let (header, depth) = array(&file, "depth");
         assert!(
-            header.starts_with("{'descr': '|u1', 'fortran_order': False, 'shape': (4, 72, 128,), }"),
+            header
+                .starts_with("{'descr': '|u1', 'fortran_order': False, 'shape': (4, 72, 128,), }"),
             "{header}"
         );
         assert_eq!(
@@ -402,13 +444,19 @@ mod tests {
         assert_eq!(integers("course"), [0, 0, 0, 1]);
         assert_eq!(integers("episode"), [0, 0, 1, 0]);
         let (header, position) = array(&file, "position_m");
-        assert!(header.contains("'<f4'") && header.contains("(4, 3,)"), "{header}");
+        assert!(
+            header.contains("'<f4'") && header.contains("(4, 3,)"),
+            "{header}"
+        );
         assert_eq!(values::<f32>(&position)[3..6], [2.0, 0.5, -1.0]);
         let (header, latent) = array(&file, "latent");
         assert!(header.contains("(4, 8,)"), "{header}");
         assert_eq!(values::<f32>(&latent)[14..18], [8.0, 9.0, 3.0, 4.0]);
         let (header, names) = array(&file, "course_names");
-        assert!(header.contains("'<U5'") && header.contains("(2,)"), "{header}");
+        assert!(
+            header.contains("'<U5'") && header.contains("(2,)"),
+            "{header}"
+        );
         assert_eq!(values::<u32>(&names)[9], 0xe4);
     }
 
@@ -419,8 +467,19 @@ mod tests {
         write_recording(&file, &["near"], 8, &[vec![episode(0, 3)]]).unwrap();
         for column in &COLUMNS {
             let value_bytes: usize = column.kind[2..].parse().unwrap();
-            let expected = 3 * column.shape.iter().map(|axis| axis.len(8)).product::<usize>() * value_bytes;
-            assert_eq!(array(&file, column.name).1.len(), expected, "{}", column.name);
+            let expected = 3
+                * column
+                    .shape
+                    .iter()
+                    .map(|axis| axis.len(8))
+                    .product::<usize>()
+                * value_bytes;
+            assert_eq!(
+                array(&file, column.name).1.len(),
+                expected,
+                "{}",
+                column.name
+            );
         }
     }
 
@@ -428,7 +487,12 @@ mod tests {
     fn a_file_that_cannot_be_written_is_named() {
         let file = Path::new("/nonexistent/episodes.npz");
         for error in [write_recording(file, &[], 32, &[]), check_recordable(file)] {
-            assert!(error.unwrap_err().to_string().contains("/nonexistent/episodes.npz"));
+            assert!(
+                error
+                    .unwrap_err()
+                    .to_string()
+                    .contains("/nonexistent/episodes.npz")
+            );
         }
     }
 

@@ -1,8 +1,10 @@
-//! The incarnation of an actor process: join the learner, take a ticket, fly it, until the run is over.
+//! The incarnation of an actor process: join the learner, take a ticket, fly it, until the run is
+//! over.
 //!
-//! Whatever happens on the way is survived by doing nothing about it: an episode that is lost is flown again on a new ticket, by this actor or another; a
-//! learner that is lost is looked for until it lives again. Only the end of the run, a signal, or no heartbeat from any learner for too long end the
-//! process.
+//! Whatever happens on the way is survived by doing nothing about it: an episode that is lost is
+//! flown again on a new ticket, by this actor or another; a learner that is lost is looked for
+//! until it lives again. Only the end of the run, a signal, or no heartbeat from any learner for
+//! too long end the process.
 
 mod line;
 #[cfg(test)]
@@ -60,7 +62,8 @@ enum Parting {
     Leave(Ending),
     /// That learner is dead, or another incarnation of it has begun.
     LearnerGone,
-    /// This process was stopped for so long that the learner has given it up: its tickets are others' now.
+    /// This process was stopped for so long that the learner has given it up: its tickets are
+    /// others' now.
     Overslept,
     /// The learner hears nothing of what this actor flies.
     AskedToRejoin,
@@ -68,7 +71,12 @@ enum Parting {
 
 impl<'a> Service<'a> {
     /// A service of `actor` that has not joined a learner yet.
-    pub fn new(identity: &'a RunIdentity, config: &'a Config, actor: ActorId, told_to_end: &'a AtomicBool) -> Self {
+    pub fn new(
+        identity: &'a RunIdentity,
+        config: &'a Config,
+        actor: ActorId,
+        told_to_end: &'a AtomicBool,
+    ) -> Self {
         Self {
             identity,
             config,
@@ -83,8 +91,9 @@ impl<'a> Service<'a> {
     /// Flies tickets as they come, until the run is over for this actor.
     ///
     /// # Errors
-    /// [`JoinError`] when no learner of this run can be joined by this process, now or later, or one that is there could not for
-    /// `transport.learner_silence_secs`. A lost episode or learner is none.
+    /// [`JoinError`] when no learner of this run can be joined by this process, now or later, or
+    /// one that is there could not for `transport.learner_silence_secs`. A lost episode or learner
+    /// is none.
     pub fn serve(mut self, environment_loop: &mut EnvironmentLoop) -> Result<Ending, JoinError> {
         loop {
             let ports = match self.seek()? {
@@ -100,9 +109,15 @@ impl<'a> Service<'a> {
             self.last_sign = line.last_sign();
             match parting {
                 Ok(Parting::Leave(ending)) => return Ok(ending),
-                Ok(Parting::LearnerGone) => warn!("the learner is gone; looking for its next incarnation"),
-                Ok(Parting::Overslept) => warn!("this process was stopped for too long; joining anew"),
-                Ok(Parting::AskedToRejoin) => warn!("nothing that was flown has arrived; joining anew"),
+                Ok(Parting::LearnerGone) => {
+                    warn!("the learner is gone; looking for its next incarnation")
+                }
+                Ok(Parting::Overslept) => {
+                    warn!("this process was stopped for too long; joining anew")
+                }
+                Ok(Parting::AskedToRejoin) => {
+                    warn!("nothing that was flown has arrived; joining anew")
+                }
                 Err(error) => {
                     warn!(%error, "the line to the learner is broken; joining anew");
                     sleep(SEEK_INTERVAL);
@@ -121,8 +136,12 @@ impl<'a> Service<'a> {
             }
             match ActorPorts::join(self.identity, self.config) {
                 Ok(ports) => {
-                    // An incarnation that was not there before shows that a learner incarnations. To join the same one again shows nothing.
-                    if self.newest_learner.is_none_or(|newest| newest < ports.incarnation()) {
+                    // An incarnation that was not there before shows that a learner incarnations.
+                    // To join the same one again shows nothing.
+                    if self
+                        .newest_learner
+                        .is_none_or(|newest| newest < ports.incarnation())
+                    {
                         self.newest_learner = Some(ports.incarnation());
                         self.last_sign = Instant::now();
                     }
@@ -135,7 +154,9 @@ impl<'a> Service<'a> {
                         info!(error = refusal, "no learner joined yet");
                         last_refusal = Some(refusal);
                     }
-                    if self.last_sign.elapsed() > Duration::from_secs_f64(self.config.transport.learner_silence_secs) {
+                    if self.last_sign.elapsed()
+                        > Duration::from_secs_f64(self.config.transport.learner_silence_secs)
+                    {
                         return match error {
                             JoinError::NoLearner(_) => Ok(Err(Ending::LearnerSilent)),
                             error => Err(error),
@@ -148,7 +169,8 @@ impl<'a> Service<'a> {
     }
 }
 
-/// A number that no earlier incarnation of this actor had, as far as the clock tells, and none of this process.
+/// A number that no earlier incarnation of this actor had, as far as the clock tells, and none of
+/// this process.
 fn next_incarnation(last: ActorIncarnation) -> ActorIncarnation {
     let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH);
     let nanos = since_1970.map_or(0, |elapsed| elapsed.as_nanos() as u64);
@@ -184,8 +206,7 @@ fn fly(
     network: &Network,
     line: &mut LearnerLine<'_>,
 ) -> Result<(), ServiceError> {
-    let span =
-        info_span!("episode", episode = %ticket.episode, attempt = %ticket.attempt, policy = %ticket.policy_version);
+    let span = info_span!("episode", episode = %ticket.episode, attempt = %ticket.attempt, policy = %ticket.policy_version);
     let _entered = span.enter();
     match environment_loop.fly(ticket, network, line) {
         Ok(None) => debug!(steps = ticket.first_step(), "segment flown"),

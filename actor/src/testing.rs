@@ -1,4 +1,5 @@
-//! What several tests need: a policy of random parameters, and a configuration with the shipped courses.
+//! What several tests need: a policy of random parameters, and a configuration with the shipped
+//! courses.
 
 use std::path::Path;
 
@@ -13,7 +14,9 @@ pub(crate) fn random_snapshot(layout: &SnapshotLayout, seed: u64) -> Snapshot {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let mut values = vec![0.0; layout.values()];
     for tensor in layout.tensors() {
-        let bound = (tensor.shape[0] as f32 / tensor.range.len() as f32).sqrt().min(0.5);
+        let bound = (tensor.shape[0] as f32 / tensor.range.len() as f32)
+            .sqrt()
+            .min(0.5);
         values[tensor.range.clone()].fill_with(|| rng.random_range(-bound..bound));
     }
     Snapshot {
@@ -22,7 +25,8 @@ pub(crate) fn random_snapshot(layout: &SnapshotLayout, seed: u64) -> Snapshot {
     }
 }
 
-/// The default configuration with a small policy, the shipped courses, and `simulator` as its simulator section.
+/// The default configuration with a small policy, the shipped courses, and `simulator` as its
+/// simulator section.
 pub(crate) fn config(simulator: &str) -> Config {
     let mut config = Config {
         simulator: toml::from_str(simulator).unwrap(),

@@ -1,4 +1,5 @@
-//! The snapshots an actor holds: the newest few, so that an episode may use the one its ticket names while the learner goes on.
+//! The snapshots an actor holds: the newest few, so that an episode may use the one its ticket
+//! names while the learner goes on.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -47,11 +48,16 @@ impl Weights {
         }
     }
 
-    /// For a run. Tickets name the newest snapshot, an evaluation's too, and with policy lag 1 the one before it: no other is published
-    /// before their episodes are committed. One more is there for what comes before its ticket.
+    /// For a run. Tickets name the newest snapshot, an evaluation's too, and with policy lag 1 the
+    /// one before it: no other is published before their episodes are committed. One more is there
+    /// for what comes before its ticket.
     pub fn of_run(config: &Config) -> Self {
         let most = config.learning.policy_lag as usize + 2;
-        Self::new(SnapshotLayout::of(config), config.vae.encoder_precision, most)
+        Self::new(
+            SnapshotLayout::of(config),
+            config.vae.encoder_precision,
+            most,
+        )
     }
 
     /// Takes in a snapshot; the one that came first goes when there are too many.
@@ -75,9 +81,16 @@ impl Weights {
 
     /// The network of this version, if it is held.
     pub fn network(&mut self, version: PolicyVersion) -> Option<Arc<Network>> {
-        let held = self.held.iter_mut().find(|held| held.version() == version)?;
+        let held = self
+            .held
+            .iter_mut()
+            .find(|held| held.version() == version)?;
         if let Held::Raw(snapshot) = held {
-            *held = Held::Network(Arc::new(Network::new(snapshot, &self.layout, self.precision)));
+            *held = Held::Network(Arc::new(Network::new(
+                snapshot,
+                &self.layout,
+                self.precision,
+            )));
         }
         match held {
             Held::Network(network) => Some(Arc::clone(network)),
@@ -110,14 +123,20 @@ mod tests {
         assert_eq!(weights.newest(), Some(PolicyVersion(5)));
         assert!(!weights.holds(PolicyVersion(1)) && weights.holds(PolicyVersion(2)));
         assert!(weights.network(PolicyVersion(1)).is_none());
-        assert_eq!(weights.network(PolicyVersion(2)).unwrap().version(), PolicyVersion(2));
+        assert_eq!(
+            weights.network(PolicyVersion(2)).unwrap().version(),
+            PolicyVersion(2)
+        );
     }
 
     #[test]
     fn a_network_is_made_once_and_outlives_its_place() {
         let mut weights = weights(0..4);
         let network = weights.network(PolicyVersion(0)).unwrap();
-        assert!(Arc::ptr_eq(&network, &weights.network(PolicyVersion(0)).unwrap()));
+        assert!(Arc::ptr_eq(
+            &network,
+            &weights.network(PolicyVersion(0)).unwrap()
+        ));
         weights.insert(Snapshot {
             version: PolicyVersion(9),
             values: vec![0.0; weights.layout.values()],

@@ -1,6 +1,9 @@
 //! `skein-evaluate` as its user meets it.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -16,7 +19,8 @@ fn shipped(course: &str) -> PathBuf {
         .join(course)
 }
 
-/// A run's folder with a snapshot of an untrained policy; its evaluation courses lie beside it, as in a run that was moved.
+/// A run's folder with a snapshot of an untrained policy; its evaluation courses lie beside it, as
+/// in a run that was moved.
 fn run_folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     for name in ["snapshots", "courses"] {
@@ -44,7 +48,11 @@ fn run_folder() -> tempfile::TempDir {
         values,
     };
     snapshot
-        .save(&folder.path().join("snapshots/latest.safetensors"), &layout, &config)
+        .save(
+            &folder.path().join("snapshots/latest.safetensors"),
+            &layout,
+            &config,
+        )
         .unwrap();
     folder
 }
@@ -70,7 +78,16 @@ fn a_run_is_evaluated_on_its_own_courses_alike_on_any_number_of_threads() {
         let json = format!("{threads}.json");
         let output = evaluate(
             folder.path(),
-            &["--run", ".", "--episodes", "4", "--threads", threads, "--json", &json],
+            &[
+                "--run",
+                ".",
+                "--episodes",
+                "4",
+                "--threads",
+                threads,
+                "--json",
+                &json,
+            ],
         );
         assert!(output.status.success(), "{output:?}");
         let table = String::from_utf8(output.stdout).unwrap();
@@ -84,7 +101,11 @@ fn a_run_is_evaluated_on_its_own_courses_alike_on_any_number_of_threads() {
     let report: EvaluationReport = serde_json::from_str(&read("1.json")).unwrap();
     assert_eq!(report.policy_version, PolicyVersion(17));
     assert_eq!(
-        report.courses.iter().map(|course| course.episodes).collect::<Vec<_>>(),
+        report
+            .courses
+            .iter()
+            .map(|course| course.episodes)
+            .collect::<Vec<_>>(),
         [4, 4]
     );
 }
@@ -153,7 +174,10 @@ fn a_suite_is_flown_entry_by_entry_alike_on_any_number_of_threads() {
         );
         assert!(output.status.success(), "{output:?}");
         let announced = String::from_utf8(output.stderr).unwrap();
-        assert!(announced.contains("11 episodes in 3 entries"), "{announced}");
+        assert!(
+            announced.contains("11 episodes in 3 entries"),
+            "{announced}"
+        );
     }
     let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
     assert_eq!(read("1.json"), read("3.json"));
@@ -163,9 +187,13 @@ fn a_suite_is_flown_entry_by_entry_alike_on_any_number_of_threads() {
         .iter()
         .map(|entry| (entry.course.as_str(), entry.episodes))
         .collect();
-    assert_eq!(flown, [("as it is", 3), ("in any order", 5), ("new courses", 3)]);
+    assert_eq!(
+        flown,
+        [("as it is", 3), ("in any order", 5), ("new courses", 3)]
+    );
     for entry in &report.courses {
-        let failed = |failures: &Failures| failures.hit_wall + failures.hit_corridor + failures.timed_out;
+        let failed =
+            |failures: &Failures| failures.hit_wall + failures.hit_corridor + failures.timed_out;
         let failures: u64 = entry.failures.iter().map(failed).sum();
         assert_eq!(failures + entry.reached_end, entry.episodes, "{entry:?}");
         assert_eq!(entry.failures.len(), 6);
@@ -211,7 +239,9 @@ fn a_suite_that_cannot_be_flown_is_refused_by_file_and_entry() {
         "{head}course = \"courses/training.toml\"\ndisturbances.mass_spread = 3.0\n"
     ));
     assert!(
-        strong.contains("suite.toml") && strong.contains("entry \"one\"") && strong.contains("mass_spread = 3"),
+        strong.contains("suite.toml")
+            && strong.contains("entry \"one\"")
+            && strong.contains("mass_spread = 3"),
         "{strong}"
     );
     assert!(error_of(at, &["--run", ".", "--suite", "none.toml"]).contains("none.toml"));
@@ -248,7 +278,10 @@ fn an_evaluation_that_fails_leaves_no_file_and_changes_none() {
         assert!(!at.join(name).exists(), "{name}");
     }
     assert!(at.join("link.json").is_symlink());
-    assert_eq!(std::fs::read_to_string(at.join("earlier.json")).unwrap(), "earlier");
+    assert_eq!(
+        std::fs::read_to_string(at.join("earlier.json")).unwrap(),
+        "earlier"
+    );
 }
 
 #[test]
@@ -258,7 +291,10 @@ fn more_threads_than_episodes_are_not_started() {
     let output = evaluate(folder.path(), &arguments);
     assert!(output.status.success(), "{output:?}");
     let announced = String::from_utf8(output.stderr).unwrap();
-    assert!(announced.contains("on each of 2 courses, 6 threads"), "{announced}");
+    assert!(
+        announced.contains("on each of 2 courses, 6 threads"),
+        "{announced}"
+    );
     assert!(
         announced.contains("the encoder in f32; images are drawn with "),
         "{announced}"
@@ -293,14 +329,21 @@ fn errors_name_the_file_and_the_remedy() {
     assert!(with(&["--json", "none/report.json"]).contains("none/report.json"));
     std::fs::write(at.join("bent.toml"), "wals = 3").unwrap();
     let bent = with(&["--course", "bent.toml"]);
-    assert!(bent.contains("bent.toml") && bent.contains("wals"), "{bent}");
+    assert!(
+        bent.contains("bent.toml") && bent.contains("wals"),
+        "{bent}"
+    );
     std::fs::remove_dir_all(at.join("courses")).unwrap();
     let gone = with(&[]);
     assert!(
         gone.contains("/courses/training.toml") && gone.contains("--course"),
         "{gone}"
     );
-    std::fs::write(at.join("snapshots/latest.safetensors"), b"nothing of the kind").unwrap();
+    std::fs::write(
+        at.join("snapshots/latest.safetensors"),
+        b"nothing of the kind",
+    )
+    .unwrap();
     assert!(with(&[]).contains("snapshots/latest.safetensors"));
 }
 

@@ -1,6 +1,10 @@
-//! The depth image's bytes are written once: where the camera rendered them, the learner reads them.
+//! The depth image's bytes are written once: where the camera rendered them, the learner reads
+//! them.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::sync::Arc;
 
@@ -37,7 +41,10 @@ impl Place {
             })
         });
         let place = place.expect("every address of ours is mapped");
-        assert_ne!(place.inode, "0", "memory of one process alone is shared with nobody");
+        assert_ne!(
+            place.inode, "0",
+            "memory of one process alone is shared with nobody"
+        );
         place
     }
 }
@@ -76,7 +83,10 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
     let mut config = Config::default();
     config.sac.hidden_width = 8;
     config.transport.max_actors = 1;
-    let configs = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/courses/training.toml");
+    let configs = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../configs/courses/training.toml"
+    );
     config.courses.training = configs.into();
     config.courses.evaluation = vec![configs.into()];
     run.create(&config).unwrap();
@@ -103,14 +113,22 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
         segment: None,
     };
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config).unwrap()));
-    let mut environment_loop =
-        EnvironmentLoop::new(ActorId(0), ActorIncarnation(0), simulators, Agent::new(config.view()));
+    let mut environment_loop = EnvironmentLoop::new(
+        ActorId(0),
+        ActorIncarnation(0),
+        simulators,
+        Agent::new(config.view()),
+    );
     let mut watched = Watched {
         ports: &actor,
         loaned: Vec::new(),
         sent: Vec::new(),
     };
-    let flown = environment_loop.fly(&ticket, &Network::new(&snapshot, &layout, Precision::F32), &mut watched);
+    let flown = environment_loop.fly(
+        &ticket,
+        &Network::new(&snapshot, &layout, Precision::F32),
+        &mut watched,
+    );
 
     let mut received = Vec::new();
     while let Some(record) = learner.receive_transition().unwrap() {

@@ -1,8 +1,10 @@
-//! What it costs to bring episodes home in epochs: microseconds of a run for each environment step, as epochs grow longer.
+//! What it costs to bring episodes home in epochs: microseconds of a run for each environment step,
+//! as epochs grow longer.
 //!
-//! Whole runs of the real programs with two actors, which fly at random and learn nothing, so that every run flies the same episodes and only the number of
-//! epochs differs: what is left beside flying is ordering, waiting for the last of an epoch, and publishing a snapshot after it. Each figure is a line of
-//! JSON; `--quick` flies little.
+//! Whole runs of the real programs with two actors, which fly at random and learn nothing, so that
+//! every run flies the same episodes and only the number of epochs differs: what is left beside
+//! flying is ordering, waiting for the last of an epoch, and publishing a snapshot after it. Each
+//! figure is a line of JSON; `--quick` flies little.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -50,7 +52,9 @@ fn run(episodes: u64, length: u64) -> Summary {
     let folder = tempfile::tempdir().expect("there is room for a run");
     let directory = folder.path().join("run");
     let mut command = Command::new(env!("CARGO_BIN_EXE_skein"));
-    command.args(["run", "--actors", "2", "--run-dir"]).arg(&directory);
+    command
+        .args(["run", "--actors", "2", "--run-dir"])
+        .arg(&directory);
     command.arg("--config").arg(smoke());
     let settings = SETTINGS.map(str::to_owned).into_iter();
     for setting in settings.chain([

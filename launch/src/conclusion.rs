@@ -1,4 +1,5 @@
-//! What the user is told at the end of a run: the evaluation, where the time went, and where everything lies.
+//! What the user is told at the end of a run: the evaluation, where the time went, and where
+//! everything lies.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -11,7 +12,8 @@ use skein_protocol::summary::{Ending, Summary, Trained};
 
 use crate::display::Clock;
 
-/// The evaluation table, the run in one sentence, the table of where the time went, and the paths of everything it left, for standard output. What a run did not come to write is left out.
+/// The evaluation table, the run in one sentence, the table of where the time went, and the paths
+/// of everything it left, for standard output. What a run did not come to write is left out.
 pub fn conclusion(run: &RunDirectory) -> String {
     let mut text = String::new();
     if let Some(report) = read::<EvaluationReport>(&run.evaluation_json()) {
@@ -34,7 +36,11 @@ pub fn conclusion(run: &RunDirectory) -> String {
     }
     push(&mut text, &format!("{}:", run.root().display()));
     for (path, meaning) in artefacts(run) {
-        let shown = path.strip_prefix(run.root()).unwrap_or(&path).display().to_string();
+        let shown = path
+            .strip_prefix(run.root())
+            .unwrap_or(&path)
+            .display()
+            .to_string();
         push(&mut text, &format!("  {shown:<30} {meaning}"));
     }
     text
@@ -72,7 +78,10 @@ fn sentence(summary: &Summary) -> String {
         summary.updates,
         summary.vae_updates,
         summary.final_version,
-        summary.policy_sha256.get(..16).unwrap_or(&summary.policy_sha256)
+        summary
+            .policy_sha256
+            .get(..16)
+            .unwrap_or(&summary.policy_sha256)
     )
 }
 
@@ -87,13 +96,22 @@ fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
         (run.evaluation_trajectories_csv(), "where its episodes flew"),
         (run.summary_json(), "counts, times above, policy_sha256"),
         (plot("return.png"), "return over the training episodes"),
-        (plot("walls_passed.png"), "walls passed over the training episodes"),
+        (
+            plot("walls_passed.png"),
+            "walls passed over the training episodes",
+        ),
         (
             plot("reconstructions.png"),
             "depth images and what the VAE makes of them",
         ),
-        (plot("trajectories.png"), "evaluation episodes through the walls"),
-        (run.best_snapshot(), "the best snapshot: launch/evaluate.sh --run DIR"),
+        (
+            plot("trajectories.png"),
+            "evaluation episodes through the walls",
+        ),
+        (
+            run.best_snapshot(),
+            "the best snapshot: launch/evaluate.sh --run DIR",
+        ),
         (run.latest_snapshot(), "the last snapshot"),
         (run.checkpoints(), "everything the learner knew"),
         (run.tensorboard(), "curves: tensorboard --logdir DIR"),
@@ -157,7 +175,11 @@ mod tests {
             stages,
             thread_cpu_secs: BTreeMap::new(),
         };
-        fs::write(run.evaluation_json(), serde_json::to_string(&report).unwrap()).unwrap();
+        fs::write(
+            run.evaluation_json(),
+            serde_json::to_string(&report).unwrap(),
+        )
+        .unwrap();
         fs::write(run.summary_json(), serde_json::to_string(&summary).unwrap()).unwrap();
         let text = conclusion(&run);
         for part in [
@@ -179,6 +201,9 @@ mod tests {
     #[test]
     fn a_run_that_left_nothing_has_a_conclusion_still() {
         let directory = tempfile::tempdir().unwrap();
-        assert!(conclusion(&RunDirectory::new(directory.path())).contains(&directory.path().display().to_string()));
+        assert!(
+            conclusion(&RunDirectory::new(directory.path()))
+                .contains(&directory.path().display().to_string())
+        );
     }
 }

@@ -1,7 +1,8 @@
 //! The progress of a run, on a terminal or in a log.
 //!
-//! A terminal gets a bar with the figures beneath that renew themselves; anything else gets a plain line every few seconds. Both go to
-//! standard error, so that what a run comes to stands alone on standard output.
+//! A terminal gets a bar with the figures beneath that renew themselves; anything else gets a plain
+//! line every few seconds. Both go to standard error, so that what a run comes to stands alone on
+//! standard output.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -15,7 +16,8 @@ use crate::supervisor::{Restarts, Watcher};
 
 /// Between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
-/// The pace of the last so many seconds says how long the rest will take: the VAE's part of a run is slower than what follows.
+/// The pace of the last so many seconds says how long the rest will take: the VAE's part of a run
+/// is slower than what follows.
 const PACE_SECS: f64 = 60.0;
 
 /// Shows how a run gets on.
@@ -32,8 +34,8 @@ enum Surface {
 /// A progress bar, if standard error is a terminal.
 pub(crate) fn bar_on_terminal() -> Option<ProgressBar> {
     std::io::stderr().is_terminal().then(|| {
-        let style =
-            ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}").expect("the template is well-formed");
+        let style = ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}")
+            .expect("the template is well-formed");
         ProgressBar::new(0).with_style(style.progress_chars("━━─"))
     })
 }
@@ -48,11 +50,19 @@ impl Display {
         }
     }
 
-    /// Where the run is and how much longer it will take, and the figures that show whether it learns.
+    /// Where the run is and how much longer it will take, and the figures that show whether it
+    /// learns.
     pub fn text(&mut self, progress: &Progress, restarts: Restarts) -> (String, String) {
         let left_secs = self.pace.secs_left(progress);
         let figures = Figures { progress, restarts };
-        (Head { progress, left_secs }.to_string(), figures.to_string())
+        (
+            Head {
+                progress,
+                left_secs,
+            }
+            .to_string(),
+            figures.to_string(),
+        )
     }
 
     /// Removes the bar, so that other things can be printed.
@@ -76,7 +86,9 @@ impl Watcher for Display {
             Surface::Terminal(bar) => {
                 let (position, length) = match progress.phase {
                     Phase::Evaluating => progress.evaluation_episodes,
-                    Phase::Flying | Phase::Learning | Phase::Finishing => (progress.episodes, progress.total_episodes),
+                    Phase::Flying | Phase::Learning | Phase::Finishing => {
+                        (progress.episodes, progress.total_episodes)
+                    }
                 };
                 bar.set_length(length);
                 bar.set_position(position);
@@ -167,7 +179,10 @@ impl fmt::Display for Figures<'_> {
         }
         let plural = if progress.actors == 1 { "" } else { "s" };
         write!(f, " · {} actor{plural}", progress.actors)?;
-        for (who, times) in [("learner", self.restarts.learner), ("actors", self.restarts.actors)] {
+        for (who, times) in [
+            ("learner", self.restarts.learner),
+            ("actors", self.restarts.actors),
+        ] {
             if times > 0 {
                 write!(f, " · {who} restarted {times}×")?;
             }
@@ -179,8 +194,8 @@ impl fmt::Display for Figures<'_> {
     }
 }
 
-/// `figures` on as many lines of at most `columns` as they take, parted where one figure ends: the terminal would part them anywhere, and the bar would
-/// not know how many lines to renew.
+/// `figures` on as many lines of at most `columns` as they take, parted where one figure ends: the
+/// terminal would part them anywhere, and the bar would not know how many lines to renew.
 fn wrapped(figures: &str, columns: usize) -> String {
     let mut lines: Vec<String> = Vec::new();
     for figure in figures.split(" · ") {
@@ -225,7 +240,8 @@ struct Pace {
 }
 
 impl Pace {
-    /// Seconds until all training episodes are flown at the present pace; `None` before there is a pace.
+    /// Seconds until all training episodes are flown at the present pace; `None` before there is a
+    /// pace.
     fn secs_left(&mut self, progress: &Progress) -> Option<f64> {
         let (now_secs, episodes) = (progress.elapsed_secs, progress.episodes);
         // A learner that was started again does some work anew, and is ahead of nobody by it.
@@ -279,7 +295,10 @@ mod tests {
             },
             Figures {
                 progress: &progress,
-                restarts: Restarts { learner: 2, actors: 0 },
+                restarts: Restarts {
+                    learner: 2,
+                    actors: 0
+                },
             }
         );
         let expected = "episode 512/2000 · 1:02:05, 1:01 left · 152 steps/s · 63 updates/s · walls passed 1.23 · temperature 0.051 · 1 actor · learner restarted 2×";
@@ -303,7 +322,10 @@ mod tests {
         .to_string();
         for columns in 30..200 {
             let lines = wrapped(&figures, columns);
-            assert!(lines.lines().all(|line| line.chars().count() <= columns), "{lines}");
+            assert!(
+                lines.lines().all(|line| line.chars().count() <= columns),
+                "{lines}"
+            );
             assert_eq!(lines.replace('\n', " · "), figures);
         }
         assert!(!wrapped(&figures, figures.chars().count()).contains('\n'));

@@ -14,16 +14,23 @@ pub const INTERRUPTED: u8 = 130;
 /// # Errors
 /// When the system refuses.
 pub fn runtime() -> io::Result<Runtime> {
-    tokio::runtime::Builder::new_current_thread().enable_all().build()
+    tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
 }
 
-/// One message for each time the user, or the system, asks this process to end. Within a [`runtime`].
+/// One message for each time the user, or the system, asks this process to end. Within a
+/// [`runtime`].
 ///
 /// # Errors
 /// When the system refuses.
 pub fn interrupts() -> io::Result<mpsc::Receiver<()>> {
     let (sender, receiver) = mpsc::channel(4);
-    for kind in [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()] {
+    for kind in [
+        SignalKind::interrupt(),
+        SignalKind::terminate(),
+        SignalKind::hangup(),
+    ] {
         let mut signal = signal(kind)?;
         let sender = sender.clone();
         tokio::spawn(async move {

@@ -182,7 +182,8 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         return Ok(outcome?);
     }
 
-    // Plots are a service: a run that failed may have left something worth looking at, and one that succeeded has, plots or not.
+    // Plots are a service: a run that failed may have left something worth looking at, and one that
+    // succeeded has, plots or not.
     let window = config.evaluation.window_episodes as usize;
     if let Err(error) = reports::draw_all(run, courses, window, ideal_walls_passed(config)?) {
         eprintln!("skein: not all plots could be drawn: {error}");
@@ -192,7 +193,8 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         source,
     })?;
     print!("{}", conclusion(run));
-    // Whoever told the learner alone to stop has interrupted the run as well, and a run may be complete before it heeds an interruption.
+    // Whoever told the learner alone to stop has interrupted the run as well, and a run may be
+    // complete before it heeds an interruption.
     let ended = match Summary::of(run).map(|summary| summary.ending) {
         Some(Ending::Completed) => Ended::Finished,
         Some(Ending::Interrupted) => Ended::Interrupted,
@@ -251,7 +253,10 @@ fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
     if !config.courses.evaluation.contains(&config.courses.training) {
         eprintln!(
             "skein: note: the training course is not among courses.evaluation; the best snapshot is chosen on {}",
-            prepared.courses.first().map_or("none", |course| &course.name)
+            prepared
+                .courses
+                .first()
+                .map_or("none", |course| &course.name)
         );
     }
 }
@@ -271,7 +276,8 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let programs = Programs::beside_this()?;
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
-    // Between two incarnations of its learner, a run is under way as long as somebody sees to it that there will be another.
+    // Between two incarnations of its learner, a run is under way as long as somebody sees to it
+    // that there will be another.
     if !run.is_under_way()? {
         let root = run.root().display();
         bail!(
@@ -286,7 +292,9 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     // The lowest free numbers were claimed: with those from the limit on, there would be too many.
     let too_many = actors.iter().filter(|id| id.0 as usize >= most).count();
     if too_many > 0 {
-        bail!("that is {too_many} more than transport.max_actors = {most} of this run allows: attach fewer");
+        bail!(
+            "that is {too_many} more than transport.max_actors = {most} of this run allows: attach fewer"
+        );
     }
     let names: Vec<_> = actors.iter().map(ToString::to_string).collect();
     eprintln!(

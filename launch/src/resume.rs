@@ -68,17 +68,25 @@ pub enum ResumeError {
     },
 }
 
-/// Checks that the run in `directory` can be gone on with by `actors` actors, and claims it. A learner that nobody supervises is given `patience`
-/// to end.
+/// Checks that the run in `directory` can be gone on with by `actors` actors, and claims it. A
+/// learner that nobody supervises is given `patience` to end.
 ///
 /// # Errors
 /// [`ResumeError`]; nothing was changed then.
-pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Prepared, SupervisorLock), ResumeError> {
+pub fn resume(
+    directory: &Path,
+    actors: usize,
+    patience: Duration,
+) -> Result<(Prepared, SupervisorLock), ResumeError> {
     let not_a_run = |missing: &Path| ResumeError::NotARun {
         directory: directory.to_owned(),
         missing: missing.to_owned(),
     };
-    let run = RunDirectory::new(directory.canonicalize().map_err(|_| not_a_run(Path::new("run.json")))?);
+    let run = RunDirectory::new(
+        directory
+            .canonicalize()
+            .map_err(|_| not_a_run(Path::new("run.json")))?,
+    );
     if !run.identity().is_file() {
         return Err(not_a_run(Path::new("run.json")));
     }
@@ -124,7 +132,10 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
 }
 
 /// Looks again and again for what `look` may find, for so long.
-fn in_time<T, E>(patience: Duration, look: impl Fn() -> Result<Option<T>, E>) -> Result<Option<T>, E> {
+fn in_time<T, E>(
+    patience: Duration,
+    look: impl Fn() -> Result<Option<T>, E>,
+) -> Result<Option<T>, E> {
     let deadline = Instant::now() + patience;
     loop {
         match look()? {
@@ -144,7 +155,9 @@ mod tests {
     use crate::prepare::tests::prepared_run;
 
     fn refusal(directory: &Path) -> String {
-        resume(directory, 1, Duration::ZERO).unwrap_err().to_string()
+        resume(directory, 1, Duration::ZERO)
+            .unwrap_err()
+            .to_string()
     }
 
     #[test]
@@ -175,7 +188,9 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = prepared_run(directory.path()).run;
         let actors = Config::default().transport.max_actors + 1;
-        let error = resume(run.root(), actors, Duration::ZERO).unwrap_err().to_string();
+        let error = resume(run.root(), actors, Duration::ZERO)
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("max_actors"), "{error}");
         let text = fs::read_to_string(run.config())
             .unwrap()

@@ -1,6 +1,7 @@
 //! Drawing a minibatch from a full split replay buffer, from small buffers to large ones.
 //!
-//! The configured size is 2^17; the others show what a batch costs once its rows no longer lie in a cache.
+//! The configured size is 2^17; the others show what a batch costs once its rows no longer lie in a
+//! cache.
 
 use criterion::{BenchmarkId, Criterion, Throughput};
 use rand::{Rng, SeedableRng};
@@ -16,7 +17,8 @@ use skein_protocol::{ACTION, GROUND_TRUTH, LONGEST_LATENT};
 const BATCH: usize = 256;
 /// Steps of each episode that fills the buffer.
 const STEPS: usize = 64;
-/// Every so many steps pass a wall: more than the success part's share, so that it fills no later than the other.
+/// Every so many steps pass a wall: more than the success part's share, so that it fills no later
+/// than the other.
 const STEPS_PER_WALL: usize = 4;
 
 fn main() {

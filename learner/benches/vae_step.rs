@@ -26,7 +26,11 @@ fn main() {
     let mut group = criterion.benchmark_group("vae_step");
     group.throughput(Throughput::Elements(of_an_image as u64 * BATCH as u64));
     group.bench_function("native", |bencher| {
-        bencher.iter(|| native.update(&images, &mut noise).expect("images are finite"));
+        bencher.iter(|| {
+            native
+                .update(&images, &mut noise)
+                .expect("images are finite")
+        });
     });
     group.bench_function("libtorch", |bencher| {
         bencher.iter(|| {

@@ -1,4 +1,5 @@
-//! Prints how long a VAE step takes on this machine, on both engines, where in the network the time goes, and how near that is to what its cores can do.
+//! Prints how long a VAE step takes on this machine, on both engines, where in the network the time
+//! goes, and how near that is to what its cores can do.
 //!
 //! `cargo run --release -p skein-learner --example vae_step_times -- [THREADS]`
 
@@ -19,7 +20,10 @@ fn main() {
     use_threads(threads);
     let isa = Isa::best();
     let peak = peak_flops(isa) * threads as f64;
-    println!("{isa}, peak of {threads} threads: {:.1} GFLOP/s", peak / 1e9);
+    println!(
+        "{isa}, peak of {threads} threads: {:.1} GFLOP/s",
+        peak / 1e9
+    );
     for batch in [32, 16] {
         vae(batch, threads, peak);
     }
@@ -42,7 +46,9 @@ fn vae(batch: usize, threads: usize, peak: f64) {
         if spent.is_none() {
             let _ = native.take_spent();
         }
-        native.update(&bytes, &mut vae_noise).expect("images are finite");
+        native
+            .update(&bytes, &mut vae_noise)
+            .expect("images are finite");
         spent = Some(native.take_spent());
     });
     let torch_millis = report("VAE step, libtorch", batch, STEPS / 2, || {
@@ -86,7 +92,8 @@ fn vae(batch: usize, threads: usize, peak: f64) {
     });
 }
 
-/// Runs `work` a few times to warm up, then `repetitions` times; prints and returns the median, which a busy machine disturbs least.
+/// Runs `work` a few times to warm up, then `repetitions` times; prints and returns the median,
+/// which a busy machine disturbs least.
 fn report(what: &str, batch: usize, repetitions: usize, mut work: impl FnMut()) -> f64 {
     let warm_up = repetitions / 5 + 1;
     let mut millis: Vec<f64> = (0..repetitions + warm_up)

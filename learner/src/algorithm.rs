@@ -1,7 +1,9 @@
 //! What a learning algorithm is to the rest of the learner, and which there are.
 //!
-//! It gets minibatches and noise, and gives a policy; replay, transport and actors know nothing of it. Another one is a module beside [`crate::sac`] and [`crate::td3`] that
-//! implements [`Algorithm`], a section of settings that `skein_protocol::config` reads and checks, and a name in `AlgorithmName`, after which the compiler says where else it is asked for.
+//! It gets minibatches and noise, and gives a policy; replay, transport and actors know nothing of
+//! it. Another one is a module beside [`crate::sac`] and [`crate::td3`] that implements
+//! [`Algorithm`], a section of settings that `skein_protocol::config` reads and checks, and a name
+//! in `AlgorithmName`, after which the compiler says where else it is asked for.
 
 use std::fmt;
 
@@ -20,13 +22,16 @@ use crate::td3::{NativeTd3, TorchTd3};
 
 /// A way to learn a policy from transitions.
 ///
-/// Its state is what [`Stateful::parts`] names: networks begin as functions of the run's seed, and all noise comes from the caller, so that an algorithm restored from its state
-/// goes on bit for bit.
+/// Its state is what [`Stateful::parts`] names: networks begin as functions of the run's seed, and
+/// all noise comes from the caller, so that an algorithm restored from its state goes on bit for
+/// bit.
 pub trait Algorithm: Stateful + fmt::Debug {
-    /// One update from a minibatch, on the threads of `team`. What it returns are points of curves, the same ones each time.
+    /// One update from a minibatch, on the threads of `team`. What it returns are points of curves,
+    /// the same ones each time.
     ///
     /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the update's number; nothing was changed then.
+    /// [`UpdateError::NonFinite`] names what was not finite and the update's number; nothing was
+    /// changed then.
     ///
     /// # Panics
     /// When the columns have different numbers of rows, or none.
@@ -49,21 +54,31 @@ pub trait Algorithm: Stateful + fmt::Debug {
     /// When `into` is not as long as the layout.
     fn publish(&self, into: &mut [f32]);
 
-    /// Copies the encoder's part of a snapshot, in the snapshot layout's order, if this trains an encoder ([`Inputs::from_image`]). What learns from the VAE's codes leaves `into` alone.
+    /// Copies the encoder's part of a snapshot, in the snapshot layout's order, if this trains an
+    /// encoder ([`Inputs::from_image`]). What learns from the VAE's codes leaves `into` alone.
     ///
     /// # Panics
     /// When `into` is not as long as the encoder.
     fn publish_encoder(&self, into: &mut [f32]);
 }
 
-/// The algorithm that a configuration names, untrained. `device`: libtorch's; the native engine is on the processor.
+/// The algorithm that a configuration names, untrained. `device`: libtorch's; the native engine is
+/// on the processor.
 pub fn new(config: &Config, device: Device) -> Box<dyn Algorithm> {
     let (inputs, seed, engine) = (Inputs::of(config), config.run.seed, config.policy_engine());
     match (config.learning.algorithm, engine) {
-        (AlgorithmName::Sac, Engine::Native) => Box::new(NativeSac::new(&config.sac, inputs, seed, Isa::best())),
-        (AlgorithmName::Sac, Engine::Libtorch) => Box::new(TorchSac::new(&config.sac, inputs, seed, device)),
-        (AlgorithmName::Td3, Engine::Native) => Box::new(NativeTd3::new(&config.td3, inputs, seed, Isa::best())),
-        (AlgorithmName::Td3, Engine::Libtorch) => Box::new(TorchTd3::new(&config.td3, inputs, seed, device)),
+        (AlgorithmName::Sac, Engine::Native) => {
+            Box::new(NativeSac::new(&config.sac, inputs, seed, Isa::best()))
+        }
+        (AlgorithmName::Sac, Engine::Libtorch) => {
+            Box::new(TorchSac::new(&config.sac, inputs, seed, device))
+        }
+        (AlgorithmName::Td3, Engine::Native) => {
+            Box::new(NativeTd3::new(&config.td3, inputs, seed, Isa::best()))
+        }
+        (AlgorithmName::Td3, Engine::Libtorch) => {
+            Box::new(TorchTd3::new(&config.td3, inputs, seed, device))
+        }
     }
 }
 
@@ -74,7 +89,8 @@ pub struct Inputs {
     pub policy: usize,
     /// The critic, beside the action.
     pub critic: usize,
-    /// How many of them, the first ones, are made of the images in each update, by an encoder that is trained end to end; `None` where the code is the VAE's.
+    /// How many of them, the first ones, are made of the images in each update, by an encoder that
+    /// is trained end to end; `None` where the code is the VAE's.
     pub from_image: Option<usize>,
 }
 
@@ -119,9 +135,11 @@ pub struct Columns<'a> {
     pub states: &'a [f32],
     /// The same after the action.
     pub next_states: &'a [f32],
-    /// `[n]`: 1 where the state after the action ends the task (a crash, the end wall), 0 elsewhere. An episode cut off by its step limit is not terminated.
+    /// `[n]`: 1 where the state after the action ends the task (a crash, the end wall), 0
+    /// elsewhere. An episode cut off by its step limit is not terminated.
     pub terminated: &'a [f32],
-    /// Depth images of the observations and of the next ones, `[n, 72, 128]` each; where the encoder is trained end to end, whose codes no row of the replay can hold.
+    /// Depth images of the observations and of the next ones, `[n, 72, 128]` each; where the
+    /// encoder is trained end to end, whose codes no row of the replay can hold.
     pub images: Option<[&'a [u8]; 2]>,
 }
 

@@ -1,12 +1,15 @@
-//! The average of the policy over its latest updates, which flies in its place (Polyak averaging, as of a target network).
+//! The average of the policy over its latest updates, which flies in its place (Polyak averaging,
+//! as of a target network).
 //!
-//! Every update follows its own minibatch, so the policy goes on being tossed about when it no longer improves, and one snapshot flies worse than the next by chance. The
-//! average of many is steadier than any of them.
+//! Every update follows its own minibatch, so the policy goes on being tossed about when it no
+//! longer improves, and one snapshot flies worse than the next by chance. The average of many is
+//! steadier than any of them.
 
 use crate::algorithm::Algorithm;
 use crate::state::{Part, Stateful};
 
-/// Updates at the beginning of which the average hardly looks back, because an untrained policy is worth forgetting.
+/// Updates at the beginning of which the average hardly looks back, because an untrained policy is
+/// worth forgetting.
 const BEGINNING: f32 = 10.0;
 
 /// A moving average of a policy's parameters.
@@ -19,7 +22,8 @@ pub struct Average {
 }
 
 impl Average {
-    /// The average over some `updates`, exponentially weighted, of the policy of `algorithm`, which it begins as.
+    /// The average over some `updates`, exponentially weighted, of the policy of `algorithm`, which
+    /// it begins as.
     pub fn new(updates: usize, algorithm: &dyn Algorithm) -> Self {
         let mut values = vec![0.0; algorithm.policy_layout().len()];
         algorithm.publish(&mut values);
@@ -33,7 +37,9 @@ impl Average {
     /// Takes in the policy as an update has left it.
     pub fn take_in(&mut self, algorithm: &dyn Algorithm) {
         algorithm.publish(&mut self.latest);
-        let weight = self.weight.max(BEGINNING / (BEGINNING + algorithm.updates() as f32));
+        let weight = self
+            .weight
+            .max(BEGINNING / (BEGINNING + algorithm.updates() as f32));
         for (average, latest) in self.values.iter_mut().zip(&self.latest) {
             *average += weight * (latest - *average);
         }

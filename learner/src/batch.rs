@@ -17,7 +17,8 @@ pub(crate) struct Batch {
     pub(crate) states: Tensor,
     pub(crate) next_states: Tensor,
     pub(crate) terminated: Tensor,
-    /// Depth images of the observations and of the next ones, `[n, 1, 72, 128]` each, in [0, 1]; where the encoder is trained end to end.
+    /// Depth images of the observations and of the next ones, `[n, 1, 72, 128]` each, in [0, 1];
+    /// where the encoder is trained end to end.
     pub(crate) images: Option<[Tensor; 2]>,
 }
 
@@ -28,7 +29,9 @@ impl Batch {
     /// When the columns have different numbers of rows, or none.
     pub(crate) fn new(columns: Columns<'_>, inputs: Inputs, device: Device) -> Self {
         let rows = columns.check(inputs) as i64;
-        let column = |values: &[f32], shape: &[i64]| Tensor::from_slice(values).view(shape).to_device(device);
+        let column = |values: &[f32], shape: &[i64]| {
+            Tensor::from_slice(values).view(shape).to_device(device)
+        };
         let [observation, state] = [inputs.policy, inputs.critic].map(|width| width as i64);
         let seen = |bytes| pixels(&images_from_bytes(bytes).to_device(device));
         Self {

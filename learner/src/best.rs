@@ -1,15 +1,17 @@
 //! The best snapshot: candidates by training episodes, confirmed by evaluation episodes.
 //!
-//! Training episodes are flown with exploration noise from all levels, so their average only says when it is worth looking. What counts is flown as the
-//! final evaluation will be: without noise, from the start of level 1.
+//! Training episodes are flown with exploration noise from all levels, so their average only says
+//! when it is worth looking. What counts is flown as the final evaluation will be: without noise,
+//! from the start of level 1.
 
 use skein_protocol::config::EvaluationSection;
 
 use crate::checkpoint::BestSnapshot;
 use crate::metrics::MovingAverage;
 
-/// Whether the snapshot after `episodes` training episodes is worth confirming: enough episodes since the last candidate at `latest`, a full window, and an
-/// average not far below that of the best so far.
+/// Whether the snapshot after `episodes` training episodes is worth confirming: enough episodes
+/// since the last candidate at `latest`, a full window, and an average not far below that of the
+/// best so far.
 pub fn is_candidate(
     section: &EvaluationSection,
     episodes: u64,
@@ -18,14 +20,25 @@ pub fn is_candidate(
     best: Option<&BestSnapshot>,
 ) -> bool {
     let due = latest.is_none_or(|latest| episodes >= latest + section.every_episodes);
-    let threshold = best.map_or(0.0, |best| best.window_walls_passed - section.candidate_margin);
-    due && walls_passed.is_full() && walls_passed.mean().is_some_and(|mean| mean > 0.0 && mean >= threshold)
+    let threshold = best.map_or(0.0, |best| {
+        best.window_walls_passed - section.candidate_margin
+    });
+    due && walls_passed.is_full()
+        && walls_passed
+            .mean()
+            .is_some_and(|mean| mean > 0.0 && mean >= threshold)
 }
 
-/// Whether a confirmed candidate replaces the best: more walls passed in evaluation, or as many and a better training average.
+/// Whether a confirmed candidate replaces the best: more walls passed in evaluation, or as many and
+/// a better training average.
 pub fn is_better(candidate: &BestSnapshot, best: Option<&BestSnapshot>) -> bool {
     best.is_none_or(|best| {
-        let rank = |snapshot: &BestSnapshot| (snapshot.confirmed_walls_passed, snapshot.window_walls_passed);
+        let rank = |snapshot: &BestSnapshot| {
+            (
+                snapshot.confirmed_walls_passed,
+                snapshot.window_walls_passed,
+            )
+        };
         rank(candidate) > rank(best)
     })
 }

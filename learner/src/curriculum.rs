@@ -14,10 +14,14 @@ const EVALUATION_STRIDE: u64 = 1 << 24;
 
 /// Epochs of the whole run; the last may be shorter.
 pub fn epochs(config: &Config) -> u64 {
-    config.run.episodes.div_ceil(config.learning.episodes_per_epoch)
+    config
+        .run
+        .episodes
+        .div_ceil(config.learning.episodes_per_epoch)
 }
 
-/// Tickets of `epoch`, in episode order. Where episodes are flown in segments, there is one episode, and `flown` are the actions of its segments so far, from reset on.
+/// Tickets of `epoch`, in episode order. Where episodes are flown in segments, there is one
+/// episode, and `flown` are the actions of its segments so far, from reset on.
 pub fn training(
     config: &Config,
     run: RunId,
@@ -47,8 +51,8 @@ pub fn training(
 
 /// Tickets of `episodes` evaluation episodes on each of `courses`, course by course.
 ///
-/// Episode i has the same seed on every course and in every evaluation, so that snapshots are compared on the same starts. `evaluation` numbers the
-/// evaluations of a run.
+/// Episode i has the same seed on every course and in every evaluation, so that snapshots are
+/// compared on the same starts. `evaluation` numbers the evaluations of a run.
 pub fn evaluation(
     config: &Config,
     run: RunId,
@@ -73,9 +77,22 @@ pub fn evaluation(
     (0..).zip(flown).map(ticket).collect()
 }
 
-/// Tickets of the episodes that confirm a candidate for the best snapshot. Generated courses are the same ones for each candidate, and none of them is trained on.
-pub fn confirmation(config: &Config, run: RunId, number: u64, version: PolicyVersion) -> Vec<Ticket> {
-    let mut tickets = evaluation(config, run, number, version, 0..1, config.evaluation.confirm_episodes);
+/// Tickets of the episodes that confirm a candidate for the best snapshot. Generated courses are
+/// the same ones for each candidate, and none of them is trained on.
+pub fn confirmation(
+    config: &Config,
+    run: RunId,
+    number: u64,
+    version: PolicyVersion,
+) -> Vec<Ticket> {
+    let mut tickets = evaluation(
+        config,
+        run,
+        number,
+        version,
+        0..1,
+        config.evaluation.confirm_episodes,
+    );
     if config.evaluation.confirm_on == ConfirmOn::Generated {
         for (episode, ticket) in (0..).zip(&mut tickets) {
             let course = derive(config.run.seed, Purpose::ConfirmationCourse, episode);
@@ -85,7 +102,8 @@ pub fn confirmation(config: &Config, run: RunId, number: u64, version: PolicyVer
     tickets
 }
 
-/// The level training episode `episode` starts at: the next one every few episodes, then the first again (paper, section 4.2).
+/// The level training episode `episode` starts at: the next one every few episodes, then the first
+/// again (paper, section 4.2).
 fn start_level(config: &Config, episode: u64) -> u8 {
     let step = episode / config.learning.episodes_per_level;
     (step % u64::from(config.learning.levels)) as u8 + 1
@@ -126,7 +144,10 @@ mod tests {
     fn every_episode_is_in_exactly_one_epoch() {
         let mut config = Config::default();
         (config.run.episodes, config.learning.episodes_per_epoch) = (23, 10);
-        let episodes: Vec<u64> = tickets(&config).iter().map(|ticket| ticket.episode.0).collect();
+        let episodes: Vec<u64> = tickets(&config)
+            .iter()
+            .map(|ticket| ticket.episode.0)
+            .collect();
         assert_eq!(episodes, (0..23).collect::<Vec<_>>());
     }
 
@@ -134,7 +155,10 @@ mod tests {
     fn the_start_level_rises_every_ten_episodes_and_returns() {
         let mut config = Config::default();
         config.run.episodes = 60;
-        let levels: Vec<u8> = tickets(&config).iter().map(|ticket| ticket.start_level).collect();
+        let levels: Vec<u8> = tickets(&config)
+            .iter()
+            .map(|ticket| ticket.start_level)
+            .collect();
         assert_eq!(
             levels.chunks(10).map(|chunk| chunk[0]).collect::<Vec<_>>(),
             [1, 2, 3, 4, 5, 1]
@@ -168,8 +192,14 @@ mod tests {
     fn candidates_are_confirmed_on_the_same_generated_courses_which_are_not_trained_on() {
         let mut config = Config::default();
         (config.run.episodes, config.courses.generated_share) = (1000, 1.0);
-        let courses = |tickets: &[Ticket]| tickets.iter().map(|ticket| ticket.course).collect::<HashSet<_>>();
-        let confirmed = |config: &Config, number| confirmation(config, RunId(1), number, PolicyVersion(number));
+        let courses = |tickets: &[Ticket]| {
+            tickets
+                .iter()
+                .map(|ticket| ticket.course)
+                .collect::<HashSet<_>>()
+        };
+        let confirmed =
+            |config: &Config, number| confirmation(config, RunId(1), number, PolicyVersion(number));
         assert_eq!(
             courses(&confirmed(&config, 0)),
             HashSet::from([CourseChoice::Evaluation(0)])
@@ -189,7 +219,8 @@ mod tests {
         let config = Config::default();
         let first = evaluation(&config, RunId(1), 0, PolicyVersion(3), 0..2, 5);
         let second = evaluation(&config, RunId(1), 1, PolicyVersion(4), 0..1, 5);
-        let seeds = |tickets: &[Ticket]| tickets.iter().map(|ticket| ticket.seed).collect::<Vec<_>>();
+        let seeds =
+            |tickets: &[Ticket]| tickets.iter().map(|ticket| ticket.seed).collect::<Vec<_>>();
         assert_eq!(seeds(&first[..5]), seeds(&second));
         assert_eq!(seeds(&first[..5]), seeds(&first[5..]));
         assert!(

@@ -26,7 +26,8 @@ pub enum DeviceError {
     },
 }
 
-/// The tensor library's name for the configured device, once it is sure that tensors can live there.
+/// The tensor library's name for the configured device, once it is sure that tensors can live
+/// there.
 ///
 /// # Errors
 /// [`DeviceError`] says what is missing and what to do.
@@ -41,14 +42,16 @@ pub fn open(device: config::Device) -> Result<Device, DeviceError> {
             if number as i64 >= count {
                 return Err(DeviceError::NoSuchDevice { number, count });
             }
-            // Choosing convolution algorithms by timing them would make results depend on the machine's load.
+            // Choosing convolution algorithms by timing them would make results depend on the
+            // machine's load.
             Cuda::cudnn_set_benchmark(false);
             Ok(Device::Cuda(number))
         }
     }
 }
 
-/// Sets how many threads tensor operations of the calling thread use; part of the result, as another count sums in another order.
+/// Sets how many threads tensor operations of the calling thread use; part of the result, as
+/// another count sums in another order.
 pub fn use_threads(count: usize) {
     tch::set_num_threads(count as i32);
 }
@@ -62,7 +65,8 @@ mod tests {
         let error = open(config::Device::Cuda(1000)).unwrap_err();
         let text = error.to_string();
         assert!(
-            text.starts_with("run.device = cuda:1000: ") && text.contains("set run.device = \"cpu\""),
+            text.starts_with("run.device = cuda:1000: ")
+                && text.contains("set run.device = \"cpu\""),
             "{text}"
         );
     }

@@ -1,7 +1,8 @@
 //! A full disk pauses the learner and loses nothing.
 //!
-//! Whoever writes and finds no room warns, waits, and tries again until there is room or the run is told to stop; what was learned stays in memory
-//! meanwhile. Files that are written whole are written again ([`Disk::with_room`]); to those that are appended to, what is missing is appended
+//! Whoever writes and finds no room warns, waits, and tries again until there is room or the run is
+//! told to stop; what was learned stays in memory meanwhile. Files that are written whole are
+//! written again ([`Disk::with_room`]); to those that are appended to, what is missing is appended
 //! ([`Patient`]), so that nothing is in them twice. Any other failure is for the caller.
 
 use std::error::Error;
@@ -38,10 +39,14 @@ impl Disk {
 
     /// What waits for room at the moment.
     pub fn waiting(&self) -> Option<String> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.waiting
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
     }
 
-    /// Repeats `attempt`, which writes `path` anew each time, as long as it fails because the disk is full.
+    /// Repeats `attempt`, which writes `path` anew each time, as long as it fails because the disk
+    /// is full.
     ///
     /// # Errors
     /// What it fails of otherwise; that the disk is full, once the run is told to stop.
@@ -54,7 +59,8 @@ impl Disk {
         loop {
             match attempt() {
                 Err(error) if is_full(&error) && !self.stop.load(Ordering::Relaxed) => {
-                    wait.get_or_insert_with(|| Wait::of(self)).once_more(path, &error);
+                    wait.get_or_insert_with(|| Wait::of(self))
+                        .once_more(path, &error);
                 }
                 result => return result,
             }
@@ -75,7 +81,12 @@ impl Disk {
 fn is_full(error: &(dyn Error + 'static)) -> bool {
     successors(Some(error), |&error| error.source())
         .filter_map(|error| error.downcast_ref::<io::Error>())
-        .any(|error| matches!(error.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded))
+        .any(|error| {
+            matches!(
+                error.kind(),
+                ErrorKind::StorageFull | ErrorKind::QuotaExceeded
+            )
+        })
 }
 
 /// Somebody who waits for room.
@@ -90,12 +101,19 @@ impl<'a> Wait<'a> {
     }
 
     fn once_more(&mut self, path: &Path, error: &dyn Error) {
-        if self.warned.is_none_or(|warned| warned.elapsed() >= WARN_EVERY) {
+        if self
+            .warned
+            .is_none_or(|warned| warned.elapsed() >= WARN_EVERY)
+        {
             self.warned = Some(Instant::now());
             tracing::warn!(path = %path.display(), %error, "the disk is full; training waits for room");
         }
         let text = format!("waits for room on the disk to write {}", path.display());
-        *self.disk.waiting.lock().unwrap_or_else(PoisonError::into_inner) = Some(text);
+        *self
+            .disk
+            .waiting
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner) = Some(text);
         thread::sleep(self.disk.pause);
     }
 }
@@ -103,7 +121,11 @@ impl<'a> Wait<'a> {
 impl Drop for Wait<'_> {
     fn drop(&mut self) {
         // Another one who waits says so again within a pause.
-        *self.disk.waiting.lock().unwrap_or_else(PoisonError::into_inner) = None;
+        *self
+            .disk
+            .waiting
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner) = None;
     }
 }
 
@@ -169,7 +191,8 @@ mod tests {
             written: Vec::new(),
             refusals: 4,
         };
-        let mut writer = io::BufWriter::with_capacity(4, disk.patient(Path::new("episodes.csv"), small));
+        let mut writer =
+            io::BufWriter::with_capacity(4, disk.patient(Path::new("episodes.csv"), small));
         for text in ["one,", "two,", "three,", "four"] {
             writer.write_all(text.as_bytes()).unwrap();
         }
@@ -194,7 +217,10 @@ mod tests {
         }
         assert!(disk.waiting().unwrap().contains("/somewhere/episode-3"));
         disk.stop.store(true, Ordering::Relaxed);
-        assert_eq!(waiting.join().unwrap().unwrap_err().kind(), ErrorKind::QuotaExceeded);
+        assert_eq!(
+            waiting.join().unwrap().unwrap_err().kind(),
+            ErrorKind::QuotaExceeded
+        );
     }
 
     #[test]
@@ -204,6 +230,9 @@ mod tests {
             attempts += 1;
             Err::<(), _>(io::Error::from(ErrorKind::PermissionDenied))
         });
-        assert_eq!((error.unwrap_err().kind(), attempts), (ErrorKind::PermissionDenied, 1));
+        assert_eq!(
+            (error.unwrap_err().kind(), attempts),
+            (ErrorKind::PermissionDenied, 1)
+        );
     }
 }

@@ -1,8 +1,9 @@
 //! An episode as the learner keeps it: committed, complete, in order.
 //!
-//! The assembler builds it from streamed records; metrics and replay take it from there. It holds one observation more than it has steps: the closing
-//! observation is what the last step led to, and an episode that was cut off bootstraps from it. Of an episode in segments each segment is one of these, and what has been
-//! flown of it so far is one as well.
+//! The assembler builds it from streamed records; metrics and replay take it from there. It holds
+//! one observation more than it has steps: the closing observation is what the last step led to,
+//! and an episode that was cut off bootstraps from it. Of an episode in segments each segment is
+//! one of these, and what has been flown of it so far is one as well.
 
 use skein_protocol::config::View;
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
@@ -24,7 +25,8 @@ pub struct StepObservation {
     pub ground_truth: [f32; GROUND_TRUTH],
 }
 
-/// What brings the numbers of the ground truth, in their order, to a common size: 10 m between walls, some metres to an opening, tenths of a newton.
+/// What brings the numbers of the ground truth, in their order, to a common size: 10 m between
+/// walls, some metres to an opening, tenths of a newton.
 #[rustfmt::skip]
 const TRUTH_SCALE: [f32; GROUND_TRUTH] = [
     0.2, 0.5, 0.5, 1.0, // the next wall: distance, left, up, clearance
@@ -69,7 +71,8 @@ pub struct CommittedEpisode {
     pub walls_passed: u8,
     /// Walls of the course; 0 while the episode goes on.
     pub course_walls: u8,
-    /// The wall that was hit, from 1 in episode order, if it collided with one and not with the corridor.
+    /// The wall that was hit, from 1 in episode order, if it collided with one and not with the
+    /// corridor.
     pub hit_wall: Option<u8>,
     /// Depth images of all observations, `[T + 1, 72, 128]`, while the VAE is trained.
     pub depth: Option<Vec<u8>>,
@@ -97,9 +100,13 @@ impl CommittedEpisode {
         self.actions.len()
     }
 
-    /// Sum of all rewards, undiscounted; summed in double precision, so that it does not depend on how the sum is arranged.
+    /// Sum of all rewards, undiscounted; summed in double precision, so that it does not depend on
+    /// how the sum is arranged.
     pub fn total_reward(&self) -> f32 {
-        self.rewards.iter().map(|&reward| f64::from(reward)).sum::<f64>() as f32
+        self.rewards
+            .iter()
+            .map(|&reward| f64::from(reward))
+            .sum::<f64>() as f32
     }
 
     /// How it ended.
@@ -111,7 +118,8 @@ impl CommittedEpisode {
             .expect("only of episodes that have ended is asked how they did")
     }
 
-    /// Whether it ended in a state without a future. An episode that reached its step limit did not, and its last step still bootstraps.
+    /// Whether it ended in a state without a future. An episode that reached its step limit did
+    /// not, and its last step still bootstraps.
     pub fn terminated(&self) -> bool {
         match self.outcome {
             Some(Outcome::Collided | Outcome::ReachedEnd) => true,
@@ -153,8 +161,10 @@ impl CommittedEpisode {
         view.write(step, into, |step, into| self.write_moment(step, view, into));
     }
 
-    /// Writes what a critic that is told the [ground truth](skein_protocol::config::CriticInput::GroundTruth) gets at the beginning of `step`, `[TRUE_STATE]`: that, the velocity, the tilt
-    /// and the action before, which with latency has yet to take effect; each number roughly within [-2, 2].
+    /// Writes what a critic that is told the [ground
+    /// truth](skein_protocol::config::CriticInput::GroundTruth) gets at the beginning of `step`,
+    /// `[TRUE_STATE]`: that, the velocity, the tilt and the action before, which with latency has
+    /// yet to take effect; each number roughly within [-2, 2].
     pub fn write_true_state(&self, step: usize, into: &mut [f32]) {
         let seen = &self.observations[step];
         let [roll, pitch, ..] = seen.orientation;
@@ -163,9 +173,14 @@ impl CommittedEpisode {
             .iter()
             .zip(TRUTH_SCALE)
             .map(|(value, scale)| value * scale);
-        let motion = seen.velocity_mps.into_iter().chain([10.0 * roll, 10.0 * pitch]);
+        let motion = seen
+            .velocity_mps
+            .into_iter()
+            .chain([10.0 * roll, 10.0 * pitch]);
         let all = truth.chain(motion).chain(self.action_before(step));
-        into.iter_mut().zip(all).for_each(|(into, value)| *into = value);
+        into.iter_mut()
+            .zip(all)
+            .for_each(|(into, value)| *into = value);
     }
 
     fn action_before(&self, step: usize) -> [f32; ACTION] {
@@ -179,13 +194,17 @@ impl CommittedEpisode {
         view.write_moment(&seen.latent, &seen.velocity_mps, &previous_action, into);
     }
 
-    /// Checks that every part has the length that the number of actions asks for, and that there is a step.
+    /// Checks that every part has the length that the number of actions asks for, and that there is
+    /// a step.
     ///
     /// # Errors
     /// [`EpisodeFault`] names the first part that has not.
     pub fn check(&self) -> Result<(), EpisodeFault> {
         let steps = self.steps();
-        let images = self.depth.as_ref().map_or((steps + 1) * IMAGE_PIXELS, Vec::len);
+        let images = self
+            .depth
+            .as_ref()
+            .map_or((steps + 1) * IMAGE_PIXELS, Vec::len);
         for (what, found, expected) in [
             ("actions", steps, steps.max(1)),
             ("observations", self.observations.len(), steps + 1),
@@ -214,7 +233,8 @@ pub(crate) mod samples {
 
     use super::*;
 
-    /// An episode of `steps` steps whose every quantity is a function of (`episode`, step). Image t is filled with [`shade`]; its latent is [`code`] of that.
+    /// An episode of `steps` steps whose every quantity is a function of (`episode`, step). Image t
+    /// is filled with [`shade`]; its latent is [`code`] of that.
     pub(crate) fn episode(episode: u64, steps: usize, outcome: Outcome) -> CommittedEpisode {
         let at = |step: usize| episode as f32 * 1000.0 + step as f32;
         CommittedEpisode {
@@ -234,7 +254,9 @@ pub(crate) mod samples {
                     ground_truth: std::array::from_fn(|index| at(step) + index as f32),
                 })
                 .collect(),
-            actions: (0..steps).map(|step| [at(step) / 1e6, -at(step) / 1e6]).collect(),
+            actions: (0..steps)
+                .map(|step| [at(step) / 1e6, -at(step) / 1e6])
+                .collect(),
             rewards: (0..steps).map(|step| at(step) / 100.0).collect(),
             reward_terms: vec![[0.0; 4]; steps],
             level_up: vec![false; steps],

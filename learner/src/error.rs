@@ -19,7 +19,8 @@ pub enum UpdateError {
 
 /// The values of scalar tensors, once they and all of the gradients are known to be finite.
 ///
-/// One transfer from the device for all of them. A gradient counts as not finite when its squared norm overflows as well.
+/// One transfer from the device for all of them. A gradient counts as not finite when its squared
+/// norm overflows as well.
 pub(crate) fn finite<const SCALARS: usize, const GRADIENTS: usize>(
     update: u64,
     scalars: [(&'static str, &Tensor); SCALARS],
@@ -40,7 +41,8 @@ pub(crate) fn finite<const SCALARS: usize, const GRADIENTS: usize>(
     Ok(std::array::from_fn(|place| numbers[place]))
 }
 
-/// Looks whether everything that update number `update` computed is a number; the first that is not is named.
+/// Looks whether everything that update number `update` computed is a number; the first that is not
+/// is named.
 pub(crate) fn must_be_finite(
     update: u64,
     numbers: impl IntoIterator<Item = (&'static str, f32)>,

@@ -1,4 +1,5 @@
-//! What is written of the final evaluation: the report, where the episodes flew, and what the VAE makes of what they saw.
+//! What is written of the final evaluation: the report, where the episodes flew, and what the VAE
+//! makes of what they saw.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -57,7 +58,8 @@ struct PathRow<'a> {
     outcome: Outcome,
 }
 
-/// Writes `evaluation.json` and `evaluation_trajectories.csv` from the evaluation episodes of all courses, course by course.
+/// Writes `evaluation.json` and `evaluation_trajectories.csv` from the evaluation episodes of all
+/// courses, course by course.
 ///
 /// # Errors
 /// [`EvaluationError`] names the file.
@@ -79,22 +81,29 @@ pub fn write_report(
     {
         let name = CoursesSection::name_of(course);
         let scores: Vec<EpisodeScore> = episodes.iter().map(score).collect();
-        let walls = episodes.first().map_or(0, |episode| episode.course_walls.into());
+        let walls = episodes
+            .first()
+            .map_or(0, |episode| episode.course_walls.into());
         courses.push(CourseEvaluation::of(&name, walls, &scores));
         for (number, episode) in episodes.iter().take(PATHS).enumerate() {
             rows = rows.and_then(|()| write_path(&mut paths, &name, number, episode));
         }
     }
-    let paths = rows
-        .map_err(io::Error::from)
-        .and_then(|()| paths.into_inner().map_err(|error| io::Error::other(error.to_string())));
+    let paths = rows.map_err(io::Error::from).and_then(|()| {
+        paths
+            .into_inner()
+            .map_err(|error| io::Error::other(error.to_string()))
+    });
     replace(&directory.evaluation_trajectories_csv(), paths)?;
     let report = EvaluationReport {
         policy_version,
         policy_sha256: policy_sha256.to_owned(),
         courses,
     };
-    replace(&directory.evaluation_json(), serde_json::to_vec_pretty(&report))?;
+    replace(
+        &directory.evaluation_json(),
+        serde_json::to_vec_pretty(&report),
+    )?;
     Ok(report)
 }
 
@@ -128,7 +137,8 @@ fn write_path(
     Ok(())
 }
 
-/// Writes depth images of an episode beside their reconstructions, `reconstructions.safetensors`; nothing where there is no VAE.
+/// Writes depth images of an episode beside their reconstructions, `reconstructions.safetensors`;
+/// nothing where there is no VAE.
 ///
 /// # Errors
 /// [`EvaluationError`] names the file.

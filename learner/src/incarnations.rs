@@ -8,8 +8,9 @@ use skein_protocol::durable;
 
 const HEADER: &str = "incarnation,unix_secs,episodes\n";
 
-/// Notes that a learner begins to live, with the state after `episodes` episodes; returns how many incarnations there were before. A file that cannot be read as
-/// text is begun anew: nothing learned depends on it.
+/// Notes that a learner begins to live, with the state after `episodes` episodes; returns how many
+/// incarnations there were before. A file that cannot be read as text is begun anew: nothing
+/// learned depends on it.
 ///
 /// # Errors
 /// Of the file system.
@@ -50,7 +51,10 @@ mod tests {
         let text = fs::read_to_string(path).unwrap();
         let rows: Vec<_> = text.lines().collect();
         assert_eq!(rows.len(), 4);
-        assert!(rows[3].starts_with("2,") && rows[3].ends_with(",500"), "{text}");
+        assert!(
+            rows[3].starts_with("2,") && rows[3].ends_with(",500"),
+            "{text}"
+        );
     }
 
     #[test]

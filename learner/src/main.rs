@@ -15,9 +15,12 @@ use skein_protocol::run::{LearnerLock, RunDirectory};
 use skein_protocol::summary::{Ending, Summary};
 use tokio::signal::unix::{SignalKind, signal};
 
-/// The learner of a run: hands out tickets, trains on the episodes that come back, publishes snapshots. Started by run_local.sh.
+/// The learner of a run: hands out tickets, trains on the episodes that come back, publishes
+/// snapshots. Started by run_local.sh.
 ///
-/// It goes on from the newest undamaged checkpoint in the directory, if there is one. Progress goes to standard output, one JSON object a line. SIGTERM or SIGINT ends the training in order: what was learned is saved.
+/// It goes on from the newest undamaged checkpoint in the directory, if there is one. Progress goes
+/// to standard output, one JSON object a line. SIGTERM or SIGINT ends the training in order: what
+/// was learned is saved.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
@@ -54,7 +57,8 @@ fn run(arguments: &Arguments) -> Result<()> {
     // Before anything of the run is touched, the log included: there may be another learner.
     let lock = LearnerLock::take(&directory, &identity)?;
     let log = directory.learner_log();
-    log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
+    log_to_file(&log, LogFormat::from_environment())
+        .with_context(|| format!("cannot write {}", log.display()))?;
     tracing::info!(run = %identity.run, incarnation = %lock.incarnation(), seed = config.run.seed, device = %config.run.device, "learner starts");
     let stop = stop_on_signals().context("cannot listen to signals")?;
     // A summary that cannot be read is made again, from the last checkpoint.
@@ -73,20 +77,27 @@ fn run(arguments: &Arguments) -> Result<()> {
 fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_io()
+        .build()?;
     let (mut terminate, mut interrupt) = {
         let _entered = runtime.enter();
-        (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?)
+        (
+            signal(SignalKind::terminate())?,
+            signal(SignalKind::interrupt())?,
+        )
     };
-    std::thread::Builder::new().name("signals".to_owned()).spawn(move || {
-        runtime.block_on(async {
-            tokio::select! {
-                _ = terminate.recv() => {}
-                _ = interrupt.recv() => {}
-            }
-        });
-        tracing::info!("told to stop");
-        flag.store(true, Ordering::Relaxed);
-    })?;
+    std::thread::Builder::new()
+        .name("signals".to_owned())
+        .spawn(move || {
+            runtime.block_on(async {
+                tokio::select! {
+                    _ = terminate.recv() => {}
+                    _ = interrupt.recv() => {}
+                }
+            });
+            tracing::info!("told to stop");
+            flag.store(true, Ordering::Relaxed);
+        })?;
     Ok(stop)
 }

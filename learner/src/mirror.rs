@@ -1,22 +1,29 @@
 //! An episode seen in a mirror: left and right change places.
 //!
-//! Corridor, drone and reward are the same on both sides, so what is seen in the mirror is an episode, too, through another course that nobody had to fly. Only a stereo camera has sides: its shadows
-//! lie to the left of what is near, and in the mirror to the right, as if its second lens were on the other side.
+//! Corridor, drone and reward are the same on both sides, so what is seen in the mirror is an
+//! episode, too, through another course that nobody had to fly. Only a stereo camera has sides: its
+//! shadows lie to the left of what is near, and in the mirror to the right, as if its second lens
+//! were on the other side.
 
 use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_WIDTH};
 
 use crate::episode::{CommittedEpisode, StepObservation};
 
-/// Places in the ground truth of what points to the left: both openings' offsets, the distance from the middle, the gust.
+/// Places in the ground truth of what points to the left: both openings' offsets, the distance from
+/// the middle, the gust.
 const TO_THE_LEFT: [usize; 4] = [1, 5, 8, 14];
 
 impl CommittedEpisode {
-    /// The episode in the mirror. Latent codes are the unmirrored episode's: whoever needs them encodes the mirrored images.
+    /// The episode in the mirror. Latent codes are the unmirrored episode's: whoever needs them
+    /// encodes the mirrored images.
     #[must_use]
     pub fn mirrored(&self) -> Self {
         let mut mirrored = self.without_images();
         mirrored.action_before = turn(self.action_before);
-        mirrored.actions.iter_mut().for_each(|action| *action = turn(*action));
+        mirrored
+            .actions
+            .iter_mut()
+            .for_each(|action| *action = turn(*action));
         mirrored.observations.iter_mut().for_each(mirror);
         mirrored.depth = self.depth.clone();
         for row in mirrored

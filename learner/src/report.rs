@@ -1,4 +1,5 @@
-//! What the learner tells while it runs: progress lines on standard output, and where its time goes.
+//! What the learner tells while it runs: progress lines on standard output, and where its time
+//! goes.
 
 use std::collections::VecDeque;
 use std::io::Write;
@@ -28,7 +29,8 @@ pub struct Reporter {
     thread: Option<JoinHandle<()>>,
 }
 
-/// Says something to the user, by way of whoever reads the reports: a line that is none is shown as it is.
+/// Says something to the user, by way of whoever reads the reports: a line that is none is shown as
+/// it is.
 pub fn tell(line: &str) {
     tracing::warn!("{line}");
     // Nobody may be listening; it is in the log.
@@ -36,7 +38,8 @@ pub fn tell(line: &str) {
 }
 
 impl Reporter {
-    /// Starts reporting, with `progress` as the first line: in it `elapsed_secs` are those of earlier incarnations, to which this one's are added.
+    /// Starts reporting, with `progress` as the first line: in it `elapsed_secs` are those of
+    /// earlier incarnations, to which this one's are added.
     ///
     /// # Errors
     /// When the system grants no thread.
@@ -63,8 +66,11 @@ impl Reporter {
 impl Drop for Reporter {
     fn drop(&mut self) {
         self.ended.store(true, Ordering::Relaxed);
-        let Some(thread) = self.thread.take() else { return };
-        // Whoever reads the lines may be frozen, and the pipe full: then the last lines are lost, and the thread ends with the process.
+        let Some(thread) = self.thread.take() else {
+            return;
+        };
+        // Whoever reads the lines may be frozen, and the pipe full: then the last lines are lost,
+        // and the thread ends with the process.
         let deadline = Instant::now() + LAST_LINE_PATIENCE;
         while !thread.is_finished() && Instant::now() < deadline {
             thread::sleep(Duration::from_millis(5));
@@ -82,7 +88,10 @@ fn report(progress: &Mutex<Progress>, ended: &AtomicBool, receiver: &Shared, dis
     let mut marks: VecDeque<(f64, u64, u64)> = VecDeque::new();
     loop {
         let last = ended.load(Ordering::Relaxed);
-        let mut line = progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let mut line = progress
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone();
         line.elapsed_secs += started.elapsed().as_secs_f64();
         line.stalled = watchdog.look(Instant::now(), &line, disk.waiting(), receiver.situation());
         let faults = receiver.faults();

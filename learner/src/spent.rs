@@ -8,7 +8,8 @@ use skein_protocol::stages::Times;
 
 use crate::episodes::receiver::Shared;
 
-/// Time and losses, over all incarnations of the learner as far as checkpoints tell: what a death undid is not in it.
+/// Time and losses, over all incarnations of the learner as far as checkpoints tell: what a death
+/// undid is not in it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Spent {
     /// Seconds from the learner's start to its end.
@@ -22,8 +23,14 @@ pub struct Spent {
 }
 
 impl Spent {
-    /// With what the present incarnation, begun at `started`, has come to: `training` is its training thread's time, that of all others is in `shared`.
-    pub fn with_this_incarnation(&self, started: Instant, training: &Times, shared: &Shared) -> Self {
+    /// With what the present incarnation, begun at `started`, has come to: `training` is its
+    /// training thread's time, that of all others is in `shared`.
+    pub fn with_this_incarnation(
+        &self,
+        started: Instant,
+        training: &Times,
+        shared: &Shared,
+    ) -> Self {
         let faults = shared.faults();
         Self {
             wall_secs: self.wall_secs + started.elapsed().as_secs_f64(),

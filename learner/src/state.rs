@@ -1,7 +1,8 @@
 //! What a checkpoint must hold of the networks, as values with names.
 //!
-//! Everything that an update changes is listed once, by [`Stateful::parts`]; storing and restoring both go through that list, so that nothing can be stored
-//! and not restored, or the other way round. What is stored says nothing of the engine that computed it.
+//! Everything that an update changes is listed once, by [`Stateful::parts`]; storing and restoring
+//! both go through that list, so that nothing can be stored and not restored, or the other way
+//! round. What is stored says nothing of the engine that computed it.
 
 use std::collections::HashMap;
 
@@ -50,7 +51,8 @@ impl TensorValues {
 /// Where a part of a state lies.
 #[derive(Debug)]
 pub enum Part<'a> {
-    /// In the tensor library's memory, on whatever device: f32, f64 or i64. Shares its storage with the state.
+    /// In the tensor library's memory, on whatever device: f32, f64 or i64. Shares its storage with
+    /// the state.
     Tensor(Tensor),
     /// A flat vector, `[len]`.
     Numbers(&'a mut [f32]),
@@ -107,7 +109,11 @@ impl Part<'_> {
 }
 
 fn shape(tensor: &Tensor) -> Vec<usize> {
-    tensor.size().into_iter().map(|size| size as usize).collect()
+    tensor
+        .size()
+        .into_iter()
+        .map(|size| size as usize)
+        .collect()
 }
 
 fn values(tensor: &Tensor) -> TensorValues {
@@ -129,7 +135,8 @@ fn values(tensor: &Tensor) -> TensorValues {
 
 /// Something whose whole state has names.
 pub trait Stateful {
-    /// Every part of the state, under a name that is unique in the learner. To be changed in place: one list serves both ways.
+    /// Every part of the state, under a name that is unique in the learner. To be changed in place:
+    /// one list serves both ways.
     fn parts(&mut self) -> Vec<(String, Part<'_>)>;
 
     /// A copy of the whole state.
@@ -138,17 +145,25 @@ pub trait Stateful {
         parts
             .map(|(name, part)| {
                 let (shape, values) = part.read();
-                NamedTensor { name, shape, values }
+                NamedTensor {
+                    name,
+                    shape,
+                    values,
+                }
             })
             .collect()
     }
 
-    /// Takes the state from `stored`, which may hold other tensors besides. The next update is then bit for bit the one that would have followed.
+    /// Takes the state from `stored`, which may hold other tensors besides. The next update is then
+    /// bit for bit the one that would have followed.
     ///
     /// # Errors
     /// [`RestoreError`] names the first tensor that does not fit; the state is untouched then.
     fn load_named(&mut self, stored: &[NamedTensor]) -> Result<(), RestoreError> {
-        let stored: HashMap<&str, &NamedTensor> = stored.iter().map(|tensor| (tensor.name.as_str(), tensor)).collect();
+        let stored: HashMap<&str, &NamedTensor> = stored
+            .iter()
+            .map(|tensor| (tensor.name.as_str(), tensor))
+            .collect();
         let mut pairs = Vec::new();
         for (name, own) in self.parts() {
             let NamedTensor { shape, values, .. } = *stored
@@ -177,7 +192,9 @@ pub trait Stateful {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RestoreError {
     /// A tensor is not there.
-    #[error("the stored state lacks the tensor {name}: it comes from another version or is damaged")]
+    #[error(
+        "the stored state lacks the tensor {name}: it comes from another version or is damaged"
+    )]
     Missing {
         /// Its name.
         name: String,
@@ -246,7 +263,12 @@ mod tests {
         let mut state = three([0.0, 0.0], 0);
         let before = state.named_tensors();
         let missing = state.load_named(&stored[..2]).unwrap_err();
-        assert_eq!(missing, RestoreError::Missing { name: "third".into() });
+        assert_eq!(
+            missing,
+            RestoreError::Missing {
+                name: "third".into()
+            }
+        );
         let misfits: [(usize, &[usize], TensorValues); 4] = [
             (0, &[1, 2], TensorValues::F32(vec![1.0; 2])),
             (1, &[1, 3], TensorValues::F32(vec![1.0; 3])),

@@ -5,20 +5,27 @@ use std::fs;
 
 use rustix::param::clock_ticks_per_second;
 
-/// Seconds of processor time that each thread of this process has taken so far, by its name; threads of one name together, those that have ended not at
-/// all. Empty where the system does not tell.
+/// Seconds of processor time that each thread of this process has taken so far, by its name;
+/// threads of one name together, those that have ended not at all. Empty where the system does not
+/// tell.
 pub fn cpu_secs() -> BTreeMap<String, f64> {
     let mut secs = BTreeMap::new();
-    for thread in fs::read_dir("/proc/self/task").into_iter().flatten().flatten() {
+    for thread in fs::read_dir("/proc/self/task")
+        .into_iter()
+        .flatten()
+        .flatten()
+    {
         let line = fs::read_to_string(thread.path().join("stat")).unwrap_or_default();
         if let Some((name, ticks)) = parse(&line) {
-            *secs.entry(name.to_owned()).or_default() += ticks as f64 / clock_ticks_per_second() as f64;
+            *secs.entry(name.to_owned()).or_default() +=
+                ticks as f64 / clock_ticks_per_second() as f64;
         }
     }
     secs
 }
 
-/// Name and clock ticks, in user and system mode, of a line of `/proc/PID/task/TID/stat` (proc(5): fields 2, 14 and 15).
+/// Name and clock ticks, in user and system mode, of a line of `/proc/PID/task/TID/stat` (proc(5):
+/// fields 2, 14 and 15).
 fn parse(line: &str) -> Option<(&str, u64)> {
     // The name is in brackets and may have some of its own.
     let (head, tail) = line.rsplit_once(')')?;
@@ -45,15 +52,17 @@ mod tests {
 
     #[test]
     fn a_thread_that_computes_is_seen_to() {
-        let busy = std::thread::Builder::new().name("busy".to_owned()).spawn(|| {
-            let begun = std::time::Instant::now();
-            loop {
-                let so_far = cpu_secs().get("busy").copied().unwrap_or_default();
-                if so_far > 0.05 || begun.elapsed().as_secs() > 20 {
-                    return so_far;
+        let busy = std::thread::Builder::new()
+            .name("busy".to_owned())
+            .spawn(|| {
+                let begun = std::time::Instant::now();
+                loop {
+                    let so_far = cpu_secs().get("busy").copied().unwrap_or_default();
+                    if so_far > 0.05 || begun.elapsed().as_secs() > 20 {
+                        return so_far;
+                    }
                 }
-            }
-        });
+            });
         assert!(busy.unwrap().join().unwrap() > 0.05);
     }
 }

@@ -1,7 +1,8 @@
 //! What is trained, and how much of it is due.
 //!
-//! How many VAE steps and SAC updates an epoch brings follows from the steps flown so far alone, and every random draw is seeded by the version of the snapshot
-//! that the updates begin with, which no others do: a trainer restored from a checkpoint goes on bit for bit.
+//! How many VAE steps and SAC updates an epoch brings follows from the steps flown so far alone,
+//! and every random draw is seeded by the version of the snapshot that the updates begin with,
+//! which no others do: a trainer restored from a checkpoint goes on bit for bit.
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
@@ -72,7 +73,8 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Untrained networks and an empty buffer. Starts the native engine's threads, and sets the calling thread's tensor threads: training belongs on this thread.
+    /// Untrained networks and an empty buffer. Starts the native engine's threads, and sets the
+    /// calling thread's tensor threads: training belongs on this thread.
     ///
     /// # Errors
     /// [`DeviceError`] when the configured device does not exist.
@@ -109,7 +111,8 @@ impl Trainer {
         })
     }
 
-    /// Takes over the state in a checkpoint: what follows is then bit for bit what would have followed.
+    /// Takes over the state in a checkpoint: what follows is then bit for bit what would have
+    /// followed.
     ///
     /// # Errors
     /// [`TrainerRestoreError`] names what does not fit; the trainer is not to be used then.
@@ -135,7 +138,11 @@ impl Trainer {
             ("policy updates", self.updates(), progress.policy_updates),
         ] {
             if found != expected {
-                return Err(TrainerRestoreError::Count { what, found, expected });
+                return Err(TrainerRestoreError::Count {
+                    what,
+                    found,
+                    expected,
+                });
             }
         }
         Ok(())
@@ -195,7 +202,8 @@ impl Trainer {
     pub fn take_in(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
         let learning = &self.config.learning;
         let mirrored = learning.mirror.then(|| episode.mirrored());
-        // With policy lag, episodes still come in that were flown with an encoder older than the frozen one: their codes are made anew. Without, images come for the mirror alone.
+        // With policy lag, episodes still come in that were flown with an encoder older than the
+        // frozen one: their codes are made anew. Without, images come for the mirror alone.
         if !self.has_images() && (learning.policy_lag > 0 || !learning.mirror) {
             self.encode(&mut episode);
         }
@@ -215,7 +223,8 @@ impl Trainer {
         self.replay.insert(episode)
     }
 
-    /// Makes an episode's codes anew with the encoder as it is, if there are images to make them from, and if it is learned from codes at all.
+    /// Makes an episode's codes anew with the encoder as it is, if there are images to make them
+    /// from, and if it is learned from codes at all.
     fn encode(&mut self, episode: &mut CommittedEpisode) {
         let (Some(depth), Some(_)) = (&episode.depth, &self.vae) else {
             return;
@@ -227,8 +236,9 @@ impl Trainer {
         }
     }
 
-    /// Trains the VAE as far as the steps flown ask for, from what snapshot `version` holds on, and freezes it when its time is over. `after_each` may do something
-    /// between steps, and give up; `timer` is told what the time went into.
+    /// Trains the VAE as far as the steps flown ask for, from what snapshot `version` holds on, and
+    /// freezes it when its time is over. `after_each` may do something between steps, and give up;
+    /// `timer` is told what the time went into.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
@@ -238,7 +248,11 @@ impl Trainer {
         timer: &mut LapTimer,
         mut after_each: impl FnMut(&VaeMetrics) -> Result<(), E>,
     ) -> Result<Option<VaeMetrics>, E> {
-        let Some(vae) = self.vae.as_mut().filter(|_| self.replay.image_count().is_some()) else {
+        let Some(vae) = self
+            .vae
+            .as_mut()
+            .filter(|_| self.replay.image_count().is_some())
+        else {
             return Ok(None);
         };
         let section = &self.config.vae;
@@ -264,14 +278,20 @@ impl Trainer {
         }
         self.renewals = due;
         if is_over {
-            tracing::info!(steps = self.steps, vae_updates = self.vae_updates(), "VAE frozen");
+            tracing::info!(
+                steps = self.steps,
+                vae_updates = self.vae_updates(),
+                "VAE frozen"
+            );
             self.replay.freeze();
         }
         Ok(last)
     }
 
     fn renewals_due(&self) -> u64 {
-        self.steps.checked_div(self.config.vae.recode_steps as u64).unwrap_or(0)
+        self.steps
+            .checked_div(self.config.vae.recode_steps as u64)
+            .unwrap_or(0)
     }
 
     /// Makes stored codes anew with the encoder as it is.
@@ -282,10 +302,14 @@ impl Trainer {
         let Ok(()) = renewed;
     }
 
-    /// The encoder as actors have it, so that codes made here are those that actors send, to the last bit; and what it works with.
+    /// The encoder as actors have it, so that codes made here are those that actors send, to the
+    /// last bit; and what it works with.
     fn encoder(&mut self) -> (&Encoder, &mut Team, &mut Replay) {
         let updates = self.vae_updates();
-        let made = self.encoder.take().filter(|(made_after, _)| *made_after == updates);
+        let made = self
+            .encoder
+            .take()
+            .filter(|(made_after, _)| *made_after == updates);
         let make = || {
             let snapshot = self.snapshot(PolicyVersion(0));
             (
@@ -298,8 +322,9 @@ impl Trainer {
         (encoder, &mut self.team, &mut self.replay)
     }
 
-    /// Does the policy updates that the steps flown since the warm-up ask for, from what snapshot `version` holds on; their metrics go into `means`. `after_each`
-    /// may do something between updates, and give up; `timer` is told what the time went into.
+    /// Does the policy updates that the steps flown since the warm-up ask for, from what snapshot
+    /// `version` holds on; their metrics go into `means`. `after_each` may do something between
+    /// updates, and give up; `timer` is told what the time went into.
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
@@ -314,12 +339,19 @@ impl Trainer {
         let counted = self.steps.saturating_sub(learning.warmup_steps as u64);
         let due = (counted as f64 * learning.updates_per_step) as u64;
         let mut rng = rng(&self.config, Purpose::PolicyBatches, version);
-        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::PolicyNoise, version.0));
+        let mut noise = Noise::new(derive(
+            self.config.run.seed,
+            Purpose::PolicyNoise,
+            version.0,
+        ));
         let mut minibatch = Minibatch::default();
         while self.algorithm.updates() < due {
-            self.replay.sample(&mut rng, self.config.batch_size(), &mut minibatch);
+            self.replay
+                .sample(&mut rng, self.config.batch_size(), &mut minibatch);
             timer.lap(Stage::Sample, 1);
-            let metrics = self.algorithm.update(&mut self.team, columns(&minibatch), &mut noise)?;
+            let metrics = self
+                .algorithm
+                .update(&mut self.team, columns(&minibatch), &mut noise)?;
             if let Some(average) = &mut self.average {
                 average.take_in(self.algorithm.as_ref());
             }
@@ -349,14 +381,27 @@ impl Trainer {
     /// `images` as the VAE sees them, if there is one: `[n, 72, 128]` u8, both ways.
     pub fn reconstruct(&mut self, images: &[u8]) -> Option<Vec<u8>> {
         let depth = self.vae.as_mut()?.reconstruct(images).into_iter();
-        Some(depth.map(|depth| (depth * 255.0).round_ties_even() as u8).collect())
+        Some(
+            depth
+                .map(|depth| (depth * 255.0).round_ties_even() as u8)
+                .collect(),
+        )
     }
 
     /// Copies of all tensors that updates change.
     pub fn tensors(&mut self) -> Vec<NamedTensor> {
-        let mut all = self.vae.as_mut().map(Vae::named_tensors).unwrap_or_default();
+        let mut all = self
+            .vae
+            .as_mut()
+            .map(Vae::named_tensors)
+            .unwrap_or_default();
         all.extend(self.algorithm.named_tensors());
-        all.extend(self.average.as_mut().map(Average::named_tensors).unwrap_or_default());
+        all.extend(
+            self.average
+                .as_mut()
+                .map(Average::named_tensors)
+                .unwrap_or_default(),
+        );
         all
     }
 }
@@ -378,7 +423,8 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
         rewards: &minibatch.rewards,
         next_observations: &minibatch.next_observations,
         terminated: &minibatch.terminated,
-        images: (!minibatch.images.is_empty()).then_some([&minibatch.images, &minibatch.next_images]),
+        images: (!minibatch.images.is_empty())
+            .then_some([&minibatch.images, &minibatch.next_images]),
     }
 }
 

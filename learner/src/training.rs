@@ -1,8 +1,11 @@
 //! The training loop: delayed learning, in reading order.
 //!
-//! An epoch is a fixed number of episodes, all flown with one frozen snapshot. When the last of them is committed, the learner takes them in, in episode
-//! order, updates the networks and publishes the next snapshot. With direct updates an epoch is one episode, flown in segments, and the same is done after each of
-//! them. Everything it does follows from configuration, seed and committed episodes; a learner that died goes on from a checkpoint as if nothing had been (`saving`).
+//! An epoch is a fixed number of episodes, all flown with one frozen snapshot. When the last of
+//! them is committed, the learner takes them in, in episode order, updates the networks and
+//! publishes the next snapshot. With direct updates an epoch is one episode, flown in segments, and
+//! the same is done after each of them. Everything it does follows from configuration, seed and
+//! committed episodes; a learner that died goes on from a checkpoint as if nothing had been
+//! (`saving`).
 
 mod candidates;
 mod curves;
@@ -56,7 +59,8 @@ struct Training<'a> {
     curves: EpochCurves,
     /// What this thread's time goes into: what it does between two laps is in the later one.
     timer: LapTimer,
-    /// What is counted of the run. What trainer and metrics count themselves is filled in for a checkpoint.
+    /// What is counted of the run. What trainer and metrics count themselves is filled in for a
+    /// checkpoint.
     progress: Progress,
     /// The newest checkpoint's.
     saved: Progress,
@@ -64,7 +68,8 @@ struct Training<'a> {
     resumes: u64,
     /// Ordered and not learned from.
     in_the_air: VecDeque<InTheAir>,
-    /// The episode whose first segments are learned from, and whose next segment is not, as far as it was flown; without images.
+    /// The episode whose first segments are learned from, and whose next segment is not, as far as
+    /// it was flown; without images.
     under_way: Option<CommittedEpisode>,
     /// The newest snapshot, those of the episodes in the air, and the best.
     snapshots: BTreeMap<PolicyVersion, Snapshot>,
@@ -78,8 +83,9 @@ struct InTheAir {
     episodes: Vec<CommittedEpisode>,
 }
 
-/// Trains the run in `directory` to its end, in this `incarnation` of its learner, or until `stop` is set; writes and returns what it came to. It goes on from
-/// the newest undamaged checkpoint, if there is one.
+/// Trains the run in `directory` to its end, in this `incarnation` of its learner, or until `stop`
+/// is set; writes and returns what it came to. It goes on from the newest undamaged checkpoint, if
+/// there is one.
 ///
 /// # Errors
 /// [`TrainingError`]; what was learned until the last checkpoint is on disk.
@@ -92,11 +98,15 @@ pub fn run(
 ) -> Result<Summary, TrainingError> {
     let mut training = Training::begin(directory, identity, incarnation, config, stop)?;
     let end = match training.train() {
-        Ok(()) => training.save().map(|progress| (Ending::Completed, progress)),
-        Err(TrainingError::EpisodeReceiver(ReceiverError::Stopped)) => {
-            training.save().map(|progress| (Ending::Interrupted, progress))
-        }
-        Err(TrainingError::Abandoned) => training.go_back().map(|progress| (Ending::Interrupted, progress)),
+        Ok(()) => training
+            .save()
+            .map(|progress| (Ending::Completed, progress)),
+        Err(TrainingError::EpisodeReceiver(ReceiverError::Stopped)) => training
+            .save()
+            .map(|progress| (Ending::Interrupted, progress)),
+        Err(TrainingError::Abandoned) => training
+            .go_back()
+            .map(|progress| (Ending::Interrupted, progress)),
         Err(error) => Err(error),
     };
     training.conclude(end)
@@ -117,7 +127,8 @@ impl Training<'_> {
         self.look_for_best()?;
         while self.progress.epochs < epochs {
             let epoch = self.progress.epochs;
-            // With policy lag 1, the next epoch is flown with the snapshot at hand while this one is learned from.
+            // With policy lag 1, the next epoch is flown with the snapshot at hand while this one
+            // is learned from.
             self.order_until(epochs.min(epoch + 1 + self.config.learning.policy_lag))?;
             self.learn_from_flown()?;
             while self.under_way.is_some() {
@@ -126,7 +137,11 @@ impl Training<'_> {
                 self.learn_from_flown()?;
             }
             self.progress.epochs += 1;
-            tracing::debug!(epoch, episodes = self.progress.episodes, "epoch learned from");
+            tracing::debug!(
+                epoch,
+                episodes = self.progress.episodes,
+                "epoch learned from"
+            );
             self.draw_curves()?;
             self.look_for_best()?;
             self.checkpoint_if_due()?;
@@ -134,7 +149,8 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Waits for the episodes or the segment ordered first, learns from them, and publishes what was learned.
+    /// Waits for the episodes or the segment ordered first, learns from them, and publishes what
+    /// was learned.
     fn learn_from_flown(&mut self) -> Result<(), TrainingError> {
         let flown = self.collect()?;
         self.take_in(flown)?;
@@ -163,12 +179,18 @@ impl Training<'_> {
     /// Forgets snapshots that nobody will fly any more.
     fn forget_snapshots(&mut self) {
         let mut needed = vec![self.progress.version().0];
-        needed.extend(self.in_the_air.iter().map(|epoch| epoch.order.policy_version));
+        needed.extend(
+            self.in_the_air
+                .iter()
+                .map(|epoch| epoch.order.policy_version),
+        );
         needed.extend(self.progress.best.as_ref().map(|best| best.policy_version));
-        self.snapshots.retain(|version, _| needed.contains(&version.0));
+        self.snapshots
+            .retain(|version, _| needed.contains(&version.0));
     }
 
-    /// Orders the episodes of all epochs before `end` that are not ordered yet, to be flown with the newest snapshot.
+    /// Orders the episodes of all epochs before `end` that are not ordered yet, to be flown with
+    /// the newest snapshot.
     fn order_until(&mut self, end: u64) -> Result<(), TrainingError> {
         let first = self
             .in_the_air
@@ -192,7 +214,10 @@ impl Training<'_> {
 
     /// Orders the episodes of an epoch, or the next segment of the one that is under way.
     fn order(&mut self, order: EpochOrder) -> Result<(), TrainingError> {
-        let flown = self.under_way.as_ref().map_or(&[][..], |episode| &episode.actions);
+        let flown = self
+            .under_way
+            .as_ref()
+            .map_or(&[][..], |episode| &episode.actions);
         let tickets = curriculum::training(
             self.config,
             self.identity.run,
@@ -203,16 +228,25 @@ impl Training<'_> {
         );
         let batch = self.receiver.fly(Epoch(order.epoch), order.keep, tickets)?;
         let episodes = Vec::with_capacity(batch.remaining());
-        self.in_the_air.push_back(InTheAir { order, batch, episodes });
+        self.in_the_air.push_back(InTheAir {
+            order,
+            batch,
+            episodes,
+        });
         Ok(())
     }
 
-    /// Waits for all episodes of the epoch that was ordered first, or for its segment. Until they are there, it counts as in the air.
+    /// Waits for all episodes of the epoch that was ordered first, or for its segment. Until they
+    /// are there, it counts as in the air.
     fn collect(&mut self) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
-        self.reporter.update(|progress| progress.phase = Phase::Flying);
+        self.reporter
+            .update(|progress| progress.phase = Phase::Flying);
         let (is_amid_episode, shared) = (self.under_way.is_some(), self.receiver.shared());
-        if let Some(InTheAir { batch, episodes, .. }) = self.in_the_air.front_mut() {
+        if let Some(InTheAir {
+            batch, episodes, ..
+        }) = self.in_the_air.front_mut()
+        {
             let watch = &mut self.stop_watch;
             let mut next = || match is_amid_episode {
                 true => batch.next_unless(|| watch.amid_episode(&shared)),
@@ -286,14 +320,16 @@ impl Training<'_> {
     fn train_vae(&mut self) -> Result<(), TrainingError> {
         let version = self.progress.version();
         let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
-        let trained = self.trainer.train_vae(version, &mut self.timer, |metrics| {
-            reporter.update(|progress| {
-                progress.vae_updates += 1;
-                progress.vae_loss = Some(metrics.loss.into());
-            });
-            pass(FaultPoint::LearnerMidUpdates);
-            watch.after_update()
-        })?;
+        let trained = self
+            .trainer
+            .train_vae(version, &mut self.timer, |metrics| {
+                reporter.update(|progress| {
+                    progress.vae_updates += 1;
+                    progress.vae_loss = Some(metrics.loss.into());
+                });
+                pass(FaultPoint::LearnerMidUpdates);
+                watch.after_update()
+            })?;
         self.curves.vae = trained.or(self.curves.vae);
         Ok(())
     }
@@ -305,15 +341,18 @@ impl Training<'_> {
         let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
         let updates_before = self.trainer.updates();
         let means = &mut self.curves.policy;
-        self.trainer.train_policy(version, &mut self.timer, means, |metrics| {
-            let temperature = metrics.iter().find(|(scalar, _)| *scalar == Scalar::Temperature);
-            reporter.update(|progress| {
-                progress.updates += 1;
-                progress.temperature = temperature.map(|(_, value)| f64::from(*value));
-            });
-            pass(FaultPoint::LearnerMidUpdates);
-            watch.after_update()
-        })?;
+        self.trainer
+            .train_policy(version, &mut self.timer, means, |metrics| {
+                let temperature = metrics
+                    .iter()
+                    .find(|(scalar, _)| *scalar == Scalar::Temperature);
+                reporter.update(|progress| {
+                    progress.updates += 1;
+                    progress.temperature = temperature.map(|(_, value)| f64::from(*value));
+                });
+                pass(FaultPoint::LearnerMidUpdates);
+                watch.after_update()
+            })?;
         pass(FaultPoint::LearnerUpdated);
         self.curves.updates += self.trainer.updates() - updates_before;
         self.curves.updating += started.elapsed();

@@ -44,8 +44,9 @@ impl Watchdog {
         }
     }
 
-    /// Who waits for whom, if nothing has moved for a while. `obstacle`: what is known to stop the training thread. `receiver`: how long ago the
-    /// receiving thread last told where the episodes are, and what it told.
+    /// Who waits for whom, if nothing has moved for a while. `obstacle`: what is known to stop the
+    /// training thread. `receiver`: how long ago the receiving thread last told where the episodes
+    /// are, and what it told.
     pub fn look(
         &mut self,
         now: Instant,
@@ -89,8 +90,14 @@ fn who_waits(phase: Phase, still: Duration, receiver: Option<(Duration, Situatio
     let episodes = match phase {
         Phase::Flying => "episodes",
         Phase::Evaluating => "evaluation episodes",
-        Phase::Learning => return format!("the training thread has been at one step of its updates for {still} s"),
-        Phase::Finishing => return format!("the training thread has been writing what remains for {still} s"),
+        Phase::Learning => {
+            return format!(
+                "the training thread has been at one step of its updates for {still} s"
+            );
+        }
+        Phase::Finishing => {
+            return format!("the training thread has been writing what remains for {still} s");
+        }
     };
     let waits = format!("the training thread has waited for {episodes} for {still} s");
     match receiver {
@@ -135,7 +142,10 @@ mod tests {
         progress.phase = Phase::Learning;
         watchdog.look(at(24), &progress, None, nobody());
         let told = watchdog.look(at(50), &progress, None, nobody()).unwrap();
-        assert!(told.contains("at one step of its updates for 26 s"), "{told}");
+        assert!(
+            told.contains("at one step of its updates for 26 s"),
+            "{told}"
+        );
     }
 
     #[test]
@@ -145,7 +155,9 @@ mod tests {
         let progress = Progress::start(40);
         watchdog.look(start, &progress, None, None);
         let stale = nobody().map(|(_, situation)| (Duration::from_secs(33), situation));
-        let told = watchdog.look(start + PATIENCE, &progress, None, stale).unwrap();
+        let told = watchdog
+            .look(start + PATIENCE, &progress, None, stale)
+            .unwrap();
         assert!(
             told.ends_with("the receiving thread has not come round for 33 s"),
             "{told}"

@@ -1,6 +1,7 @@
 //! Which actor has which number: held by locks that end with the process that holds them.
 //!
-//! A lock is never in the way of the dead: the kernel frees it however its process ended. Files that are locked stay; only the lock counts.
+//! A lock is never in the way of the dead: the kernel frees it however its process ended. Files
+//! that are locked stay; only the lock counts.
 
 use std::fs::{File, OpenOptions};
 use std::path::PathBuf;
@@ -26,7 +27,8 @@ impl ActorClaim {
 }
 
 impl RunDirectory {
-    /// Claims the lowest number that no actor of this run has at present. Logs are appended to, so that a number whose actor is gone can be used again.
+    /// Claims the lowest number that no actor of this run has at present. Logs are appended to, so
+    /// that a number whose actor is gone can be used again.
     ///
     /// # Errors
     /// [`RunError::Io`] names the log that cannot be written.
@@ -44,11 +46,14 @@ impl RunDirectory {
 
 /// `file`, locked; `None` when somebody else has locked it.
 fn locked(path: PathBuf, file: std::io::Result<File>) -> Result<Option<File>, RunError> {
-    let outcome = file.and_then(|file| match flock(&file, FlockOperation::NonBlockingLockExclusive) {
-        Ok(()) => Ok(Some(file)),
-        Err(Errno::WOULDBLOCK) => Ok(None),
-        Err(error) => Err(error.into()),
-    });
+    let outcome =
+        file.and_then(
+            |file| match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+                Ok(()) => Ok(Some(file)),
+                Err(Errno::WOULDBLOCK) => Ok(None),
+                Err(error) => Err(error.into()),
+            },
+        );
     outcome.map_err(|source| RunError::Io { path, source })
 }
 
@@ -63,7 +68,10 @@ mod tests {
         let run = RunDirectory::new(directory.path());
         run.create(&Config::default()).unwrap();
         let claims = [(); 3].map(|()| run.claim_actor().unwrap());
-        assert_eq!([0, 1, 2].map(ActorId), claims.each_ref().map(ActorClaim::id));
+        assert_eq!(
+            [0, 1, 2].map(ActorId),
+            claims.each_ref().map(ActorClaim::id)
+        );
         let [first, _second, _third] = claims;
         drop(first);
         assert_eq!(run.claim_actor().unwrap().id(), ActorId(0));

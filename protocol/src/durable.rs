@@ -1,11 +1,13 @@
-//! Files that hold what they held before or all of what is new, whatever happens while they are written, a power cut included.
+//! Files that hold what they held before or all of what is new, whatever happens while they are
+//! written, a power cut included.
 
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
-/// Puts `bytes` in the place of whatever is at `path`, at once: they are written beside it, brought to disk, and renamed. Only the user can read them.
+/// Puts `bytes` in the place of whatever is at `path`, at once: they are written beside it, brought
+/// to disk, and renamed. Only the user can read them.
 ///
 /// # Errors
 /// Of the file system; what was at `path` is still there then.
@@ -18,7 +20,8 @@ pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
         })
         .and_then(|()| fs::rename(&aside, path));
     if let Err(error) = written {
-        // What is half written takes room, which may be just what is missing. If it cannot be removed, the first error is the one to tell.
+        // What is half written takes room, which may be just what is missing. If it cannot be
+        // removed, the first error is the one to tell.
         let _ = fs::remove_file(&aside);
         return Err(error);
     }
@@ -45,7 +48,8 @@ pub fn create_private(path: &Path) -> io::Result<File> {
         .open(path)
 }
 
-/// Creates the directory at `path` with those above it, if they are not there, so that only the user can look into it.
+/// Creates the directory at `path` with those above it, if they are not there, so that only the
+/// user can look into it.
 ///
 /// # Errors
 /// Of the file system.
@@ -81,7 +85,10 @@ mod tests {
             replace(&path, content.as_bytes()).unwrap();
             assert_eq!(fs::read_to_string(&path).unwrap(), content);
         }
-        assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
+        assert_eq!(
+            fs::metadata(&path).unwrap().permissions().mode() & 0o777,
+            0o600
+        );
         assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 1);
     }
 

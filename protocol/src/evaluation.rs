@@ -27,7 +27,8 @@ pub struct CourseEvaluation {
     pub course: String,
     /// Episodes flown.
     pub episodes: u64,
-    /// R = (t_1 + … + t_n) / (n · episodes): the average rate of obstacles avoided (paper, section 4.4).
+    /// R = (t_1 + … + t_n) / (n · episodes): the average rate of obstacles avoided (paper, section
+    /// 4.4).
     pub r: f64,
     /// Share of episodes that reached the end wall.
     pub completed: f64,
@@ -41,8 +42,8 @@ pub struct CourseEvaluation {
     pub collided: u64,
     /// Episodes cut off by the step limit.
     pub timed_out: u64,
-    /// Where and by what episodes failed: an entry for each wall in course order, and one for the way from the last wall to the end wall. Their sum is that of
-    /// `collided` and `timed_out`.
+    /// Where and by what episodes failed: an entry for each wall in course order, and one for the
+    /// way from the last wall to the end wall. Their sum is that of `collided` and `timed_out`.
     pub failures: Vec<Failures>,
 }
 
@@ -51,7 +52,8 @@ pub struct CourseEvaluation {
 pub struct Failures {
     /// Hit this wall or the edge of its opening, from before or from behind.
     pub hit_wall: u64,
-    /// Hit a side, the floor or the ceiling of the corridor before they had passed this wall, and after the one before.
+    /// Hit a side, the floor or the ceiling of the corridor before they had passed this wall, and
+    /// after the one before.
     pub hit_corridor: u64,
     /// Ran out of steps there.
     pub timed_out: u64,
@@ -66,16 +68,24 @@ pub struct EpisodeScore {
     pub episode_return: f64,
     /// How it ended.
     pub outcome: Outcome,
-    /// The wall that it hit, from 1 in course order, if it collided with one and not with the corridor.
+    /// The wall that it hit, from 1 in course order, if it collided with one and not with the
+    /// corridor.
     pub hit_wall: Option<u8>,
 }
 
 impl CourseEvaluation {
     /// Counts `episodes` of a course of `walls` walls.
     pub fn of(course: &str, walls: usize, episodes: &[EpisodeScore]) -> Self {
-        let count =
-            |holds: &dyn Fn(&EpisodeScore) -> bool| episodes.iter().filter(|episode| holds(episode)).count() as u64;
-        let share = |part: u64, whole: usize| if whole == 0 { 0.0 } else { part as f64 / whole as f64 };
+        let count = |holds: &dyn Fn(&EpisodeScore) -> bool| {
+            episodes.iter().filter(|episode| holds(episode)).count() as u64
+        };
+        let share = |part: u64, whole: usize| {
+            if whole == 0 {
+                0.0
+            } else {
+                part as f64 / whole as f64
+            }
+        };
         let walls_passed: Vec<u64> = (1..=walls)
             .map(|wall| count(&|episode| episode.walls_passed as usize >= wall))
             .collect();
@@ -124,7 +134,13 @@ fn counts(values: &[u64]) -> String {
     if values.iter().all(|&value| value == 0) {
         return "·".to_owned();
     }
-    let shown = |&value: &u64| if value == 0 { "·".to_owned() } else { value.to_string() };
+    let shown = |&value: &u64| {
+        if value == 0 {
+            "·".to_owned()
+        } else {
+            value.to_string()
+        }
+    };
     values.iter().map(shown).collect::<Vec<_>>().join(" ")
 }
 
@@ -145,7 +161,8 @@ impl fmt::Display for EvaluationReport {
         ]);
         for course in &self.courses {
             let walls: Vec<String> = course.walls_passed.iter().map(u64::to_string).collect();
-            let failed = |by: fn(&Failures) -> u64| course.failures.iter().map(by).collect::<Vec<_>>();
+            let failed =
+                |by: fn(&Failures) -> u64| course.failures.iter().map(by).collect::<Vec<_>>();
             // Behind the last wall there is none to hit.
             let mut hit_wall = failed(|failures| failures.hit_wall);
             hit_wall.truncate(walls.len());
@@ -232,7 +249,10 @@ mod tests {
             courses: vec![evaluation],
         };
         let table = report.to_string();
-        assert!(table.contains("┆    · 2 · ┆") && table.contains("· · 1 1"), "{table}");
+        assert!(
+            table.contains("┆    · 2 · ┆") && table.contains("· · 1 1"),
+            "{table}"
+        );
     }
 
     #[test]

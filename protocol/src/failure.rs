@@ -3,10 +3,12 @@
 use std::error::Error;
 use std::iter::successors;
 
-/// Exit status of an actor that finds no learner, or has not heard of it for `transport.learner_silence_secs`. Starting it again would not help.
+/// Exit status of an actor that finds no learner, or has not heard of it for
+/// `transport.learner_silence_secs`. Starting it again would not help.
 pub const EXIT_LEARNER_GONE: u8 = 3;
 
-/// Exit status of a learner whose transport failed. Nothing that was computed is at fault: it is started again, from its newest checkpoint.
+/// Exit status of a learner whose transport failed. Nothing that was computed is at fault: it is
+/// started again, from its newest checkpoint.
 pub const EXIT_START_AGAIN: u8 = 4;
 
 /// The error and those of its causes that it does not quote itself, on one line.

@@ -1,8 +1,10 @@
 //! Points at which a process can be made to die, to show that it does not matter.
 //!
-//! A point is armed from outside and while the run is under way: the environment variable [`FAULTS`] names a directory, and whoever passes a point of
-//! which there is a file there removes the file and kills itself with SIGKILL. So a point that was armed once kills once, whichever process comes by,
-//! and the process that is started in its place gets past. Without the variable, passing a point costs a comparison.
+//! A point is armed from outside and while the run is under way: the environment variable
+//! [`FAULTS`] names a directory, and whoever passes a point of which there is a file there removes
+//! the file and kills itself with SIGKILL. So a point that was armed once kills once, whichever
+//! process comes by, and the process that is started in its place gets past. Without the variable,
+//! passing a point costs a comparison.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -42,7 +44,8 @@ points! {
     ActorAfterLastRecord => "actor.after-last-record",
     /// The learner has opened its services, and nobody could join yet.
     LearnerStarted => "learner.started",
-    /// The learner's receiving thread has committed an episode that the training thread has not seen.
+    /// The learner's receiving thread has committed an episode that the training thread has not
+    /// seen.
     LearnerEpisodeCommitted => "learner.episode-committed",
     /// All episodes of an epoch are there, none is learned from.
     LearnerEpochCollected => "learner.epoch-collected",
@@ -87,12 +90,14 @@ pub fn pass(point: FaultPoint) {
     if let Some(directory) = directory
         && disarm(directory, point)
     {
-        // An error is for whoever may not kill itself, which cannot be; going on then is as good as anything.
+        // An error is for whoever may not kill itself, which cannot be; going on then is as good as
+        // anything.
         let _ = kill_process(getpid(), Signal::KILL);
     }
 }
 
-/// Takes the armed point out of `directory`; whether it was there. Of several processes that come by at a time, one gets it.
+/// Takes the armed point out of `directory`; whether it was there. Of several processes that come
+/// by at a time, one gets it.
 fn disarm(directory: &Path, point: FaultPoint) -> bool {
     fs::remove_file(directory.join(point.name())).is_ok()
 }

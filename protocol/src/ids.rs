@@ -20,11 +20,13 @@ macro_rules! id {
 }
 
 id! {
-    /// One start of a training: distinguishes two runs of one configuration. It names shared memory and records, and never influences learning.
+    /// One start of a training: distinguishes two runs of one configuration. It names shared memory
+    /// and records, and never influences learning.
     RunId(u64)
 }
 id! {
-    /// An episode (episode). Training episodes count from 0 in the order of their commit; evaluation episodes lie above [`EpisodeId::FIRST_EVALUATION`].
+    /// An episode (episode). Training episodes count from 0 in the order of their commit;
+    /// evaluation episodes lie above [`EpisodeId::FIRST_EVALUATION`].
     EpisodeId(u64)
 }
 id! {
@@ -40,15 +42,18 @@ id! {
     ActorId(u32)
 }
 id! {
-    /// One incarnation of an actor process: a restarted actor keeps its id and gets a new incarnation.
+    /// One incarnation of an actor process: a restarted actor keeps its id and gets a new
+    /// incarnation.
     ActorIncarnation(u64)
 }
 id! {
-    /// How often an episode's ticket had been issued before: tells an episode flown again from its late twin.
+    /// How often an episode's ticket had been issued before: tells an episode flown again from its
+    /// late twin.
     Attempt(u32)
 }
 
 impl EpisodeId {
-    /// Evaluation episodes are numbered from here, so that they never collide with training episodes.
+    /// Evaluation episodes are numbered from here, so that they never collide with training
+    /// episodes.
     pub const FIRST_EVALUATION: Self = Self(1 << 63);
 }

@@ -26,7 +26,8 @@ impl LogFormat {
     }
 }
 
-/// Sends this process's log to `path`, appending; `RUST_LOG` says what is logged, `info` by default.
+/// Sends this process's log to `path`, appending; `RUST_LOG` says what is logged, `info` by
+/// default.
 ///
 /// # Errors
 /// When the file cannot be opened.

@@ -1,4 +1,5 @@
-//! How far a run has come: one line of JSON on the learner's standard output for each report, for whoever watches it.
+//! How far a run has come: one line of JSON on the learner's standard output for each report, for
+//! whoever watches it.
 
 use std::collections::BTreeMap;
 
@@ -38,7 +39,8 @@ pub struct Progress {
     /// Their numbers, in ascending order.
     #[serde(default)]
     pub live_actors: Vec<u32>,
-    /// Tickets issued again since the learner's start, by reason; without reasons that did not occur.
+    /// Tickets issued again since the learner's start, by reason; without reasons that did not
+    /// occur.
     #[serde(default)]
     pub reissued: BTreeMap<String, u64>,
     /// Records refused since the learner's start, by reason; without reasons that did not occur.

@@ -1,7 +1,8 @@
 //! One seed for the run, and from it an independent one for every purpose.
 //!
-//! Nothing that draws at random keeps a generator alive: it derives one from (run seed, purpose, index). So the draws depend on *what* is drawn for,
-//! never on when or where, and there is no generator state to store in a checkpoint.
+//! Nothing that draws at random keeps a generator alive: it derives one from (run seed, purpose,
+//! index). So the draws depend on *what* is drawn for, never on when or where, and there is no
+//! generator state to store in a checkpoint.
 
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
@@ -19,7 +20,8 @@ pub enum Purpose {
     VaeParameters = 4,
     /// Initial parameters of policy and critic.
     PolicyParameters = 5,
-    /// Minibatches drawn for the policy updates between two snapshots; indexed by the former's version, which is the epoch unless episodes are flown in segments.
+    /// Minibatches drawn for the policy updates between two snapshots; indexed by the former's
+    /// version, which is the epoch unless episodes are flown in segments.
     PolicyBatches = 6,
     /// Action noise inside the policy updates between two snapshots; indexed likewise.
     PolicyNoise = 7,
@@ -29,13 +31,16 @@ pub enum Purpose {
     VaeNoise = 9,
     /// Where one episode starts; derived from the ticket's seed.
     StartPosition = 10,
-    /// Exploration noise of one episode, or of the segment of it that begins at the step of this index; derived from the ticket's seed, so that a start drawn otherwise does not shift it.
+    /// Exploration noise of one episode, or of the segment of it that begins at the step of this
+    /// index; derived from the ticket's seed, so that a start drawn otherwise does not shift it.
     ActionNoise = 11,
     /// What disturbs one episode; derived from the ticket's seed.
     Disturbances = 12,
-    /// Resamples of the runs of an experiment, from which the uncertainty of what it found is told; the seed is their number, the index that of the resamples.
+    /// Resamples of the runs of an experiment, from which the uncertainty of what it found is told;
+    /// the seed is their number, the index that of the resamples.
     Bootstrap = 13,
-    /// Generated course on which a candidate for the best snapshot is confirmed; indexed by episode.
+    /// Generated course on which a candidate for the best snapshot is confirmed; indexed by
+    /// episode.
     ConfirmationCourse = 14,
 }
 

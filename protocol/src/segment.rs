@@ -1,9 +1,12 @@
-//! A segment: some steps of an episode, flown on a ticket of their own, so that the rest can be flown with what was learned meanwhile.
+//! A segment: some steps of an episode, flown on a ticket of their own, so that the rest can be
+//! flown with what was learned meanwhile.
 //!
-//! A segment is a function of its ticket as an episode is: the ticket carries the actions flown so far. An actor that has flown the segment before still has the drone
-//! where that ended; any other takes off and repeats them, and as the simulator is deterministic it comes to the same.
+//! A segment is a function of its ticket as an episode is: the ticket carries the actions flown so
+//! far. An actor that has flown the segment before still has the drone where that ended; any other
+//! takes off and repeats them, and as the simulator is deterministic it comes to the same.
 //!
-//! Tickets of segments have a service of their own. The actions make them thirty times as long as other messages, of which shared memory has room for thousands.
+//! Tickets of segments have a service of their own. The actions make them thirty times as long as
+//! other messages, of which shared memory has room for thousands.
 
 use std::sync::Arc;
 
@@ -39,14 +42,22 @@ pub struct SegmentRecord {
 }
 
 // Whole fields of eight bytes: no padding, so no uninitialised byte ever leaves the process.
-const _: () = assert!(size_of::<SegmentRecord>() == size_of::<ControlRecord>() + 2 * 4 + MOST_FLOWN * ACTION * 4);
+const _: () = assert!(
+    size_of::<SegmentRecord>() == size_of::<ControlRecord>() + 2 * 4 + MOST_FLOWN * ACTION * 4
+);
 
 impl SegmentRecord {
     /// `segment` of `ticket`'s episode, for one incarnation of one actor.
     ///
     /// # Panics
-    /// When more than [`MOST_FLOWN`] actions were flown before; the configuration allows no episode to become so long.
-    pub fn fly(ticket: &Ticket, segment: &Segment, actor: ActorId, incarnation: ActorIncarnation) -> Self {
+    /// When more than [`MOST_FLOWN`] actions were flown before; the configuration allows no episode
+    /// to become so long.
+    pub fn fly(
+        ticket: &Ticket,
+        segment: &Segment,
+        actor: ActorId,
+        incarnation: ActorIncarnation,
+    ) -> Self {
         let mut actions = [[0.0; ACTION]; MOST_FLOWN];
         actions[..segment.flown.len()].copy_from_slice(&segment.flown);
         Self {
@@ -73,9 +84,14 @@ impl SegmentRecord {
         let flown = self
             .actions
             .get(..self.flown as usize)
-            .ok_or(ControlFault::Segment("has more actions than it has room for"))?;
+            .ok_or(ControlFault::Segment(
+                "has more actions than it has room for",
+            ))?;
         // No number is within bounds that is none.
-        let are_actions = flown.iter().flatten().all(|command| (-1.0..=1.0).contains(command));
+        let are_actions = flown
+            .iter()
+            .flatten()
+            .all(|command| (-1.0..=1.0).contains(command));
         if !are_actions {
             return Err(ControlFault::Segment("has an action outside [-1, 1]"));
         }
@@ -116,7 +132,12 @@ mod tests {
 
     fn record(flown: usize) -> SegmentRecord {
         let ticket = ticket(flown);
-        SegmentRecord::fly(&ticket, ticket.segment.as_ref().unwrap(), ACTOR, INCARNATION)
+        SegmentRecord::fly(
+            &ticket,
+            ticket.segment.as_ref().unwrap(),
+            ACTOR,
+            INCARNATION,
+        )
     }
 
     #[test]
@@ -124,7 +145,9 @@ mod tests {
         for flown in [0, 1, MOST_FLOWN] {
             let record = record(flown);
             assert_eq!(record.read(RUN), Ok(Control::Fly(ticket(flown))));
-            assert!(record.is_for(ACTOR, INCARNATION) && !record.is_for(ACTOR, ActorIncarnation(9)));
+            assert!(
+                record.is_for(ACTOR, INCARNATION) && !record.is_for(ACTOR, ActorIncarnation(9))
+            );
         }
     }
 
@@ -140,7 +163,10 @@ mod tests {
         assert!(refused(|record| record.actions[0][1] = 1.5).contains("outside [-1, 1]"));
         assert!(refused(|record| record.steps = 0).contains("no step"));
         assert!(refused(|record| record.ticket = ControlRecord::stop(RUN)).contains("no ticket"));
-        assert!(matches!(record(2).read(RunId(4)), Err(ControlFault::OtherRun(3))));
+        assert!(matches!(
+            record(2).read(RunId(4)),
+            Err(ControlFault::OtherRun(3))
+        ));
         // What lies behind the actions is nobody's.
         let mut record = record(2);
         record.actions[2] = [f32::NAN; ACTION];

@@ -1,7 +1,9 @@
 //! The policy snapshot: what an actor needs to fly, as one range of bytes.
 //!
-//! A snapshot is the encoder's and the policy's parameters, back to back, f32 little-endian, in the order of [`SnapshotLayout`]. It travels over shared
-//! memory behind a [`SnapshotHeader`], and lies on disk as safetensors with the run's configuration in its metadata, so that a file alone can be flown.
+//! A snapshot is the encoder's and the policy's parameters, back to back, f32 little-endian, in the
+//! order of [`SnapshotLayout`]. It travels over shared memory behind a [`SnapshotHeader`], and lies
+//! on disk as safetensors with the run's configuration in its metadata, so that a file alone can be
+//! flown.
 
 use std::collections::HashMap;
 use std::fs;
@@ -18,7 +20,8 @@ use crate::config::{AlgorithmName, Config, View};
 use crate::ids::{PolicyVersion, RunId};
 use crate::{ACTION, durable};
 
-/// Channels of the encoder's four 4×4 convolutions of stride 2; the first is the image's (paper, section 3.3; widths as in arXiv:1803.10122).
+/// Channels of the encoder's four 4×4 convolutions of stride 2; the first is the image's (paper,
+/// section 3.3; widths as in arXiv:1803.10122).
 pub const ENCODER_CHANNELS: [usize; 5] = [1, 32, 64, 128, 256];
 /// Width and height of the encoder's kernels.
 pub const ENCODER_KERNEL: usize = 4;
@@ -43,7 +46,8 @@ pub struct TensorSpec {
 pub enum PolicyHead {
     /// Mean and log standard deviation of a Gaussian that tanh squashes, `[2]` each.
     SquashedGaussian,
-    /// The action before tanh, `[2]`. To explore, noise of this standard deviation is added after it, and the sum kept in [-1, 1].
+    /// The action before tanh, `[2]`. To explore, noise of this standard deviation is added after
+    /// it, and the sum kept in [-1, 1].
     Noisy(f32),
 }
 
@@ -66,7 +70,8 @@ pub struct SnapshotLayout {
 }
 
 impl SnapshotLayout {
-    /// The layout for policies that see `view`, have hidden layers of `hidden_width`, and give a squashed Gaussian.
+    /// The layout for policies that see `view`, have hidden layers of `hidden_width`, and give a
+    /// squashed Gaussian.
     pub fn new(view: &View, hidden_width: usize) -> Self {
         Self::with_head(view, hidden_width, PolicyHead::SquashedGaussian)
     }
@@ -84,7 +89,13 @@ impl SnapshotLayout {
         }
         layout.push_layer("encoder.mean", &[view.latent, ENCODER_FEATURES]);
         layout.encoder_values = layout.values();
-        let widths = [view.len(), hidden_width, hidden_width, hidden_width, head.outputs()];
+        let widths = [
+            view.len(),
+            hidden_width,
+            hidden_width,
+            hidden_width,
+            head.outputs(),
+        ];
         for (index, pair) in widths.windows(2).enumerate() {
             layout.push_layer(&format!("policy.layer{}", index + 1), &[pair[1], pair[0]]);
         }
@@ -286,7 +297,11 @@ impl Snapshot {
     }
 
     fn check_finite(&self, layout: &SnapshotLayout) -> Result<(), SnapshotError> {
-        let broken = |tensor: &&TensorSpec| self.values[tensor.range.clone()].iter().any(|value| !value.is_finite());
+        let broken = |tensor: &&TensorSpec| {
+            self.values[tensor.range.clone()]
+                .iter()
+                .any(|value| !value.is_finite())
+        };
         match layout.tensors().iter().find(broken) {
             Some(tensor) => Err(SnapshotError::NotFinite {
                 tensor: tensor.name.clone(),
@@ -295,17 +310,24 @@ impl Snapshot {
         }
     }
 
-    /// SHA-256 of the parameters' bytes, in hexadecimal: equal exactly when two policies are bit-equal.
+    /// SHA-256 of the parameters' bytes, in hexadecimal: equal exactly when two policies are
+    /// bit-equal.
     pub fn sha256(&self) -> String {
         let digest = Sha256::digest(bytemuck::cast_slice::<f32, u8>(&self.values));
         digest.iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// Writes the snapshot as safetensors, with `config` in its metadata, [portable](Config::portable); on disk in its place, or not at all.
+    /// Writes the snapshot as safetensors, with `config` in its metadata,
+    /// [portable](Config::portable); on disk in its place, or not at all.
     ///
     /// # Errors
     /// [`SnapshotError::Io`] names the file.
-    pub fn save(&self, path: &Path, layout: &SnapshotLayout, config: &Config) -> Result<(), SnapshotError> {
+    pub fn save(
+        &self,
+        path: &Path,
+        layout: &SnapshotLayout,
+        config: &Config,
+    ) -> Result<(), SnapshotError> {
         let bytes: &[u8] = bytemuck::cast_slice(&self.values);
         let views = layout.tensors().iter().map(|tensor| {
             let range = tensor.range.start * size_of::<f32>()..tensor.range.end * size_of::<f32>();
@@ -316,13 +338,18 @@ impl Snapshot {
         let (version, config) = (self.version.to_string(), config.portable());
         let metadata = HashMap::from([
             (FORMAT_KEY.to_owned(), FORMAT.to_owned()),
-            (CHECKSUM_KEY.to_owned(), checksum(&version, &config, &self.values)),
+            (
+                CHECKSUM_KEY.to_owned(),
+                checksum(&version, &config, &self.values),
+            ),
             (VERSION_KEY.to_owned(), version),
             (CONFIG_KEY.to_owned(), config),
         ]);
-        let file = safetensors::serialize(views, Some(metadata)).map_err(|error| SnapshotError::Format {
-            path: path.to_owned(),
-            problem: error.to_string(),
+        let file = safetensors::serialize(views, Some(metadata)).map_err(|error| {
+            SnapshotError::Format {
+                path: path.to_owned(),
+                problem: error.to_string(),
+            }
         })?;
         durable::replace(path, &file).map_err(|source| SnapshotError::Io {
             path: path.to_owned(),
@@ -330,7 +357,8 @@ impl Snapshot {
         })
     }
 
-    /// Reads a snapshot file and the configuration it was trained with, which names its courses' files, and not where they lie.
+    /// Reads a snapshot file and the configuration it was trained with, which names its courses'
+    /// files, and not where they lie.
     ///
     /// # Errors
     /// [`SnapshotError`] names the file and what is wrong with it.
@@ -361,7 +389,8 @@ const CHECKSUM_KEY: &str = "skein.checksum";
 const VERSION_KEY: &str = "skein.policy_version";
 const CONFIG_KEY: &str = "skein.config";
 
-/// xxh3 of all that a snapshot file says, hexadecimal: a flipped bit that leaves finite numbers is seen by nothing else.
+/// xxh3 of all that a snapshot file says, hexadecimal: a flipped bit that leaves finite numbers is
+/// seen by nothing else.
 fn checksum(version: &str, config: &str, values: &[f32]) -> String {
     let mut hasher = Xxh3::new();
     for text in [version, config] {
@@ -375,14 +404,22 @@ fn checksum(version: &str, config: &str, values: &[f32]) -> String {
 fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| error.to_string())?;
     let metadata = metadata.metadata().as_ref().ok_or("it has no metadata")?;
-    let value = |key: &str| metadata.get(key).ok_or(format!("its metadata has no {key}"));
+    let value = |key: &str| {
+        metadata
+            .get(key)
+            .ok_or(format!("its metadata has no {key}"))
+    };
     if value(FORMAT_KEY)? != FORMAT {
-        return Err(format!("its format is {}, not {FORMAT}", value(FORMAT_KEY)?));
+        return Err(format!(
+            "its format is {}, not {FORMAT}",
+            value(FORMAT_KEY)?
+        ));
     }
     let version = value(VERSION_KEY)?
         .parse()
         .map_err(|_| format!("its {VERSION_KEY} is not a number"))?;
-    let config: Config = toml::from_str(value(CONFIG_KEY)?).map_err(|error| format!("its configuration: {error}"))?;
+    let config: Config = toml::from_str(value(CONFIG_KEY)?)
+        .map_err(|error| format!("its configuration: {error}"))?;
     config
         .validate()
         .map_err(|error| format!("its configuration: {error}"))?;
@@ -390,7 +427,9 @@ fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
     let layout = SnapshotLayout::of(&config);
     let mut values = Vec::with_capacity(layout.values());
     for tensor in layout.tensors() {
-        let view = file.tensor(&tensor.name).map_err(|error| error.to_string())?;
+        let view = file
+            .tensor(&tensor.name)
+            .map_err(|error| error.to_string())?;
         if view.dtype() != Dtype::F32 || view.shape() != tensor.shape {
             return Err(format!(
                 "{} is {:?} {:?}, not F32 {:?}",
@@ -413,7 +452,9 @@ fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
             value(CHECKSUM_KEY)?
         ));
     }
-    snapshot.check_finite(&layout).map_err(|error| error.to_string())?;
+    snapshot
+        .check_finite(&layout)
+        .map_err(|error| error.to_string())?;
     Ok((snapshot, config))
 }
 
@@ -435,7 +476,9 @@ mod tests {
     }
 
     fn snapshot(layout: &SnapshotLayout) -> Snapshot {
-        let values = (0..layout.values()).map(|index| (index as f32).sin()).collect();
+        let values = (0..layout.values())
+            .map(|index| (index as f32).sin())
+            .collect();
         Snapshot {
             version: PolicyVersion(12),
             values,
@@ -463,7 +506,10 @@ mod tests {
         let sent = snapshot(&layout);
         let header = sent.header(RunId(1), &layout);
         let bytes = bytemuck::cast_slice(&sent.values);
-        assert_eq!(Snapshot::receive(&header, bytes, RunId(1), &layout).unwrap(), sent);
+        assert_eq!(
+            Snapshot::receive(&header, bytes, RunId(1), &layout).unwrap(),
+            sent
+        );
     }
 
     #[test]
@@ -472,12 +518,15 @@ mod tests {
         let mut sent = snapshot(&layout);
         let header = sent.header(RunId(1), &layout);
         let mut bytes = bytemuck::cast_slice(&sent.values).to_vec();
-        let receive = |bytes: &[u8], run, layout: &SnapshotLayout| Snapshot::receive(&header, bytes, run, layout);
+        let receive = |bytes: &[u8], run, layout: &SnapshotLayout| {
+            Snapshot::receive(&header, bytes, run, layout)
+        };
         assert!(matches!(
             receive(&bytes, RunId(2), &layout),
             Err(SnapshotError::OtherRun { .. })
         ));
-        // An observation more, and a code that is longer by as many numbers as are not seen beside it.
+        // An observation more, and a code that is longer by as many numbers as are not seen beside
+        // it.
         for (moment, latent) in [(Observation::Latent, 32), (Observation::Latent, 34)] {
             let other = SnapshotLayout::new(&View::present(moment, latent), 64);
             assert!(matches!(
@@ -496,8 +545,18 @@ mod tests {
         ));
         sent.values[5] = f32::NAN;
         let header = sent.header(RunId(1), &layout);
-        let poisoned = Snapshot::receive(&header, bytemuck::cast_slice(&sent.values), RunId(1), &layout);
-        assert!(poisoned.unwrap_err().to_string().contains("encoder.conv1.weight"));
+        let poisoned = Snapshot::receive(
+            &header,
+            bytemuck::cast_slice(&sent.values),
+            RunId(1),
+            &layout,
+        );
+        assert!(
+            poisoned
+                .unwrap_err()
+                .to_string()
+                .contains("encoder.conv1.weight")
+        );
     }
 
     #[test]
@@ -519,7 +578,8 @@ mod tests {
             "nobody's folders are told"
         );
         let sound = fs::read(&path).unwrap();
-        // All of its header, where a bit may change a name or a place, and a thousand positions of its parameters.
+        // All of its header, where a bit may change a name or a place, and a thousand positions of
+        // its parameters.
         let header = 8 + u64::from_le_bytes(*sound.first_chunk().unwrap()) as usize;
         let parameters = (header..sound.len()).step_by((sound.len() - header) / 1000);
         for index in (0..header).chain(parameters) {

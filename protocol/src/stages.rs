@@ -1,7 +1,8 @@
 //! Where time goes: every stage of the data's way, and what each thread has spent on it.
 //!
-//! A [`LapTimer`] is never stopped: each lap books the time since the one before to a stage. So a thread's stages are its whole time and their shares sum
-//! to one, and a lap costs a single reading of the clock. Nothing that is learned depends on any of it.
+//! A [`LapTimer`] is never stopped: each lap books the time since the one before to a stage. So a
+//! thread's stages are its whole time and their shares sum to one, and a lap costs a single reading
+//! of the clock. Nothing that is learned depends on any of it.
 
 use std::fmt;
 use std::time::{Duration, Instant};
@@ -44,7 +45,8 @@ impl Thread {
 
 macro_rules! stages {
     ($($thread:ident { $($(#[$doc:meta])* $stage:ident => $name:literal),* $(,)? })*) => {
-        /// What a thread is at, in the order of the data's way. The first sentence of each says what is done, the second what is counted.
+        /// What a thread is at, in the order of the data's way. The first sentence of each says
+        /// what is done, the second what is counted.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         pub enum Stage { $($($(#[$doc])* $stage),*),* }
 
@@ -69,11 +71,13 @@ stages! {
     Actors {
         /// Snapshots are taken in and made ready to fly with. Snapshots.
         TakeSnapshot => "snapshot",
-        /// The simulator is set to the start of an episode, or to where a segment begins. Episodes, segments.
+        /// The simulator is set to the start of an episode, or to where a segment begins. Episodes,
+        /// segments.
         Reset => "reset",
         /// The drone moves until its next decision. Environment steps.
         Physics => "physics",
-        /// A depth image is rendered into its record. Observations: one more than steps in each episode.
+        /// A depth image is rendered into its record. Observations: one more than steps in each
+        /// episode.
         Camera => "camera",
         /// The image is encoded. Observations.
         Encoder => "encoder",
@@ -113,7 +117,8 @@ stages! {
         Evaluate => "evaluation",
         /// The state is copied for a checkpoint and handed over. Checkpoints.
         Checkpoint => "checkpoint",
-        /// The start, orders, curves, the files at the end, waits that were broken off. Not counted.
+        /// The start, orders, curves, the files at the end, waits that were broken off. Not
+        /// counted.
         OtherTraining => "other",
         /// Training episodes are waited for. Waits.
         TrainingIdle => "idle",
@@ -170,7 +175,8 @@ impl Tally {
 
 /// What was spent on each stage.
 ///
-/// Stored as a list, without stages that did not occur: `thread`, `stage`, `count`, `secs`. Stages of another version are left out when it is read.
+/// Stored as a list, without stages that did not occur: `thread`, `stage`, `count`, `secs`. Stages
+/// of another version are left out when it is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "Vec<Row>", into = "Vec<Row>")]
 pub struct Times([Tally; STAGES]);
@@ -203,13 +209,17 @@ impl Times {
     /// Both together.
     #[must_use]
     pub fn plus(&self, other: &Self) -> Self {
-        Self(std::array::from_fn(|stage| self.0[stage].plus(other.0[stage])))
+        Self(std::array::from_fn(|stage| {
+            self.0[stage].plus(other.0[stage])
+        }))
     }
 
     /// What has come since `earlier`; nothing where that is more.
     #[must_use]
     pub fn since(&self, earlier: &Self) -> Self {
-        Self(std::array::from_fn(|stage| self.0[stage].minus(earlier.0[stage])))
+        Self(std::array::from_fn(|stage| {
+            self.0[stage].minus(earlier.0[stage])
+        }))
     }
 
     /// An actor's stages, on the wire.
@@ -257,7 +267,8 @@ impl From<Vec<Row>> for Times {
     fn from(rows: Vec<Row>) -> Self {
         let mut times = Self::default();
         for row in rows {
-            let is_of = |stage: &&Stage| stage.thread().name() == row.thread && stage.name() == row.stage;
+            let is_of =
+                |stage: &&Stage| stage.thread().name() == row.thread && stage.name() == row.stage;
             if let Some(stage) = Stage::ALL.iter().find(is_of) {
                 // Saturates: whatever a file says is a time.
                 let nanos = (row.secs * 1e9).round() as u64;
@@ -273,7 +284,14 @@ impl fmt::Display for Times {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut table = Table::new();
         table.load_preset(UTF8_FULL_CONDENSED);
-        table.set_header(["where the time went", "stage", "count", "total", "each", "share"]);
+        table.set_header([
+            "where the time went",
+            "stage",
+            "count",
+            "total",
+            "each",
+            "share",
+        ]);
         let mut thread = None;
         for (stage, tally) in self.occurred() {
             let of_thread = self.total_nanos(stage.thread());
@@ -288,7 +306,10 @@ impl fmt::Display for Times {
                 some(tally.count, tally.count.to_string()),
                 format!("{:.2} s", tally.secs()),
                 some(tally.count, each(tally)),
-                format!("{:.1} %", 100.0 * tally.nanos as f64 / of_thread.max(1) as f64),
+                format!(
+                    "{:.1} %",
+                    100.0 * tally.nanos as f64 / of_thread.max(1) as f64
+                ),
             ]);
         }
         for column in table.column_iter_mut().skip(2) {
@@ -328,7 +349,8 @@ impl LapTimer {
         }
     }
 
-    /// Books the time since the last lap to `stage`, in which `count` were done; 0 for a part of what is counted elsewhere.
+    /// Books the time since the last lap to `stage`, in which `count` were done; 0 for a part of
+    /// what is counted elsewhere.
     pub fn lap(&mut self, stage: Stage, count: u64) {
         let now = Instant::now();
         self.times.add(stage, count, now - self.last);

@@ -1,4 +1,5 @@
-//! What an actor tells the learner besides its episodes: that it is there, and that it incarnations.
+//! What an actor tells the learner besides its episodes: that it is there, and that it
+//! incarnations.
 
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
@@ -6,7 +7,8 @@ use iceoryx2::prelude::ZeroCopySend;
 use crate::ids::{ActorId, ActorIncarnation, PolicyVersion, RunId};
 use crate::stages::{ACTOR_STAGES, Tally, Times};
 
-/// Sign of incarnation of an actor, sent at its start, when it finds nothing to fly, at every heartbeat and at its end.
+/// Sign of incarnation of an actor, sent at its start, when it finds nothing to fly, at every
+/// heartbeat and at its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
 #[type_name("skein.StatusRecord.v2")]
@@ -75,7 +77,8 @@ impl StatusRecord {
         }
     }
 
-    /// The status, or `None` when the record is of another run or holds what no actor of this version writes: another state, times of years.
+    /// The status, or `None` when the record is of another run or holds what no actor of this
+    /// version writes: another state, times of years.
     pub fn read(&self, run: RunId) -> Option<ActorStatus> {
         let state = match self.state {
             1 => ActorState::Serving,
@@ -88,7 +91,8 @@ impl StatusRecord {
             incarnation: ActorIncarnation(self.incarnation),
             pid: self.pid,
             state,
-            newest_policy: (self.newest_policy != NO_POLICY).then_some(PolicyVersion(self.newest_policy)),
+            newest_policy: (self.newest_policy != NO_POLICY)
+                .then_some(PolicyVersion(self.newest_policy)),
             episodes_flown: self.episodes_flown,
             times,
         })

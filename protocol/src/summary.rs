@@ -14,7 +14,8 @@ use crate::stages::Times;
 /// What a run came to.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Version of Skein, and the last commit that changed what the learner is made of, where that is known: `0.1.0+b8735651a2c3`, with `-dirty` behind it if it had been changed since.
+    /// Version of Skein, and the last commit that changed what the learner is made of, where that
+    /// is known: `0.1.0+b8735651a2c3`, with `-dirty` behind it if it had been changed since.
     pub skein_version: String,
     /// The run.
     pub run: RunId,
@@ -22,7 +23,8 @@ pub struct Summary {
     pub seed: u64,
     /// How it ended.
     pub ending: Ending,
-    /// SHA-256 of the final encoder and policy parameters: equal exactly when two runs learned the same, bit for bit.
+    /// SHA-256 of the final encoder and policy parameters: equal exactly when two runs learned the
+    /// same, bit for bit.
     pub policy_sha256: String,
     /// The final snapshot.
     pub final_version: PolicyVersion,
@@ -30,7 +32,8 @@ pub struct Summary {
     pub best_version: Option<PolicyVersion>,
     /// Walls passed in the best snapshot's confirmation episodes, on average.
     pub best_confirmed_walls_passed: Option<f64>,
-    /// When a candidate for the best snapshot first passed the share `evaluation.trained_rate` of walls, if one did.
+    /// When a candidate for the best snapshot first passed the share `evaluation.trained_rate` of
+    /// walls, if one did.
     #[serde(default)]
     pub trained: Option<Trained>,
     /// Training episodes committed.
@@ -41,7 +44,8 @@ pub struct Summary {
     pub updates: u64,
     /// VAE steps.
     pub vae_updates: u64,
-    /// Episodes without exploration: those that the best snapshot was chosen by, and those of its evaluation. Their steps are in no other count.
+    /// Episodes without exploration: those that the best snapshot was chosen by, and those of its
+    /// evaluation. Their steps are in no other count.
     pub evaluation_episodes: u64,
     /// Tickets issued again, for whatever reason.
     pub tickets_reissued: u64,
@@ -53,16 +57,20 @@ pub struct Summary {
     /// [`Summary::records_refused`] by reason; without reasons that did not occur.
     #[serde(default)]
     pub refused_by_reason: BTreeMap<String, u64>,
-    /// Times the learner was started again, whether it went on from a checkpoint or from the first episode.
+    /// Times the learner was started again, whether it went on from a checkpoint or from the first
+    /// episode.
     #[serde(default)]
     pub resumes: u64,
-    /// Seconds from the learner's start to its end, over all its incarnations; what a death undid is not counted.
+    /// Seconds from the learner's start to its end, over all its incarnations; what a death undid
+    /// is not counted.
     pub wall_secs: f64,
-    /// What the time of actors and learner went into, as far as `wall_secs`. An actor that was killed has told of it until its last heartbeat or the end of
-    /// its last episode, whichever was later.
+    /// What the time of actors and learner went into, as far as `wall_secs`. An actor that was
+    /// killed has told of it until its last heartbeat or the end of its last episode, whichever was
+    /// later.
     #[serde(default)]
     pub stages: Times,
-    /// Seconds of processor time in the learner's last incarnation by those of its threads that lived until its end; `receiver` receives and assembles episodes.
+    /// Seconds of processor time in the learner's last incarnation by those of its threads that
+    /// lived until its end; `receiver` receives and assembles episodes.
     #[serde(default)]
     pub thread_cpu_secs: BTreeMap<String, f64>,
 }
@@ -86,7 +94,8 @@ impl Summary {
 /// When a policy first did what it was trained for: what is behind it then.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Trained {
-    /// Share R of walls passed in its evaluation episodes, without exploration noise, from the start of level 1, where `evaluation.confirm_on` says.
+    /// Share R of walls passed in its evaluation episodes, without exploration noise, from the
+    /// start of level 1, where `evaluation.confirm_on` says.
     pub rate: f64,
     /// Training episodes committed.
     pub episodes: u64,
@@ -94,7 +103,8 @@ pub struct Trained {
     pub steps: u64,
     /// Policy updates.
     pub updates: u64,
-    /// Seconds from the learner's start until its evaluation episodes were flown, over all incarnations; what a death undid is not counted.
+    /// Seconds from the learner's start until its evaluation episodes were flown, over all
+    /// incarnations; what a death undid is not counted.
     pub wall_secs: f64,
 }
 

@@ -1,7 +1,9 @@
 //! The ticket: everything an episode is a function of.
 //!
-//! An episode is flown only against a ticket, and two actors that hold the same ticket fly the same episode, bit for bit. The learner sends tickets inside
-//! [`ControlRecord`]s, fixed-size messages that actors listen to; those of [segments](crate::segment) inside [`SegmentRecord`]s, which have room for more.
+//! An episode is flown only against a ticket, and two actors that hold the same ticket fly the same
+//! episode, bit for bit. The learner sends tickets inside [`ControlRecord`]s, fixed-size messages
+//! that actors listen to; those of [segments](crate::segment) inside [`SegmentRecord`]s, which have
+//! room for more.
 
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
@@ -36,7 +38,9 @@ pub struct Ticket {
 impl Ticket {
     /// Steps of the episode that were flown on other tickets before.
     pub fn first_step(&self) -> u32 {
-        self.segment.as_ref().map_or(0, |segment| segment.flown.len() as u32)
+        self.segment
+            .as_ref()
+            .map_or(0, |segment| segment.flown.len() as u32)
     }
 }
 
@@ -95,7 +99,8 @@ pub struct ControlRecord {
     exploration: u8,
 }
 
-// Six 8-byte and three 4-byte fields, then four bytes: no padding, so no uninitialised byte ever leaves the process.
+// Six 8-byte and three 4-byte fields, then four bytes: no padding, so no uninitialised byte ever
+// leaves the process.
 const _: () = assert!(size_of::<ControlRecord>() == 6 * 8 + 3 * 4 + 4);
 
 const EVERYONE: u32 = u32::MAX;
@@ -168,7 +173,8 @@ impl ControlRecord {
 
     /// Whether this incarnation of this actor is meant.
     pub fn is_for(&self, actor: ActorId, incarnation: ActorIncarnation) -> bool {
-        self.to_actor == EVERYONE || (self.to_actor == actor.0 && self.to_incarnation == incarnation.0)
+        self.to_actor == EVERYONE
+            || (self.to_actor == actor.0 && self.to_incarnation == incarnation.0)
     }
 
     /// What is said.
@@ -246,7 +252,12 @@ impl Message {
     pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: ActorIncarnation) -> Self {
         match &ticket.segment {
             None => Self::Control(ControlRecord::fly(ticket, actor, incarnation)),
-            Some(segment) => Self::Segment(Box::new(SegmentRecord::fly(ticket, segment, actor, incarnation))),
+            Some(segment) => Self::Segment(Box::new(SegmentRecord::fly(
+                ticket,
+                segment,
+                actor,
+                incarnation,
+            ))),
         }
     }
 
@@ -335,7 +346,10 @@ pub(crate) mod tests {
         assert!(ControlRecord::stop(RunId(3)).is_for(ActorId(5), ActorIncarnation(1)));
         let rejoin = ControlRecord::rejoin(RunId(3), ActorId(4), ActorIncarnation(8));
         assert_eq!(rejoin.read(RunId(3)), Ok(Control::Rejoin));
-        assert!(rejoin.is_for(ActorId(4), ActorIncarnation(8)) && !rejoin.is_for(ActorId(4), ActorIncarnation(9)));
+        assert!(
+            rejoin.is_for(ActorId(4), ActorIncarnation(8))
+                && !rejoin.is_for(ActorId(4), ActorIncarnation(9))
+        );
     }
 
     #[test]

@@ -1,8 +1,10 @@
 //! The transition record: one step of an episode, as it lies in shared memory.
 //!
-//! An episode of T steps is T+1 records, and so is a segment of one. Record t holds the observation at step t, the action chosen on it, and the reward and end flags that
-//! followed; the closing record holds the last observation only. The depth camera renders into [`TransitionRecord::depth`] of a loaned sample, and the learner reads
-//! it there: the image's bytes are written once.
+//! An episode of T steps is T+1 records, and so is a segment of one. Record t holds the observation
+//! at step t, the action chosen on it, and the reward and end flags that followed; the closing
+//! record holds the last observation only. The depth camera renders into
+//! [`TransitionRecord::depth`] of a loaned sample, and the learner reads it there: the image's
+//! bytes are written once.
 
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
@@ -12,11 +14,12 @@ use crate::ids::{ActorId, ActorIncarnation};
 use crate::ticket::Ticket;
 use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
 
-/// No number of a sound record is larger: rewards end at 4 · 10⁶ by their settings, corridors at 1 km. The learner squares what it learns from, and single
-/// precision ends at 3 · 10³⁸.
+/// No number of a sound record is larger: rewards end at 4 · 10⁶ by their settings, corridors at 1
+/// km. The learner squares what it learns from, and single precision ends at 3 · 10³⁸.
 pub const LARGEST_NUMBER: f32 = 1e7;
 
-/// One step of an episode on the wire. Every bit pattern is a valid value of every field's type; [`TransitionRecord::check`] says whether it makes sense.
+/// One step of an episode on the wire. Every bit pattern is a valid value of every field's type;
+/// [`TransitionRecord::check`] says whether it makes sense.
 #[derive(Debug, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
 #[type_name("skein.TransitionRecord.v4")]
@@ -33,7 +36,8 @@ pub struct TransitionRecord {
     pub actor: u32,
     /// The ticket's attempt: tells an episode flown again from its late twin.
     pub attempt: u32,
-    /// Position in the episode, from 0 without a gap, segments flown before included; the closing record counts too.
+    /// Position in the episode, from 0 without a gap, segments flown before included; the closing
+    /// record counts too.
     pub step: u32,
     /// A [`RecordKind`].
     pub kind: u8,
@@ -65,16 +69,20 @@ pub struct TransitionRecord {
     pub truncated: u8,
     /// Walls of the course, in the closing record: what `walls_passed` is measured against.
     pub course_walls: u8,
-    /// In the closing record of an episode that collided: the wall that was hit, from 1 in course order, or 0 for the corridor. 0 in all others.
+    /// In the closing record of an episode that collided: the wall that was hit, from 1 in course
+    /// order, or 0 for the corridor. 0 in all others.
     pub hit_wall: u8,
     reserved: [u8; 7],
-    /// What the simulator knows of the observation's moment and the camera does not see; see [`CriticInput::GroundTruth`](crate::config::CriticInput::GroundTruth).
+    /// What the simulator knows of the observation's moment and the camera does not see; see
+    /// [`CriticInput::GroundTruth`](crate::config::CriticInput::GroundTruth).
     pub ground_truth: [f32; GROUND_TRUTH],
-    /// The depth image, 128×72, row by row from the top left; 255 is the camera's range or farther. On a cache line of its own.
+    /// The depth image, 128×72, row by row from the top left; 255 is the camera's range or farther.
+    /// On a cache line of its own.
     pub depth: [u8; IMAGE_PIXELS],
 }
 
-// The header is seven cache lines, so that in samples aligned to one (see `services`) the image starts on one; nothing is padding, so that the record is plain data.
+// The header is seven cache lines, so that in samples aligned to one (see `services`) the image
+// starts on one; nothing is padding, so that the record is plain data.
 const _: () = assert!(std::mem::offset_of!(TransitionRecord, depth) == 448);
 const _: () = assert!(size_of::<TransitionRecord>() == 448 + IMAGE_PIXELS);
 const _: () = assert!(align_of::<TransitionRecord>() == 8);
@@ -151,8 +159,15 @@ impl RecordKind {
 }
 
 impl TransitionRecord {
-    /// Writes who flies what; everything but the image is reset. The image is left as it is, to be rendered over.
-    pub fn begin(&mut self, ticket: &Ticket, actor: ActorId, incarnation: ActorIncarnation, step: u32) {
+    /// Writes who flies what; everything but the image is reset. The image is left as it is, to be
+    /// rendered over.
+    pub fn begin(
+        &mut self,
+        ticket: &Ticket,
+        actor: ActorId,
+        incarnation: ActorIncarnation,
+        step: u32,
+    ) {
         bytemuck::bytes_of_mut(self)[..std::mem::offset_of!(Self, depth)].fill(0);
         self.run = ticket.run.0;
         self.episode = ticket.episode.0;
@@ -165,7 +180,8 @@ impl TransitionRecord {
         self.start_level = ticket.start_level;
     }
 
-    /// The record's kind, if it makes sense as step `step` of `ticket` flown by `incarnation` of `actor`.
+    /// The record's kind, if it makes sense as step `step` of `ticket` flown by `incarnation` of
+    /// `actor`.
     ///
     /// # Errors
     /// [`RecordFault`] names the field; such a record is never learned from.
@@ -180,16 +196,28 @@ impl TransitionRecord {
             if found == expected {
                 Ok(())
             } else {
-                Err(RecordFault::Mismatch { name, found, expected })
+                Err(RecordFault::Mismatch {
+                    name,
+                    found,
+                    expected,
+                })
             }
         };
         same("run", self.run, ticket.run.0)?;
         same("episode", self.episode, ticket.episode.0)?;
-        same("policy_version", self.policy_version, ticket.policy_version.0)?;
+        same(
+            "policy_version",
+            self.policy_version,
+            ticket.policy_version.0,
+        )?;
         same("attempt", self.attempt.into(), ticket.attempt.0.into())?;
         same("actor", self.actor.into(), actor.0.into())?;
         same("incarnation", self.incarnation, incarnation.0)?;
-        same("start_level", self.start_level.into(), ticket.start_level.into())?;
+        same(
+            "start_level",
+            self.start_level.into(),
+            ticket.start_level.into(),
+        )?;
         same("step", self.step.into(), step.into())?;
         let kind = RecordKind::from_code(self.kind).ok_or(RecordFault::Code {
             name: "kind",
@@ -220,9 +248,13 @@ impl TransitionRecord {
     fn check_numbers(&self) -> Result<(), RecordFault> {
         let usual = -LARGEST_NUMBER..=LARGEST_NUMBER;
         // A NaN is in no range.
-        let finite = |name, values: &[f32]| match values.iter().find(|value| !usual.contains(value)) {
+        let finite = |name, values: &[f32]| match values.iter().find(|value| !usual.contains(value))
+        {
             None => Ok(()),
-            Some(value) if value.is_finite() => Err(RecordFault::TooLarge { name, value: *value }),
+            Some(value) if value.is_finite() => Err(RecordFault::TooLarge {
+                name,
+                value: *value,
+            }),
             Some(_) => Err(RecordFault::NotFinite { name }),
         };
         finite("position_m", &self.position_m)?;
@@ -241,7 +273,9 @@ impl TransitionRecord {
             });
         }
         if self.action.iter().any(|value| value.abs() > 1.0) {
-            return Err(RecordFault::ActionOutOfRange { action: self.action });
+            return Err(RecordFault::ActionOutOfRange {
+                action: self.action,
+            });
         }
         for (name, value) in [
             ("level_up", self.level_up),
@@ -263,7 +297,9 @@ impl TransitionRecord {
     fn check_ending(&self) -> Result<(), RecordFault> {
         let (name, value) = if Outcome::from_code(self.outcome).is_none() {
             ("outcome", self.outcome)
-        } else if u32::from(self.start_level) + u32::from(self.walls_passed) > u32::from(self.course_walls) + 1 {
+        } else if u32::from(self.start_level) + u32::from(self.walls_passed)
+            > u32::from(self.course_walls) + 1
+        {
             ("walls_passed", self.walls_passed)
         } else if !self.may_have_hit_wall() {
             ("hit_wall", self.hit_wall)
@@ -273,7 +309,8 @@ impl TransitionRecord {
         Err(RecordFault::Code { name, value })
     }
 
-    /// Whether `hit_wall` is none, or one that an episode which collided could reach: no farther than the first that it has not passed.
+    /// Whether `hit_wall` is none, or one that an episode which collided could reach: no farther
+    /// than the first that it has not passed.
     fn may_have_hit_wall(&self) -> bool {
         let next = u32::from(self.start_level) + u32::from(self.walls_passed);
         let reachable = next.min(self.course_walls.into());
@@ -373,7 +410,10 @@ mod tests {
         record.depth[17] = 200;
         record.begin(&ticket(), ACTOR, INCARNATION, 4);
         assert_eq!(record.depth[17], 200);
-        assert_eq!(record.check(&ticket(), ACTOR, INCARNATION, 4), Ok(RecordKind::Step));
+        assert_eq!(
+            record.check(&ticket(), ACTOR, INCARNATION, 4),
+            Ok(RecordKind::Step)
+        );
     }
 
     #[test]
@@ -381,7 +421,10 @@ mod tests {
         let check = |change: fn(&mut TransitionRecord)| {
             let mut record = record();
             change(&mut record);
-            record.check(&ticket(), ACTOR, INCARNATION, 4).unwrap_err().to_string()
+            record
+                .check(&ticket(), ACTOR, INCARNATION, 4)
+                .unwrap_err()
+                .to_string()
         };
         assert!(check(|r| r.run = 2).contains("run"));
         assert!(check(|r| r.episode = 6).contains("episode"));
@@ -399,7 +442,9 @@ mod tests {
         assert!(check(|r| r.action = [0.0, 1.5]).contains("action"));
         assert!(check(|r| r.terminated = 2).contains("terminated"));
         assert!(check(|r| r.reward = 0.5).contains("not the sum of its terms"));
-        assert!(check(|r| (r.terminated, r.truncated) = (1, 1)).contains("terminated and truncated"));
+        assert!(
+            check(|r| (r.terminated, r.truncated) = (1, 1)).contains("terminated and truncated")
+        );
         let closes = |r: &mut TransitionRecord| {
             r.kind = RecordKind::Closing.code();
             r.outcome = Outcome::ReachedEnd.code();
@@ -439,7 +484,11 @@ mod tests {
             (Outcome::TimedOut, 3, false),
             (Outcome::ReachedEnd, 1, false),
         ] {
-            assert_eq!(hit(outcome, hit_wall).is_ok(), is_sound, "{outcome:?}, wall {hit_wall}");
+            assert_eq!(
+                hit(outcome, hit_wall).is_ok(),
+                is_sound,
+                "{outcome:?}, wall {hit_wall}"
+            );
         }
     }
 }

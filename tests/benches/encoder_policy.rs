@@ -1,4 +1,5 @@
-//! An actor's thinking, one image and one action at a time: native, and by libtorch, which only the learner has. The one benchmark that needs both.
+//! An actor's thinking, one image and one action at a time: native, and by libtorch, which only the
+//! learner has. The one benchmark that needs both.
 
 use std::hint::black_box;
 
@@ -10,7 +11,9 @@ use skein_learner::sac::TorchSac;
 use skein_learner::vae::{TorchVae, images_from_bytes};
 use skein_protocol::config::{Config, Observation, Precision, View};
 use skein_protocol::ids::PolicyVersion;
-use skein_protocol::snapshot::{ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout};
+use skein_protocol::snapshot::{
+    ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout,
+};
 use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LONGEST_LATENT, LatentCode};
 use tch::Device;
 
@@ -40,7 +43,10 @@ fn main() {
         observation.clone()
     };
     let mut group = criterion.benchmark_group("encoder_policy");
-    group.throughput(Throughput::Elements(operations(&view, config.sac.hidden_width)));
+    group.throughput(Throughput::Elements(operations(
+        &view,
+        config.sac.hidden_width,
+    )));
     for (name, precision) in [("native", Precision::F32), ("native-bf16", Precision::Bf16)] {
         let network = Network::new(&snapshot, &layout, precision);
         group.bench_function(name, |bencher| {
@@ -63,7 +69,8 @@ fn main() {
     criterion.final_summary();
 }
 
-/// Floating-point operations of the products of both networks, a multiplication and an addition counted as two; nothing else is counted.
+/// Floating-point operations of the products of both networks, a multiplication and an addition
+/// counted as two; nothing else is counted.
 fn operations(view: &View, width: usize) -> u64 {
     let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
     let mut products = 0;

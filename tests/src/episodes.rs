@@ -23,7 +23,8 @@ pub struct Episode {
     pub outcome: String,
 }
 
-/// The rows of a run's `episodes.csv` so far; none before there is a file. A row that is still being written is left out.
+/// The rows of a run's `episodes.csv` so far; none before there is a file. A row that is still
+/// being written is left out.
 ///
 /// # Panics
 /// When a row is malformed.
@@ -36,7 +37,8 @@ pub fn episodes(run: &RunDirectory) -> Vec<Episode> {
         .unwrap()
 }
 
-/// What a run came to, apart from who flew which episode: two runs of one configuration and seed have it in common.
+/// What a run came to, apart from who flew which episode: two runs of one configuration and seed
+/// have it in common.
 #[derive(Debug, Clone)]
 pub struct Learned {
     policy_sha256: String,
@@ -45,7 +47,10 @@ pub struct Learned {
 
 impl Learned {
     pub(crate) fn of(run: &RunDirectory, summary: &Summary) -> Self {
-        let nobody = |episode| Episode { actor: 0, ..episode };
+        let nobody = |episode| Episode {
+            actor: 0,
+            ..episode
+        };
         Self {
             policy_sha256: summary.policy_sha256.clone(),
             episodes: episodes(run).into_iter().map(nobody).collect(),

@@ -64,11 +64,15 @@ impl Output {
     }
 }
 
-/// Runs the built program `name` to its end. For programs that end by themselves within seconds: nothing watches over them.
+/// Runs the built program `name` to its end. For programs that end by themselves within seconds:
+/// nothing watches over them.
 ///
 /// # Panics
 /// When it cannot be started.
 pub fn run_program<A: AsRef<OsStr>>(name: &str, arguments: &[A]) -> Output {
-    let output = Command::new(program(name)).args(arguments).output().unwrap();
+    let output = Command::new(program(name))
+        .args(arguments)
+        .output()
+        .unwrap();
     Output::of(output.status, &output.stdout, &output.stderr)
 }

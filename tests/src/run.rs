@@ -176,8 +176,16 @@ impl Running {
                 return found;
             }
             let ended = self.supervisor.try_wait().unwrap();
-            assert!(ended.is_none(), "the run ended before {what}:\n{}", self.stderr());
-            assert!(Instant::now() < self.deadline, "never {what}:\n{}", self.stderr());
+            assert!(
+                ended.is_none(),
+                "the run ended before {what}:\n{}",
+                self.stderr()
+            );
+            assert!(
+                Instant::now() < self.deadline,
+                "never {what}:\n{}",
+                self.stderr()
+            );
             sleep(LOOK);
         }
     }
@@ -188,7 +196,11 @@ impl Running {
     /// When the time is up.
     pub fn until_ended(&mut self) {
         while self.supervisor.try_wait().unwrap().is_none() {
-            assert!(Instant::now() < self.deadline, "it does not end:\n{}", self.stderr());
+            assert!(
+                Instant::now() < self.deadline,
+                "it does not end:\n{}",
+                self.stderr()
+            );
             sleep(LOOK);
         }
     }
@@ -266,7 +278,11 @@ impl Running {
     /// When it had ended already.
     pub fn kill_supervisor(&mut self) {
         let ended = self.supervisor.try_wait().unwrap();
-        assert!(ended.is_none(), "the run ended too soon:\n{}", self.stderr());
+        assert!(
+            ended.is_none(),
+            "the run ended too soon:\n{}",
+            self.stderr()
+        );
         self.supervisor.kill().unwrap();
         self.supervisor.wait().unwrap();
     }
@@ -281,7 +297,11 @@ impl Running {
             .for_each(|process| process.signal(Signal::KILL));
         self.supervisor.wait().unwrap();
         while !processes_of(&self.directory).is_empty() {
-            assert!(Instant::now() < self.deadline, "{:?}", processes_of(&self.directory));
+            assert!(
+                Instant::now() < self.deadline,
+                "{:?}",
+                processes_of(&self.directory)
+            );
             sleep(LOOK);
         }
     }
@@ -374,7 +394,8 @@ pub struct Ended {
 }
 
 impl Ended {
-    /// Requires that no process, shared memory or socket was left the moment the supervisor had ended.
+    /// Requires that no process, shared memory or socket was left the moment the supervisor had
+    /// ended.
     ///
     /// # Panics
     /// When something was.
@@ -406,7 +427,8 @@ impl Ended {
         episodes(&self.directory)
     }
 
-    /// Requires that it came to the same as `calm`, in every file and every point of every curve, who flew what apart.
+    /// Requires that it came to the same as `calm`, in every file and every point of every curve,
+    /// who flew what apart.
     ///
     /// # Panics
     /// When it did not; the message names every difference.
@@ -415,7 +437,11 @@ impl Ended {
             .into_iter()
             .filter_map(|check| Some(format!("{}: {}", check.what, check.verdict.err()?)))
             .collect();
-        assert!(differences.is_empty(), "{differences:#?}\n{}", self.output.stderr);
+        assert!(
+            differences.is_empty(),
+            "{differences:#?}\n{}",
+            self.output.stderr
+        );
     }
 
     /// What must be the same however the run was flown.
@@ -428,6 +454,7 @@ impl Ended {
 }
 
 fn json<T: DeserializeOwned>(path: PathBuf) -> T {
-    let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let text =
+        fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     serde_json::from_str(&text).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }

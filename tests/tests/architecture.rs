@@ -1,6 +1,10 @@
-//! Who may depend on whom. A package exists where a heavy dependency is fenced in; here is the fence.
+//! Who may depend on whom. A package exists where a heavy dependency is fenced in; here is the
+//! fence.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -21,9 +25,13 @@ enum Of {
 /// Names of everything that `package` depends on, directly or not.
 fn dependencies(metadata: &Metadata, package: &str, of: Of) -> BTreeSet<String> {
     let resolve = metadata.resolve.as_ref().unwrap();
-    let nodes: BTreeMap<&PackageId, _> = resolve.nodes.iter().map(|node| (&node.id, node)).collect();
+    let nodes: BTreeMap<&PackageId, _> =
+        resolve.nodes.iter().map(|node| (&node.id, node)).collect();
     let packages = metadata.workspace_packages();
-    let start = packages.iter().find(|found| found.name.as_str() == package).unwrap();
+    let start = packages
+        .iter()
+        .find(|found| found.name.as_str() == package)
+        .unwrap();
     let mut seen: BTreeSet<&PackageId> = BTreeSet::new();
     let mut to_see = vec![&start.id];
     while let Some(id) = to_see.pop() {
@@ -39,14 +47,25 @@ fn dependencies(metadata: &Metadata, package: &str, of: Of) -> BTreeSet<String> 
             }
         }
     }
-    seen.iter().map(|id| metadata[id].name.to_string()).collect()
+    seen.iter()
+        .map(|id| metadata[id].name.to_string())
+        .collect()
 }
 
 fn metadata() -> Metadata {
     MetadataCommand::new()
         .manifest_path(repository().join("Cargo.toml"))
-        // What this machine builds is all here already; what other platforms would build may not be.
-        .other_options(["--locked", "--offline", "--filter-platform", env!("SKEIN_TARGET")].map(str::to_owned))
+        // What this machine builds is all here already; what other platforms would build may not
+        // be.
+        .other_options(
+            [
+                "--locked",
+                "--offline",
+                "--filter-platform",
+                env!("SKEIN_TARGET"),
+            ]
+            .map(str::to_owned),
+        )
         .exec()
         .unwrap()
 }
@@ -62,11 +81,20 @@ fn every_package_keeps_to_its_side_of_the_fence() {
     let torch = ["tch", "torch-sys"];
     let physics = ["rapier3d", "parry3d"];
     for (package, allowed, forbidden) in [
-        ("skein-simulator", &[][..], [&torch[..], &["iceoryx2"]].concat()),
+        (
+            "skein-simulator",
+            &[][..],
+            [&torch[..], &["iceoryx2"]].concat(),
+        ),
         ("skein-protocol", &[], [torch, physics].concat()),
         (
             "skein-actor",
-            &["skein-inference", "skein-kernels", "skein-protocol", "skein-simulator"],
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-simulator",
+            ],
             torch.to_vec(),
         ),
         (

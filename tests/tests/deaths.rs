@@ -1,6 +1,10 @@
-//! Whoever dies, freezes or is cut off, and however often: the run comes to what it would have come to, and leaves nothing behind.
+//! Whoever dies, freezes or is cut off, and however often: the run comes to what it would have come
+//! to, and leaves nothing behind.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::fs;
 use std::path::PathBuf;
@@ -19,8 +23,8 @@ fn recipe() -> Recipe {
     Recipe::small().set("run.episodes=100")
 }
 
-/// What it comes to when nobody disturbs it. Run once for all tests that are under way at a time; to be asked for before one's own run is started, which
-/// would be waited for.
+/// What it comes to when nobody disturbs it. Run once for all tests that are under way at a time;
+/// to be asked for before one's own run is started, which would be waited for.
 fn calm() -> Arc<Ended> {
     static CALM: Mutex<Weak<Ended>> = Mutex::new(Weak::new());
     let mut known = CALM.lock().unwrap_or_else(PoisonError::into_inner);
@@ -40,7 +44,11 @@ fn a_learner_killed_three_times_goes_on_from_its_checkpoints() {
     }
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
-    let told = disturbed.output.stderr.matches("killed by signal 9").count();
+    let told = disturbed
+        .output
+        .stderr
+        .matches("killed by signal 9")
+        .count();
     assert_eq!(told, 3, "{}", disturbed.output.stderr);
 }
 
@@ -78,13 +86,22 @@ fn after_a_power_cut_a_damaged_checkpoint_is_named_and_the_one_before_it_used() 
             .lines()
             .any(|line| words.iter().all(|word| line.contains(word)))
     };
-    assert!(told([name, "damaged"]), "nobody was warned of {name}:\n{terminal}");
+    assert!(
+        told([name, "damaged"]),
+        "nobody was warned of {name}:\n{terminal}"
+    );
     assert!(told(["going on after episode", ""]), "{terminal}");
 }
 
 /// The checkpoints that are in their place, oldest first.
 fn checkpoints(run: &Running) -> Vec<PathBuf> {
-    let number = |path: &PathBuf| -> Option<u64> { path.file_name()?.to_str()?.strip_prefix("episode-")?.parse().ok() };
+    let number = |path: &PathBuf| -> Option<u64> {
+        path.file_name()?
+            .to_str()?
+            .strip_prefix("episode-")?
+            .parse()
+            .ok()
+    };
     let mut found: Vec<_> = fs::read_dir(run.directory().checkpoints())
         .into_iter()
         .flatten()
@@ -150,7 +167,10 @@ fn a_copy_of_a_runs_directory_is_not_resumed_while_the_run_is_under_way() {
     assert!(copied.is_ok(), "{copied:?}");
     // Between two incarnations of the learner, too.
     run.process("skein-learner").signal(Signal::KILL);
-    let refused = run_program("skein", &["run", "--resume", copy.to_str().unwrap(), "--actors", "1"]);
+    let refused = run_program(
+        "skein",
+        &["run", "--resume", copy.to_str().unwrap(), "--actors", "1"],
+    );
     refused.assert_refused(&["under way in another directory", "copy"]);
     run.finish().assert_same_as(&calm);
 }
@@ -167,7 +187,11 @@ fn an_actor_that_was_frozen_too_long_is_not_mixed_in_when_it_wakes() {
     sleeper.signal(Signal::CONT);
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
-    assert!(disturbed.summary().tickets_reissued > 0, "{:?}", disturbed.summary());
+    assert!(
+        disturbed.summary().tickets_reissued > 0,
+        "{:?}",
+        disturbed.summary()
+    );
 }
 
 #[test]
@@ -269,7 +293,10 @@ fn a_second_learner_of_a_run_is_refused_and_the_first_goes_on() {
     let calm = calm();
     let mut run = recipe().start();
     run.until_episodes(10);
-    let second = run_program("skein-learner", &["--run", run.directory().root().to_str().unwrap()]);
+    let second = run_program(
+        "skein-learner",
+        &["--run", run.directory().root().to_str().unwrap()],
+    );
     second.assert_refused(&["another learner"]);
     run.finish().assert_same_as(&calm);
 }

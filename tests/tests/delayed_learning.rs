@@ -1,4 +1,5 @@
-//! Delayed learning: an epoch's episodes all follow the one snapshot that its number and the policy lag name, and no episode is flown with two.
+//! Delayed learning: an epoch's episodes all follow the one snapshot that its number and the policy
+//! lag name, and no episode is flown with two.
 //!
 //! That a record of another version within an episode is refused is tested beside the assembler.
 
@@ -34,6 +35,10 @@ fn one_episode_an_epoch_is_one_snapshot_an_episode() {
         .set("learning.episodes_per_epoch=1")
         .set("run.episodes=15")
         .finish();
-    let versions: Vec<_> = run.episodes().iter().map(|episode| episode.policy_version).collect();
+    let versions: Vec<_> = run
+        .episodes()
+        .iter()
+        .map(|episode| episode.policy_version)
+        .collect();
     assert_eq!(versions, (0..15).collect::<Vec<_>>());
 }

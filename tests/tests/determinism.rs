@@ -1,6 +1,10 @@
-//! Training is a function of configuration and seed: who flies, how many fly, and who dies meanwhile, changes nothing.
+//! Training is a function of configuration and seed: who flies, how many fly, and who dies
+//! meanwhile, changes nothing.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::collections::BTreeSet;
 
@@ -22,7 +26,8 @@ fn one_two_and_four_actors_and_one_attached_half_way_learn_the_same_bit_for_bit(
             crew(&run).len() > 1,
             "of {actors} actors only one flew: nothing was compared"
         );
-        run.learned().assert_same(&alone.learned(), &format!("{actors} actors"));
+        run.learned()
+            .assert_same(&alone.learned(), &format!("{actors} actors"));
     }
     let mut run = Recipe::smoke().actors(1).start();
     run.until_episodes(alone.episodes().len() / 2);
@@ -43,8 +48,13 @@ fn actors_that_fly_while_the_learner_updates_change_nothing_either() {
     let lagging = || Recipe::small().set("learning.policy_lag=1");
     let alone = lagging().actors(1).finish();
     let together = lagging().actors(3).finish();
-    assert!(crew(&together).len() > 1, "only one actor flew: nothing was compared");
-    together.learned().assert_same(&alone.learned(), "three actors");
+    assert!(
+        crew(&together).len() > 1,
+        "only one actor flew: nothing was compared"
+    );
+    together
+        .learned()
+        .assert_same(&alone.learned(), "three actors");
 }
 
 #[test]

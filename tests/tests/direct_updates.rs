@@ -1,6 +1,10 @@
-//! Direct updates: the weights are refreshed in the middle of an episode, and what is learned is a function of configuration and seed all the same.
+//! Direct updates: the weights are refreshed in the middle of an episode, and what is learned is a
+//! function of configuration and seed all the same.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use rustix::process::Signal;
 use skein_protocol::summary::Ending;
@@ -22,10 +26,17 @@ fn in_segments_of(steps: u64) -> Recipe {
 fn assert_direct(run: &Ended) {
     let (episodes, summary) = (run.episodes(), run.summary());
     assert_eq!(episodes.len(), 40);
-    let versions: Vec<_> = episodes.iter().map(|episode| episode.policy_version).collect();
-    assert!(versions.is_sorted_by(|one, next| one < next), "{versions:?}");
+    let versions: Vec<_> = episodes
+        .iter()
+        .map(|episode| episode.policy_version)
+        .collect();
     assert!(
-        summary.final_version.0 > 2 * summary.episodes && summary.final_version.0 <= summary.steps + summary.episodes,
+        versions.is_sorted_by(|one, next| one < next),
+        "{versions:?}"
+    );
+    assert!(
+        summary.final_version.0 > 2 * summary.episodes
+            && summary.final_version.0 <= summary.steps + summary.episodes,
         "{summary:?}"
     );
     let steps: u64 = episodes.iter().map(|episode| episode.steps).sum();
@@ -53,7 +64,11 @@ fn one_actor_three_and_one_that_is_killed_twice_learn_the_same_bit_for_bit() {
         });
     }
     let disturbed = run.finish();
-    let told = disturbed.output.stderr.matches("killed by signal 9").count();
+    let told = disturbed
+        .output
+        .stderr
+        .matches("killed by signal 9")
+        .count();
     assert_eq!(told, 2, "{}", disturbed.output.stderr);
     disturbed.assert_same_as(&alone);
 }

@@ -1,6 +1,10 @@
-//! `skein-evaluate` on a run's snapshot gives the numbers that the run itself gave, and records what it flew.
+//! `skein-evaluate` on a run's snapshot gives the numbers that the run itself gave, and records
+//! what it flew.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::fs::{self, File};
 use std::io::Read;
@@ -51,7 +55,10 @@ fn a_code_of_another_length_is_learned_flown_and_recorded() {
             .set("evaluation.episodes=8")
             .finish();
         let summary = run.summary();
-        assert!(summary.vae_updates > 0 && summary.updates > 0, "{summary:?}");
+        assert!(
+            summary.vae_updates > 0 && summary.updates > 0,
+            "{summary:?}"
+        );
         let directory = run.directory.root().to_str().unwrap();
         let folder = tempfile::tempdir().unwrap();
         let later = evaluate(folder.path(), &["--run", directory]);
@@ -66,7 +73,8 @@ fn the_shipped_generalist_flies_courses_that_it_never_saw() {
     let folder = tempfile::tempdir().unwrap();
     let snapshots = repository().join("configs/snapshots");
     let said: EvaluationReport =
-        serde_json::from_str(&fs::read_to_string(snapshots.join("generalist.json")).unwrap()).unwrap();
+        serde_json::from_str(&fs::read_to_string(snapshots.join("generalist.json")).unwrap())
+            .unwrap();
     let (_, config) = Snapshot::load(&snapshots.join("generalist.safetensors")).unwrap();
     let shipped = Config::load(&repository().join("configs/generalist.toml"), &[]).unwrap();
     let mut differences = shipped.differences(&config.portable()).unwrap();
@@ -77,12 +85,22 @@ fn the_shipped_generalist_flies_courses_that_it_never_saw() {
     // By a bare name, from where it lies.
     let json = folder.path().join("report.json");
     let output = Command::new(program("skein-evaluate"))
-        .args(["--snapshot", "generalist.safetensors", "--episodes", "10", "--json"])
+        .args([
+            "--snapshot",
+            "generalist.safetensors",
+            "--episodes",
+            "10",
+            "--json",
+        ])
         .arg(&json)
         .current_dir(&snapshots)
         .output()
         .unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     let flown: EvaluationReport = serde_json::from_str(&fs::read_to_string(json).unwrap()).unwrap();
     assert_eq!(flown.policy_sha256, said.policy_sha256);
     assert_eq!(flown.courses.len(), config.courses.evaluation.len());
@@ -143,7 +161,10 @@ fn a_recording_holds_every_step_of_every_episode(run: &Ended, latent: usize, fol
         .map(|(_, reward)| f64::from(f32::from_le_bytes(reward)))
         .sum();
     let reported = evaluation.courses[0].mean_return * 8.0;
-    assert!((total - reported).abs() < 1e-3, "recorded {total}, reported {reported}");
+    assert!(
+        (total - reported).abs() < 1e-3,
+        "recorded {total}, reported {reported}"
+    );
 }
 
 /// An array of a recording.
@@ -155,11 +176,14 @@ struct Array {
 impl Array {
     /// Its values of four bytes.
     fn words(&self) -> impl Iterator<Item = [u8; 4]> {
-        self.data.chunks_exact(4).map(|word| word.try_into().unwrap())
+        self.data
+            .chunks_exact(4)
+            .map(|word| word.try_into().unwrap())
     }
 }
 
-/// Reads `name` from a `.npz` file: a zip of `.npy` files, whose header is a Python dictionary. Source: numpy.lib.format, version 1.0.
+/// Reads `name` from a `.npz` file: a zip of `.npy` files, whose header is a Python dictionary.
+/// Source: numpy.lib.format, version 1.0.
 fn array(file: &Path, name: &str, kind: &str) -> Array {
     let mut zip = zip::ZipArchive::new(File::open(file).unwrap()).unwrap();
     let mut bytes = Vec::new();
@@ -170,8 +194,14 @@ fn array(file: &Path, name: &str, kind: &str) -> Array {
     assert_eq!(&bytes[..8], b"\x93NUMPY\x01\x00", "{name}");
     let data = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
     let header = std::str::from_utf8(&bytes[10..data]).unwrap();
-    assert!(header.contains(&format!("'descr': '{kind}'")), "{name}: {header}");
-    assert!(header.contains("'fortran_order': False"), "{name}: {header}");
+    assert!(
+        header.contains(&format!("'descr': '{kind}'")),
+        "{name}: {header}"
+    );
+    assert!(
+        header.contains("'fortran_order': False"),
+        "{name}: {header}"
+    );
     let (_, shape) = header.split_once("'shape': (").unwrap();
     let (shape, _) = shape.split_once(')').unwrap();
     let shape: Vec<usize> = shape

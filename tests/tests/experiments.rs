@@ -1,6 +1,10 @@
-//! An experiment from its file to its report: interrupted, gone on with, told, published, and refused once it is another.
+//! An experiment from its file to its report: interrupted, gone on with, told, published, and
+//! refused once it is another.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -120,12 +124,23 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
     until("the first run has episodes", || {
         (episodes(&runs[0]).len() >= 20).then_some(())
     });
-    kill_process(Pid::from_raw(experiment.id().cast_signed()).unwrap(), Signal::INT).unwrap();
+    kill_process(
+        Pid::from_raw(experiment.id().cast_signed()).unwrap(),
+        Signal::INT,
+    )
+    .unwrap();
     let status = until("the experiment stops", || experiment.try_wait().unwrap());
     assert_eq!(status.code(), Some(130));
-    assert!(!runs.iter().all(completed), "nothing was left to go on with");
+    assert!(
+        !runs.iter().all(completed),
+        "nothing was left to go on with"
+    );
     for run in &runs {
-        assert!(leftovers(run).is_empty(), "left behind: {:?}", leftovers(run));
+        assert!(
+            leftovers(run).is_empty(),
+            "left behind: {:?}",
+            leftovers(run)
+        );
     }
 
     let output = scene.finish(&[]);
@@ -155,7 +170,8 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
     let picture = fs::read(report.join("walls_passed_over_episodes.png")).unwrap();
     assert!(picture.starts_with(b"\x89PNG"));
 
-    // What was interrupted came to the same as a run of a user who set the same and was left in peace.
+    // What was interrupted came to the same as a run of a user who set the same and was left in
+    // peace.
     let mut alone = Recipe::small()
         .set("replay.success_share=0.0")
         .set("run.learner_threads=1");
@@ -176,7 +192,11 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
 #[test]
 fn an_experiment_that_cannot_be_run_does_not_hide_the_others() {
     let scene = Scene::new();
-    fs::write(scene.path("configs/experiments/broken.toml"), "question = 1\n").unwrap();
+    fs::write(
+        scene.path("configs/experiments/broken.toml"),
+        "question = 1\n",
+    )
+    .unwrap();
     let repository = scene.path("").display().to_string();
     let output = run_program("skein-experiment", &["--repository", &repository, "--list"]);
     assert_eq!(output.code, Some(1));
@@ -199,18 +219,28 @@ fn assert_published(scene: &Scene, report: &str) {
         assert_eq!(output.code, Some(0), "{}", output.stderr);
     }
     let results = scene.results();
-    assert!(results.starts_with("# Results\n\nBefore.\n\n## Experiment: tiny\n\n<!-- experiment: tiny -->\n"));
+    assert!(
+        results.starts_with(
+            "# Results\n\nBefore.\n\n## Experiment: tiny\n\n<!-- experiment: tiny -->\n"
+        )
+    );
     assert_eq!(results.matches("<!-- end -->").count(), 1);
     let picture = "launch/pictures/experiments/tiny_walls_passed_over_episodes.png";
     assert!(results.contains(picture) && scene.path(picture).is_file());
-    let lines = fs::read_to_string(scene.path("launch/pictures/experiments/tiny_runs.csv")).unwrap();
+    let lines =
+        fs::read_to_string(scene.path("launch/pictures/experiments/tiny_runs.csv")).unwrap();
     for (arm, seed) in [("one-part", 1), ("half", 1), ("one-part", 2), ("half", 2)] {
         let learned = Summary::of(&scene.run(arm, seed)).unwrap().policy_sha256;
-        let line = lines.lines().find(|line| line.starts_with(&format!("{arm},{seed},")));
+        let line = lines
+            .lines()
+            .find(|line| line.starts_with(&format!("{arm},{seed},")));
         assert!(line.is_some_and(|line| line.contains(&learned)), "{lines}");
     }
     let published = results.replace("launch/pictures/experiments/tiny_", "");
-    assert!(published.contains(report.trim_end()), "{published}\n---\n{report}");
+    assert!(
+        published.contains(report.trim_end()),
+        "{published}\n---\n{report}"
+    );
     // Not while another is being published.
     let pictures = fs::File::open(scene.path("launch/pictures/experiments")).unwrap();
     pictures.lock().unwrap();
@@ -234,10 +264,12 @@ fn suite_results(run: &RunDirectory) -> Vec<PathBuf> {
     results
 }
 
-/// A run that is trained flies its suite and nothing else, whatever kept it from that before: it failed, was interrupted, or is another suite now.
+/// A run that is trained flies its suite and nothing else, whatever kept it from that before: it
+/// failed, was interrupted, or is another suite now.
 fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     let files = |run: &RunDirectory| {
-        [run.summary_json(), run.episodes_csv()].map(|file| fs::metadata(file).unwrap().modified().unwrap())
+        [run.summary_json(), run.episodes_csv()]
+            .map(|file| fs::metadata(file).unwrap().modified().unwrap())
     };
     let before: Vec<_> = runs.iter().map(files).collect();
     let result = suite_results(&runs[1]).pop().unwrap();
@@ -268,30 +300,46 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
             output.stderr
         );
     }
-    assert!(output.stdout.contains("**Not all of it**: 3 of 4 runs are complete."));
+    assert!(
+        output
+            .stdout
+            .contains("**Not all of it**: 3 of 4 runs are complete.")
+    );
     fs::rename(&snapshots[1], &snapshots[0]).unwrap();
     let output = scene.finish(&[]);
     assert_eq!(output.code, Some(0), "{}", output.stderr);
     assert!(
-        output.stderr.contains("half/seed-1 is complete: it completed "),
+        output
+            .stderr
+            .contains("half/seed-1 is complete: it completed "),
         "{}",
         output.stderr
     );
-    assert!(!output.stderr.contains("half/seed-1 is trained"), "{}", output.stderr);
+    assert!(
+        !output.stderr.contains("half/seed-1 is trained"),
+        "{}",
+        output.stderr
+    );
     assert_eq!(
         fs::read(&result).unwrap(),
         flown,
         "the same episodes came to something else"
     );
 
-    // Another suite of the same name, too long to be flown to its end, is interrupted; the results of the first are as good as they were.
+    // Another suite of the same name, too long to be flown to its end, is interrupted; the results
+    // of the first are as good as they were.
     scene.write_suite(1_000_000);
     let mut experiment = scene.start();
     until("a suite is flown", || {
         let said = fs::read_to_string(runs[0].root().with_extension("log")).unwrap();
-        said.contains("1000000 episodes on each of 2 entries").then_some(())
+        said.contains("1000000 episodes on each of 2 entries")
+            .then_some(())
     });
-    kill_process(Pid::from_raw(experiment.id().cast_signed()).unwrap(), Signal::INT).unwrap();
+    kill_process(
+        Pid::from_raw(experiment.id().cast_signed()).unwrap(),
+        Signal::INT,
+    )
+    .unwrap();
     let status = until("the experiment stops", || experiment.try_wait().unwrap());
     assert_eq!(status.code(), Some(130));
     scene
@@ -301,7 +349,11 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     let output = scene.finish(&["--report"]);
     assert_eq!(output.code, Some(0), "{}", output.stderr);
     assert_eq!(suite_results(&runs[1]), [result]);
-    assert_eq!(runs.iter().map(files).collect::<Vec<_>>(), before, "trained again");
+    assert_eq!(
+        runs.iter().map(files).collect::<Vec<_>>(),
+        before,
+        "trained again"
+    );
 }
 
 /// And that is another result, beside the suite's own.
@@ -314,31 +366,41 @@ fn assert_a_suite_is_flown_as_often_as_the_experiment_says(scene: &Scene, runs: 
     for run in runs {
         let results = suite_results(run);
         let flown = |result: &PathBuf| -> Vec<u64> {
-            let report: EvaluationReport = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
+            let report: EvaluationReport =
+                serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
             report.courses.iter().map(|entry| entry.episodes).collect()
         };
         assert_eq!(
-            results.iter().filter(|result| flown(result) == [2, 2]).count(),
+            results
+                .iter()
+                .filter(|result| flown(result) == [2, 2])
+                .count(),
             1,
             "{results:?}"
         );
         assert_eq!(
-            results.iter().filter(|result| flown(result) == [5, 5]).count(),
+            results
+                .iter()
+                .filter(|result| flown(result) == [5, 5])
+                .count(),
             1,
             "{results:?}"
         );
     }
 }
 
-/// What was learned from another configuration is never mixed with what the file says now, and never removed.
+/// What was learned from another configuration is never mixed with what the file says now, and
+/// never removed.
 fn assert_refused_when_changed(scene: &Scene) {
     scene.write("0.25");
     for arguments in [&[][..], &["--report"]] {
         let changed = scene.run("half", 1);
         let directory = changed.root().display().to_string();
-        scene
-            .finish(arguments)
-            .assert_refused(&[&directory, "replay.success_share = 0.5 there, 0.25 here", "mv "]);
+        scene.finish(arguments).assert_refused(&[
+            &directory,
+            "replay.success_share = 0.5 there, 0.25 here",
+            "mv ",
+        ]);
         assert!(completed(&changed));
     }
     scene

@@ -1,6 +1,9 @@
 //! A disk that fills up pauses a run, and costs nothing but time.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -43,7 +46,8 @@ impl Drop for SmallDisk {
     }
 }
 
-/// Starts a run on a disk of this `size`, makes room when the user is told that there is none, and requires that nothing else has come of it.
+/// Starts a run on a disk of this `size`, makes room when the user is told that there is none, and
+/// requires that nothing else has come of it.
 fn waits_for_room_and_comes_to_the_same(size: &str) {
     let Some(disk) = SmallDisk::of(size) else {
         eprintln!("skipped: this user may not mount a file system");

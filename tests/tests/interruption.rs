@@ -1,6 +1,10 @@
-//! How a run ends before its time: in order, at once, or with its supervisor; and that nothing is left behind.
+//! How a run ends before its time: in order, at once, or with its supervisor; and that nothing is
+//! left behind.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::time::{Duration, Instant};
 
@@ -24,7 +28,12 @@ fn the_first_interruption_saves_everything_learned() {
     let run = long_run();
     run.signal(Signal::INT);
     let ended = run.wait();
-    assert_eq!(ended.output.code, Some(INTERRUPTED), "{}", ended.output.stderr);
+    assert_eq!(
+        ended.output.code,
+        Some(INTERRUPTED),
+        "{}",
+        ended.output.stderr
+    );
     ended.assert_nothing_is_left();
 
     let summary = ended.summary();
@@ -41,7 +50,10 @@ fn the_first_interruption_saves_everything_learned() {
         .directory
         .checkpoints()
         .join(format!("episode-{}", summary.episodes));
-    assert!(checkpoint.join("manifest.json").is_file(), "no {checkpoint:?}");
+    assert!(
+        checkpoint.join("manifest.json").is_file(),
+        "no {checkpoint:?}"
+    );
     for plot in ["return.png", "walls_passed.png"] {
         assert!(
             ended.directory.plots().join(plot).is_file(),
@@ -60,7 +72,10 @@ fn the_second_interruption_ends_the_run_at_once() {
     let mut run = long_run();
     // A learner that cannot stop in order, now or ever.
     let processes = processes_of(run.directory());
-    let learner = processes.iter().find(|process| process.runs("skein-learner")).unwrap();
+    let learner = processes
+        .iter()
+        .find(|process| process.runs("skein-learner"))
+        .unwrap();
     learner.signal(Signal::STOP);
     run.signal(Signal::INT);
     run.until("the first interruption was heeded", |run| {
@@ -69,7 +84,12 @@ fn the_second_interruption_ends_the_run_at_once() {
     run.signal(Signal::INT);
     let begun = Instant::now();
     let ended = run.wait();
-    assert_eq!(ended.output.code, Some(INTERRUPTED), "{}", ended.output.stderr);
+    assert_eq!(
+        ended.output.code,
+        Some(INTERRUPTED),
+        "{}",
+        ended.output.stderr
+    );
     ended.assert_nothing_is_left();
     assert!(
         begun.elapsed() < Duration::from_secs(10),
@@ -85,7 +105,10 @@ fn no_process_outlives_a_killed_supervisor_not_even_a_frozen_one() {
     let directory = run.directory().clone();
     let processes = processes_of(&directory);
     assert_eq!(processes.len(), 4, "supervisor, learner, two actors");
-    let learner = processes.iter().find(|process| process.runs("skein-learner")).unwrap();
+    let learner = processes
+        .iter()
+        .find(|process| process.runs("skein-learner"))
+        .unwrap();
     learner.signal(Signal::STOP);
     run.signal(Signal::KILL);
     let begun = Instant::now();
@@ -103,7 +126,10 @@ fn no_process_outlives_a_killed_supervisor_not_even_a_frozen_one() {
 fn a_run_between_two_incarnations_of_its_learner_stops_in_order() {
     let mut run = long_run();
     let processes = processes_of(run.directory());
-    let learner = processes.iter().find(|process| process.runs("skein-learner")).unwrap();
+    let learner = processes
+        .iter()
+        .find(|process| process.runs("skein-learner"))
+        .unwrap();
     learner.signal(Signal::KILL);
     run.until("the learner was started again", |run| {
         run.stderr()
@@ -112,7 +138,12 @@ fn a_run_between_two_incarnations_of_its_learner_stops_in_order() {
     });
     run.signal(Signal::INT);
     let ended = run.wait();
-    assert_eq!(ended.output.code, Some(INTERRUPTED), "{}", ended.output.stderr);
+    assert_eq!(
+        ended.output.code,
+        Some(INTERRUPTED),
+        "{}",
+        ended.output.stderr
+    );
     let last = ended.output.stderr.lines().last().unwrap_or_default();
     assert!(
         last.ends_with(&format!(

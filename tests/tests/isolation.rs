@@ -1,6 +1,9 @@
 //! A run is its user's alone, and on its machine alone.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -64,13 +67,22 @@ fn another_user_can_neither_read_nor_write_nor_join() {
     fs::write(&open, "x").unwrap();
     set_mode(&open, 0o666);
     for action in [READ, WRITE] {
-        assert!(other_user_can(action, &open), "nothing could be shown if this failed");
+        assert!(
+            other_user_can(action, &open),
+            "nothing could be shown if this failed"
+        );
     }
 
     let segments: Vec<PathBuf> = fs::read_dir("/dev/shm")
         .unwrap()
         .map(|entry| entry.unwrap().path())
-        .filter(|path| path.file_name().unwrap().to_str().unwrap().starts_with(&segment_prefix))
+        .filter(|path| {
+            path.file_name()
+                .unwrap()
+                .to_str()
+                .unwrap()
+                .starts_with(&segment_prefix)
+        })
         .collect();
     assert!(segments.len() > 10, "{segments:?}");
     let files = [
@@ -82,11 +94,23 @@ fn another_user_can_neither_read_nor_write_nor_join() {
     ];
     for path in segments.iter().chain(&files) {
         // What an actor that has gone took with it, nobody can read.
-        assert!(!other_user_can(READ, path), "{} can be read", path.display());
-        assert!(!other_user_can(WRITE, path), "{} can be written", path.display());
+        assert!(
+            !other_user_can(READ, path),
+            "{} can be read",
+            path.display()
+        );
+        assert!(
+            !other_user_can(WRITE, path),
+            "{} can be written",
+            path.display()
+        );
     }
     for folder in [run.directory().root(), &identity.transport_folder()] {
-        assert!(!other_user_can(LIST, folder), "{} can be listed", folder.display());
+        assert!(
+            !other_user_can(LIST, folder),
+            "{} can be listed",
+            folder.display()
+        );
     }
 
     // With everything about the run that there is to know, short of being its user.
@@ -106,7 +130,10 @@ fn another_user_can_neither_read_nor_write_nor_join() {
     assert!(given.unwrap().success());
     fs::copy(program("skein-actor"), &actor).unwrap();
     chown(&actor, Some(OTHER_USER), None).unwrap();
-    let joined = as_other_user(&actor, &[Path::new("--run"), &copy, Path::new("--id"), Path::new("7")]);
+    let joined = as_other_user(
+        &actor,
+        &[Path::new("--run"), &copy, Path::new("--id"), Path::new("7")],
+    );
     let told = String::from_utf8_lossy(&joined.stderr);
     assert!(
         !joined.status.success() && told.contains("belongs to user 0"),

@@ -29,8 +29,14 @@ fn assert_actors_stay_below(bytes: u64, policy_lag: u64) {
     let actors = run.processes(Role::Actor);
     assert_eq!(actors.len(), 2);
     for actor in actors {
-        let most = actor.usage().expect("the actor is alive").most_resident_bytes;
-        println!("actor {}: {most} bytes with policy lag {policy_lag}", actor.pid());
+        let most = actor
+            .usage()
+            .expect("the actor is alive")
+            .most_resident_bytes;
+        println!(
+            "actor {}: {most} bytes with policy lag {policy_lag}",
+            actor.pid()
+        );
         assert!(most <= bytes, "actor {} took {most} bytes", actor.pid());
     }
     run.finish();

@@ -1,4 +1,5 @@
-//! What `learning.mirror` takes for granted: flown with mirrored commands through a mirrored course, an episode is the mirror image of the episode, image by image.
+//! What `learning.mirror` takes for granted: flown with mirrored commands through a mirrored
+//! course, an episode is the mirror image of the episode, image by image.
 
 use std::sync::Arc;
 
@@ -7,7 +8,9 @@ use rand_pcg::Pcg64Mcg;
 use skein_learner::episode::{CommittedEpisode, StepObservation};
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::{ACTION, IMAGE_PIXELS, LONGEST_LATENT};
-use skein_simulator::course::{Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout};
+use skein_simulator::course::{
+    Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout,
+};
 use skein_simulator::simulator::{Ahead, GroundTruth, Simulator, SimulatorSettings};
 
 const STEPS: usize = 15;
@@ -34,7 +37,13 @@ fn course(side: f32) -> Course {
         jitter_z_m: 0.0,
         ..StartArea::default()
     };
-    let shape = [[-1.0, -1.2], [1.4, -1.0], [1.1, 0.9], [0.2, 1.5], [-1.3, 0.8]];
+    let shape = [
+        [-1.0, -1.2],
+        [1.4, -1.0],
+        [1.1, 0.9],
+        [0.2, 1.5],
+        [-1.3, 0.8],
+    ];
     Course::new(CourseLayout {
         name: "mirror".to_owned(),
         corridor: Corridor::default(),
@@ -49,8 +58,8 @@ fn course(side: f32) -> Course {
 }
 
 fn fly(side: f32) -> CommittedEpisode {
-    let mut simulator =
-        Simulator::new(Arc::new(course(side)), &SimulatorSettings::default()).expect("the default settings are sound");
+    let mut simulator = Simulator::new(Arc::new(course(side)), &SimulatorSettings::default())
+        .expect("the default settings are sound");
     let [mut start, mut calm] = [1, 2].map(Pcg64Mcg::seed_from_u64);
     simulator
         .reset(1, &mut start, &mut calm)
@@ -100,20 +109,34 @@ fn fly(side: f32) -> CommittedEpisode {
 fn the_mirror_image_of_an_episode_is_the_episode_through_the_mirrored_course() {
     let (mirrored, flown) = (fly(1.0).mirrored(), fly(-1.0));
     assert_eq!(mirrored.actions, flown.actions);
-    for (step, (one, other)) in mirrored.observations.iter().zip(&flown.observations).enumerate() {
+    for (step, (one, other)) in mirrored
+        .observations
+        .iter()
+        .zip(&flown.observations)
+        .enumerate()
+    {
         for (what, one, other) in [
             ("position", &one.position_m[..], &other.position_m[..]),
             ("velocity", &one.velocity_mps, &other.velocity_mps),
             ("orientation", &one.orientation, &other.orientation),
             ("ground truth", &one.ground_truth, &other.ground_truth),
         ] {
-            let apart = one.iter().zip(other).map(|(one, other)| (one - other).abs());
+            let apart = one
+                .iter()
+                .zip(other)
+                .map(|(one, other)| (one - other).abs());
             let most = apart.fold(0.0, f32::max);
             assert!(most < 2e-3, "step {step}: {what} {one:?} and {other:?}");
         }
     }
-    let images = mirrored.depth.unwrap().into_iter().zip(flown.depth.unwrap());
-    let off = images.filter(|(one, other)| one.abs_diff(*other) > 1).count();
+    let images = mirrored
+        .depth
+        .unwrap()
+        .into_iter()
+        .zip(flown.depth.unwrap());
+    let off = images
+        .filter(|(one, other)| one.abs_diff(*other) > 1)
+        .count();
     // Silhouettes may come to lie on the other side of a pixel's centre.
     let pixels = (STEPS + 1) * IMAGE_PIXELS;
     assert!(off < pixels / 200, "{off} of {pixels} pixels differ");
@@ -139,5 +162,8 @@ fn all_that_points_to_the_left_points_to_the_right_in_the_mirror_and_nothing_els
     };
     let mut flown = fly(1.0);
     flown.observations[0].ground_truth = truth(1.0).numbers();
-    assert_eq!(flown.mirrored().observations[0].ground_truth, truth(-1.0).numbers());
+    assert_eq!(
+        flown.mirrored().observations[0].ground_truth,
+        truth(-1.0).numbers()
+    );
 }

@@ -1,6 +1,10 @@
-//! What cannot be done is refused with one line that says what to change, and nothing is left of the attempt.
+//! What cannot be done is refused with one line that says what to change, and nothing is left of
+//! the attempt.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::fs;
 use std::path::Path;
@@ -62,14 +66,20 @@ fn a_directory_that_is_not_empty() {
     attempt
         .run(&[])
         .assert_refused(&[run.to_str().unwrap(), "not empty", "--run-dir"]);
-    assert_eq!(fs::read_dir(&run).unwrap().count(), 1, "something was put beside it");
+    assert_eq!(
+        fs::read_dir(&run).unwrap().count(),
+        1,
+        "something was put beside it"
+    );
 }
 
 #[test]
 fn an_unknown_key_section_or_setting() {
-    Attempt::new("[replay]\ncapcity = 1000\n").assert_refused(&[], &["mine.toml", "[replay]", "capcity"]);
+    Attempt::new("[replay]\ncapcity = 1000\n")
+        .assert_refused(&[], &["mine.toml", "[replay]", "capcity"]);
     Attempt::new("[replays]\n").assert_refused(&[], &["mine.toml", "[replays]"]);
-    Attempt::new("[simulator.camera]\nzoom = 2\n").assert_refused(&[], &["mine.toml", "[simulator]", "zoom"]);
+    Attempt::new("[simulator.camera]\nzoom = 2\n")
+        .assert_refused(&[], &["mine.toml", "[simulator]", "zoom"]);
     let sound = Attempt::new("");
     sound.assert_refused(&["--set", "run.sede=1"], &["[run]", "sede"]);
     sound.assert_refused(&["--set", "seed=1"], &["--set seed=1", "section.key=value"]);
@@ -102,14 +112,26 @@ fn a_course_that_cannot_be_flown() {
         fs::write(&bent, text).unwrap();
         attempt.assert_refused(&["--set", &set], &[&["bent.toml"], parts].concat());
     };
-    refused("width_m = 2.2", "width_m = 0.1", &["wall 1", "width_m = 0.1", "drone"]);
-    refused("centre_m = ", "centre_m = [2.9, 3.5] # ", &["wall 1", "centre_m"]);
+    refused(
+        "width_m = 2.2",
+        "width_m = 0.1",
+        &["wall 1", "width_m = 0.1", "drone"],
+    );
+    refused(
+        "centre_m = ",
+        "centre_m = [2.9, 3.5] # ",
+        &["wall 1", "centre_m"],
+    );
 
     // An unknown key is shown where it stands, on lines of its own.
     fs::write(&bent, shipped.replacen("width_m = 2.2", "girth_m = 2.2", 1)).unwrap();
     let output = attempt.run(&["--set", &set]);
     output.assert_refused(&["bent.toml", "wall 1"]);
-    assert!(output.stderr.contains("unknown field `girth_m`"), "{}", output.stderr);
+    assert!(
+        output.stderr.contains("unknown field `girth_m`"),
+        "{}",
+        output.stderr
+    );
 }
 
 #[test]
@@ -132,7 +154,8 @@ fn an_actor_for_a_run_that_is_not_there_or_over() {
     run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory]);
     let over = Recipe::small().set("run.episodes=1").finish();
     let directory = over.directory.root().to_str().unwrap();
-    run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory, "not under way"]);
+    run_program("skein", &["attach", "--run", directory])
+        .assert_refused(&[directory, "not under way"]);
 }
 
 #[test]
@@ -176,7 +199,10 @@ fn a_resumption_of_what_cannot_be_gone_on_with() {
     let empty = tempfile::tempdir().unwrap();
     let directory = empty.path().to_str().unwrap();
     run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "run.json"]);
-    let with_config = run_program("skein", &["run", "--resume", directory, "--set", "run.seed=2"]);
+    let with_config = run_program(
+        "skein",
+        &["run", "--resume", directory, "--set", "run.seed=2"],
+    );
     assert_eq!(with_config.code, Some(2));
     assert!(
         with_config
@@ -190,14 +216,25 @@ fn a_resumption_of_what_cannot_be_gone_on_with() {
     running.until_episodes(1);
     let root = running.directory().root().to_owned();
     let directory = root.to_str().unwrap();
-    run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "under way", "attach_actor.sh"]);
+    run_program("skein", &["run", "--resume", directory]).assert_refused(&[
+        directory,
+        "under way",
+        "attach_actor.sh",
+    ]);
     let _complete = running.finish();
-    run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "complete", "40 episodes"]);
+    run_program("skein", &["run", "--resume", directory]).assert_refused(&[
+        directory,
+        "complete",
+        "40 episodes",
+    ]);
 }
 
 #[test]
 fn an_evaluation_of_nothing() {
     run_program("skein-evaluate", &["--run", "/nowhere/run"]).assert_refused(&["/nowhere/run"]);
-    run_program("skein-evaluate", &["--snapshot", "/nowhere/best.safetensors"])
-        .assert_refused(&["/nowhere/best.safetensors"]);
+    run_program(
+        "skein-evaluate",
+        &["--snapshot", "/nowhere/best.safetensors"],
+    )
+    .assert_refused(&["/nowhere/best.safetensors"]);
 }

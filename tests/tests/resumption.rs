@@ -1,6 +1,9 @@
 //! Runs that are cut off, and what becomes of them and of what they left.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::process::{Command, Stdio};
 use std::thread::sleep;
@@ -85,7 +88,12 @@ fn the_next_start_removes_what_a_killed_run_left_and_nothing_of_a_run_beside_it(
             .arg(repository().join("tests/small.toml"))
             .arg("--run-dir")
             .arg(directory.root())
-            .args(["--actors", "1", "--set", &format!("run.episodes={episodes}")])
+            .args([
+                "--actors",
+                "1",
+                "--set",
+                &format!("run.episodes={episodes}"),
+            ])
             .stdout(Stdio::null())
             .stderr(Stdio::null())
             .spawn()

@@ -1,6 +1,10 @@
-//! The paper's rivals as whole runs: a policy that learns from images, without a VAE, and a U-Net in the VAE's place.
+//! The paper's rivals as whole runs: a policy that learns from images, without a VAE, and a U-Net
+//! in the VAE's place.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::fs;
 
@@ -33,7 +37,9 @@ fn without_a_vae_a_run_killed_and_gone_on_with_by_more_actors_learns_the_same_bi
         learners_log(&calm)
     );
     let Summary {
-        updates, vae_updates, ..
+        updates,
+        vae_updates,
+        ..
     } = calm.summary();
     assert!(
         updates > 10 && vae_updates == 0,
@@ -54,13 +60,21 @@ fn snapshots_of_such_a_run_are_laid_out_as_ever_and_the_critic_has_trained_their
         snapshot.values[SnapshotLayout::of(&config).encoder()].to_vec()
     };
     let trained = end_to_end("td3").finish();
-    let untrained = end_to_end("td3").set("learning.updates_per_step=0").finish();
+    let untrained = end_to_end("td3")
+        .set("learning.updates_per_step=0")
+        .finish();
     let (trained_encoder, untrained_encoder) = (encoder(&trained), encoder(&untrained));
     assert_eq!(trained_encoder.len(), untrained_encoder.len());
     assert_ne!(trained_encoder, untrained_encoder);
     // Nothing is there to be reconstructed, and nothing is told of it.
     assert!(!trained.directory.reconstructions().exists());
-    assert!(!trained.directory.plots().join("reconstructions.png").exists());
+    assert!(
+        !trained
+            .directory
+            .plots()
+            .join("reconstructions.png")
+            .exists()
+    );
     assert!(trained.directory.plots().join("trajectories.png").exists());
 }
 

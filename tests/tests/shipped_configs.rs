@@ -1,6 +1,9 @@
 //! The configurations that are shipped can be run, and the faithful one is the paper's.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -32,7 +35,10 @@ fn the_configurations_are_there() {
         .iter()
         .map(|path| path.file_name().unwrap().to_str().unwrap().to_owned())
         .collect();
-    assert_eq!(names, ["generalist.toml", "local.toml", "paper.toml", "smoke.toml"]);
+    assert_eq!(
+        names,
+        ["generalist.toml", "local.toml", "paper.toml", "smoke.toml"]
+    );
 }
 
 #[test]
@@ -42,7 +48,12 @@ fn every_shipped_configuration_can_be_flown_as_it_stands() {
         let settings: SimulatorSettings = toml::Value::Table(config.simulator)
             .try_into()
             .unwrap_or_else(|error| panic!("{}: {error}", file.display()));
-        for path in config.courses.evaluation.iter().chain([&config.courses.training]) {
+        for path in config
+            .courses
+            .evaluation
+            .iter()
+            .chain([&config.courses.training])
+        {
             let course = Arc::new(Course::load(path).unwrap());
             assert!(
                 course.walls().len() >= usize::from(config.learning.levels),
@@ -84,13 +95,21 @@ fn the_faithful_configuration_is_the_papers() {
 
 #[test]
 fn every_shipped_suite_can_be_flown_and_one_tells_every_family_of_shapes_apart() {
-    let suite = |name: &str| Suite::load(repository().join("configs/evaluations").join(name)).unwrap();
-    let [generalist, shapes, untried] = ["generalist.toml", "shapes.toml", "untried.toml"].map(suite);
+    let suite =
+        |name: &str| Suite::load(repository().join("configs/evaluations").join(name)).unwrap();
+    let [generalist, shapes, untried] =
+        ["generalist.toml", "shapes.toml", "untried.toml"].map(suite);
     let all = [&generalist, &shapes, &untried, &suite("paper.toml")];
     for entry in all.into_iter().flat_map(|suite| &suite.entries) {
         entry.courses.of_episode(0).unwrap();
     }
-    let told: Vec<&str> = shapes.entries.iter().map(|entry| entry.name.as_str()).collect();
-    let families = GeneratedShape::HELD_OUT.into_iter().chain(GeneratedShape::TRAINED);
+    let told: Vec<&str> = shapes
+        .entries
+        .iter()
+        .map(|entry| entry.name.as_str())
+        .collect();
+    let families = GeneratedShape::HELD_OUT
+        .into_iter()
+        .chain(GeneratedShape::TRAINED);
     assert_eq!(told, families.map(GeneratedShape::name).collect::<Vec<_>>());
 }

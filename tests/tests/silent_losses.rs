@@ -1,6 +1,10 @@
-//! The ways in which iceoryx2 loses data without a word when a peer dies, each reproduced, and that no episode is lost or mixed up by any of them.
+//! The ways in which iceoryx2 loses data without a word when a peer dies, each reproduced, and that
+//! no episode is lost or mixed up by any of them.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
@@ -78,7 +82,11 @@ impl Run {
 
     /// A dispatcher with one order.
     fn dispatcher(&self) -> Dispatcher {
-        let mut dispatcher = Dispatcher::new(self.identity.run, &self.config.transport, self.config.vae.latent);
+        let mut dispatcher = Dispatcher::new(
+            self.identity.run,
+            &self.config.transport,
+            self.config.vae.latent,
+        );
         dispatcher.order(Order {
             ticket: self.ticket(0),
             epoch: Epoch(0),
@@ -102,7 +110,8 @@ impl Run {
         }
     }
 
-    /// This test's program again, as the process that the ignored test `role` is; returned once it has said that it is ready.
+    /// This test's program again, as the process that the ignored test `role` is; returned once it
+    /// has said that it is ready.
     fn peer(&self, role: &str) -> Peer {
         let mut process = Command::new(std::env::current_exe().unwrap())
             .args(["--exact", role, "--ignored", "--nocapture"])
@@ -192,16 +201,31 @@ fn send(
 }
 
 /// What the dispatcher makes of everything that has arrived.
-fn take_in(learner: &LearnerPorts, dispatcher: &mut Dispatcher, now: Instant) -> Vec<CommittedEpisode> {
+fn take_in(
+    learner: &LearnerPorts,
+    dispatcher: &mut Dispatcher,
+    now: Instant,
+) -> Vec<CommittedEpisode> {
     let mut committed = Vec::new();
     while let Some(record) = learner.receive_transition().unwrap() {
-        committed.extend(dispatcher.on_record(&record, now).unwrap().map(|(_, episode)| episode));
+        committed.extend(
+            dispatcher
+                .on_record(&record, now)
+                .unwrap()
+                .map(|(_, episode)| episode),
+        );
     }
     committed
 }
 
 /// Requires that the first order is flown by `actor` after all, once.
-fn assert_flown(run: &Run, learner: &LearnerPorts, dispatcher: &mut Dispatcher, actor: ActorId, now: Instant) {
+fn assert_flown(
+    run: &Run,
+    learner: &LearnerPorts,
+    dispatcher: &mut Dispatcher,
+    actor: ActorId,
+    now: Instant,
+) {
     let ports = run.actor();
     learner.maintain().unwrap();
     let ticket = run.issued(dispatcher, actor, now);
@@ -238,7 +262,11 @@ fn an_actor_whose_learner_reads_nothing_and_is_killed_is_not_held_up() {
         let mut learner = run.peer("learner_that_reads_nothing");
         let ports = run.actor();
         // Several times what the learner has room for.
-        let flood = || (0..50).for_each(|episode| send(&ports, &run.ticket(episode), FIRST, INCARNATION, 0..=STEPS));
+        let flood = || {
+            (0..50).for_each(|episode| {
+                send(&ports, &run.ticket(episode), FIRST, INCARNATION, 0..=STEPS)
+            })
+        };
         flood();
         learner.kill();
         flood();
@@ -279,7 +307,10 @@ fn an_episode_whose_actor_ends_at_once_is_flown_by_another() {
     let ticket = run.issued(&mut dispatcher, FIRST, now);
     send(&ports, &ticket, FIRST, INCARNATION, 0..=STEPS);
     drop(ports);
-    assert!(take_in(&learner, &mut dispatcher, now).is_empty(), "all of it was lost");
+    assert!(
+        take_in(&learner, &mut dispatcher, now).is_empty(),
+        "all of it was lost"
+    );
     let later = now + Duration::from_secs(2);
     dispatcher.on_time(later);
     assert_flown(&run, &learner, &mut dispatcher, SECOND, later);
@@ -337,7 +368,12 @@ fn actor_that_flies() {
             println!("ready");
         }
         // Another incarnation at each joining: tickets for the one before are lost with its line.
-        let incarnation = ActorIncarnation(SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos() as u64);
+        let incarnation = ActorIncarnation(
+            SystemTime::now()
+                .duration_since(UNIX_EPOCH)
+                .unwrap()
+                .as_nanos() as u64,
+        );
         for _ in 0..20 {
             ports.maintain().unwrap();
             let sign = StatusRecord::new(identity.run, &status(FIRST, incarnation));
@@ -354,13 +390,15 @@ fn actor_that_flies() {
     }
 }
 
-/// Killed actors leave half-made connections, half-made files, and slots of which there are few: here four for two actors.
+/// Killed actors leave half-made connections, half-made files, and slots of which there are few:
+/// here four for two actors.
 #[test]
 fn many_actors_killed_in_the_middle_of_anything_cost_no_slot_no_file_and_no_episode() {
     const EPISODES: u64 = 30;
     let run = Run::new();
     let lock = LearnerLock::take(&run.directory, &run.identity).unwrap();
-    let mut receiver = EpisodeReceiver::start(&run.identity, lock.incarnation(), &run.config).unwrap();
+    let mut receiver =
+        EpisodeReceiver::start(&run.identity, lock.incarnation(), &run.config).unwrap();
     let files = run.files();
     let mut peer = run.peer("actor_that_flies");
     let tickets = (0..EPISODES).map(|episode| run.ticket(episode)).collect();
@@ -381,7 +419,8 @@ fn many_actors_killed_in_the_middle_of_anything_cost_no_slot_no_file_and_no_epis
         flown.push(episode.episode.0);
     }
     assert_eq!(flown, (0..EPISODES).collect::<Vec<_>>());
-    // Four slots, of which the learner's own waker has one: if a dead actor kept another, these would be too many.
+    // Four slots, of which the learner's own waker has one: if a dead actor kept another, these
+    // would be too many.
     drop(peer);
     let deadline = Instant::now() + PATIENCE;
     let mut actors = Vec::new();
@@ -389,7 +428,11 @@ fn many_actors_killed_in_the_middle_of_anything_cost_no_slot_no_file_and_no_epis
         match ActorPorts::join(&run.identity, &run.config) {
             Ok(ports) => actors.push(ports),
             Err(error) => {
-                assert!(Instant::now() < deadline, "{} of 3 could join: {error}", actors.len());
+                assert!(
+                    Instant::now() < deadline,
+                    "{} of 3 could join: {error}",
+                    actors.len()
+                );
                 sleep(Duration::from_millis(20));
             }
         }
@@ -398,7 +441,11 @@ fn many_actors_killed_in_the_middle_of_anything_cost_no_slot_no_file_and_no_epis
     // What died before it could be told from what is being made is left alone for some seconds.
     let deadline = Instant::now() + PATIENCE;
     while run.files() != files {
-        assert!(Instant::now() < deadline, "{files:?} became {:?}", run.files());
+        assert!(
+            Instant::now() < deadline,
+            "{files:?} became {:?}",
+            run.files()
+        );
         sleep(Duration::from_millis(100));
     }
     receiver.finish();

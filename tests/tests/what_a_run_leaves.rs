@@ -1,6 +1,9 @@
 //! What a run leaves in its directory, file by file, as it was promised; and nothing anywhere else.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -33,7 +36,11 @@ fn the_configuration_is_resolved(run: &Ended) {
     let text = fs::read_to_string(run.directory.config()).unwrap();
     let config: toml::Table = toml::from_str(&text).unwrap();
     assert_eq!(config["run"]["seed"].as_integer(), Some(7));
-    assert_eq!(config["sac"]["hidden_width"].as_integer(), Some(32), "set in the file");
+    assert_eq!(
+        config["sac"]["hidden_width"].as_integer(),
+        Some(32),
+        "set in the file"
+    );
     for [section, key] in [["sac", "discount"], ["vae", "kl_weight"]] {
         assert!(
             config[section][key].is_float(),
@@ -52,7 +59,12 @@ fn the_configuration_is_resolved(run: &Ended) {
     );
     // What it names is in the directory too.
     let config = Config::load(&run.directory.config(), &[]).unwrap();
-    for course in config.courses.evaluation.iter().chain([&config.courses.training]) {
+    for course in config
+        .courses
+        .evaluation
+        .iter()
+        .chain([&config.courses.training])
+    {
         assert!(
             course.starts_with(run.directory.courses()) && course.is_file(),
             "{course:?}"
@@ -73,7 +85,10 @@ fn the_episodes_have_the_promised_columns(run: &Ended) {
         assert_eq!(u64::from(episode.level), number / 10 % 5 + 1, "{episode:?}");
         assert!((1..=160).contains(&episode.steps), "{episode:?}");
         assert!(episode.walls_passed <= 5, "{episode:?}");
-        assert!(episode.r#return.parse::<f32>().unwrap().is_finite(), "{episode:?}");
+        assert!(
+            episode.r#return.parse::<f32>().unwrap().is_finite(),
+            "{episode:?}"
+        );
         assert!(
             ["collided", "reached_end", "timed_out"].contains(&episode.outcome.as_str()),
             "{episode:?}"
@@ -112,13 +127,20 @@ fn the_summary_agrees_with_the_episodes(run: &Ended) {
     assert_eq!(summary.ending, Ending::Completed);
     assert_eq!(summary.final_version.0, 4);
     assert_eq!(summary.episodes, episodes.len() as u64);
-    assert_eq!(summary.steps, episodes.iter().map(|episode| episode.steps).sum::<u64>());
-    assert!(summary.updates > 0 && summary.vae_updates > 0, "{summary:?}");
+    assert_eq!(
+        summary.steps,
+        episodes.iter().map(|episode| episode.steps).sum::<u64>()
+    );
+    assert!(
+        summary.updates > 0 && summary.vae_updates > 0,
+        "{summary:?}"
+    );
     // Three on each of two courses, and at least one that confirmed the best snapshot.
     assert!(summary.evaluation_episodes > 6, "{summary:?}");
 }
 
-/// Each thread's stages are its whole time, and each was gone through as often as there was something to do.
+/// Each thread's stages are its whole time, and each was gone through as often as there was
+/// something to do.
 fn the_stages_agree_with_the_counts(run: &Ended) {
     let summary = run.summary();
     let count = |stage| summary.stages.of(stage).count;
@@ -134,14 +156,23 @@ fn the_stages_agree_with_the_counts(run: &Ended) {
         "{episodes} episodes of {summary:?}"
     );
     // Those that confirmed the best snapshot were flown besides.
-    assert!(steps > summary.steps + evaluation_steps, "{steps} steps of {summary:?}");
+    assert!(
+        steps > summary.steps + evaluation_steps,
+        "{steps} steps of {summary:?}"
+    );
     assert_eq!(count(Stage::Policy), steps);
-    assert_eq!([Stage::Camera, Stage::Encoder].map(count), [steps + episodes; 2]);
+    assert_eq!(
+        [Stage::Camera, Stage::Encoder].map(count),
+        [steps + episodes; 2]
+    );
     assert!((steps + episodes - 1..=steps + episodes).contains(&count(Stage::Send)));
     assert!(count(Stage::Assemble) >= summary.steps + summary.episodes);
     assert_eq!(count(Stage::TakeIn), summary.episodes);
     assert_eq!(count(Stage::Evaluate), summary.evaluation_episodes);
-    assert_eq!([Stage::Sample, Stage::PolicyUpdate].map(count), [summary.updates; 2]);
+    assert_eq!(
+        [Stage::Sample, Stage::PolicyUpdate].map(count),
+        [summary.updates; 2]
+    );
     assert_eq!(
         [Stage::SampleImages, Stage::VaeStep].map(count),
         [summary.vae_updates; 2]
@@ -180,7 +211,11 @@ fn the_evaluation_is_of_the_best_snapshot(run: &Ended) {
     let (best, _) = Snapshot::load(&run.directory.best_snapshot()).unwrap();
     assert_eq!(evaluation.policy_version, best.version);
     assert_eq!(evaluation.policy_sha256, best.sha256());
-    let names: Vec<_> = evaluation.courses.iter().map(|course| course.course.as_str()).collect();
+    let names: Vec<_> = evaluation
+        .courses
+        .iter()
+        .map(|course| course.course.as_str())
+        .collect();
     assert_eq!(names, ["training", "non_rectangular"]);
     for course in &evaluation.courses {
         assert_eq!(course.episodes, 3);
@@ -199,7 +234,8 @@ fn the_newest_checkpoint_is_of_the_end(run: &Ended) {
     );
 }
 
-/// A record of an event file is its length, a checksum, the event, and a checksum. The first event names the format; curves go by their names.
+/// A record of an event file is its length, a checksum, the event, and a checksum. The first event
+/// names the format; curves go by their names.
 fn the_curves_are_in_an_event_file(run: &Ended) {
     let folder = run.directory.tensorboard();
     let names = names_in(&folder);
@@ -216,7 +252,11 @@ fn the_curves_are_in_an_event_file(run: &Ended) {
         events.push(event);
         rest = &after[4..];
     }
-    let holds = |event: &[u8], text: &str| event.windows(text.len()).any(|part| part == text.as_bytes());
+    let holds = |event: &[u8], text: &str| {
+        event
+            .windows(text.len())
+            .any(|part| part == text.as_bytes())
+    };
     assert!(holds(events[0], "brain.Event:2"));
     for (curve, least) in [
         ("episode/return", 40),
@@ -244,7 +284,9 @@ fn the_plots_show_something(run: &Ended) {
     );
     for plot in plots {
         let file = fs::File::open(run.directory.plots().join(plot)).unwrap();
-        let mut reader = png::Decoder::new(std::io::BufReader::new(file)).read_info().unwrap();
+        let mut reader = png::Decoder::new(std::io::BufReader::new(file))
+            .read_info()
+            .unwrap();
         let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
         let info = reader.next_frame(&mut pixels).unwrap();
         assert!(info.width >= 300 && info.height >= 150, "{plot}: {info:?}");

@@ -1,4 +1,5 @@
-//! What the benchmarks of whole actors share: a run of the default configuration whose learner is the benchmark itself.
+//! What the benchmarks of whole actors share: a run of the default configuration whose learner is
+//! the benchmark itself.
 
 use std::path::Path;
 
@@ -20,7 +21,10 @@ pub(crate) struct Learner {
     pub(crate) config: Config,
     pub(crate) ports: LearnerPorts,
     _lock: LearnerLock,
-    #[allow(dead_code, reason = "only the benchmark that starts a process says where")]
+    #[allow(
+        dead_code,
+        reason = "only the benchmark that starts a process says where"
+    )]
     pub(crate) directory: tempfile::TempDir,
 }
 
@@ -36,7 +40,8 @@ impl Learner {
         run.create(&config).expect("the directory is new");
         let (identity, config) = run.open().expect("it was just created");
         let lock = LearnerLock::take(&run, &identity).expect("nobody else knows of it");
-        let ports = LearnerPorts::open(&identity, lock.incarnation(), &config).expect("services can be created");
+        let ports = LearnerPorts::open(&identity, lock.incarnation(), &config)
+            .expect("services can be created");
         Self {
             identity,
             config,
@@ -46,13 +51,16 @@ impl Learner {
         }
     }
 
-    /// Of random parameters, uniform in about PyTorch's default range: numbers of ordinary size run through all layers.
+    /// Of random parameters, uniform in about PyTorch's default range: numbers of ordinary size run
+    /// through all layers.
     pub(crate) fn snapshot(&self) -> Snapshot {
         let layout = SnapshotLayout::of(&self.config);
         let mut rng = Pcg64Mcg::seed_from_u64(1);
         let mut values = vec![0.0; layout.values()];
         for tensor in layout.tensors() {
-            let bound = (tensor.shape[0] as f32 / tensor.range.len() as f32).sqrt().min(0.5);
+            let bound = (tensor.shape[0] as f32 / tensor.range.len() as f32)
+                .sqrt()
+                .min(0.5);
             values[tensor.range.clone()].fill_with(|| rng.random_range(-bound..bound));
         }
         Snapshot {

@@ -1,7 +1,8 @@
-//! The depth camera: frames a second drawn, drawn with a stereo camera's errors, and traced ray by ray in the same scene.
+//! The depth camera: frames a second drawn, drawn with a stereo camera's errors, and traced ray by
+//! ray in the same scene.
 //!
-//! An iteration is an episode's worth of poses through the whole corridor, leaning as drones do, so that near walls and open corridor are in it as they
-//! are in training.
+//! An iteration is an episode's worth of poses through the whole corridor, leaning as drones do, so
+//! that near walls and open corridor are in it as they are in training.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -27,7 +28,8 @@ fn main() {
 
 fn camera(criterion: &mut Criterion, name: &str) {
     let courses = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
-    let course = Course::load(courses.join(name).with_extension("toml")).expect("shipped courses can be flown");
+    let course = Course::load(courses.join(name).with_extension("toml"))
+        .expect("shipped courses can be flown");
     let settings = CameraSettings::default();
     let mut camera = DepthCamera::new(&settings, &course)
         .expect("default settings make sense")
@@ -35,7 +37,8 @@ fn camera(criterion: &mut Criterion, name: &str) {
             model: DepthModel::Stereo,
             ..Default::default()
         });
-    let reference = ReferenceCamera::new(&settings, &course).expect("a course's surfaces are a mesh");
+    let reference =
+        ReferenceCamera::new(&settings, &course).expect("a course's surfaces are a mesh");
     let poses: Vec<_> = (0..DRAWN).map(|number| pose(&course, number)).collect();
     let mut image = [0; IMAGE_PIXELS];
 
@@ -76,7 +79,9 @@ fn pose(course: &Course, number: usize) -> Isometry3<f32> {
         .walls()
         .iter()
         .find(|wall| wall.x_m() + course.wall_thickness_m() > x);
-    let [y, z] = ahead.map_or([0.0, course.corridor().height_m / 2.0], |wall| wall.safe_point());
+    let [y, z] = ahead.map_or([0.0, course.corridor().height_m / 2.0], |wall| {
+        wall.safe_point()
+    });
     let wave = number as f32 * 0.25;
     let turn = UnitQuaternion::from_euler_angles(0.4 * wave.sin(), 0.1 * wave.cos(), 0.0);
     Isometry3::from_parts(Translation3::new(x, y, z), turn)

@@ -1,6 +1,7 @@
 //! The environment step: half a second of episode, physics alone and with the image after it.
 //!
-//! An iteration is a whole episode through the training course, the oracle steering, reset included.
+//! An iteration is a whole episode through the training course, the oracle steering, reset
+//! included.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -27,7 +28,9 @@ enum Camera {
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     let courses = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
-    let course = Arc::new(Course::load(courses.join("training.toml")).expect("shipped courses can be flown"));
+    let course = Arc::new(
+        Course::load(courses.join("training.toml")).expect("shipped courses can be flown"),
+    );
     let mut group = criterion.benchmark_group("environment_step");
     for (preset, name) in [
         (Preset::Airsim, "airsim"),
@@ -41,7 +44,8 @@ fn main() {
             },
             ..Default::default()
         };
-        let mut simulator = Simulator::new(Arc::clone(&course), &settings).expect("default settings make sense");
+        let mut simulator =
+            Simulator::new(Arc::clone(&course), &settings).expect("default settings make sense");
         group.throughput(Throughput::Elements(fly(&mut simulator, Camera::Off)));
         for (camera, what) in [(Camera::Off, "physics"), (Camera::On, "with_camera")] {
             group.bench_function(BenchmarkId::new(what, name), |bencher| {
@@ -62,7 +66,9 @@ fn fly(simulator: &mut Simulator, camera: Camera) -> u64 {
         .expect("every course has a first level");
     for steps in 1.. {
         let action = Oracle::act(simulator.course(), &simulator.state());
-        let report = simulator.step(action).expect("the oracle's commands are finite");
+        let report = simulator
+            .step(action)
+            .expect("the oracle's commands are finite");
         if let Camera::On = camera {
             simulator.render(&mut image);
             black_box(&image);

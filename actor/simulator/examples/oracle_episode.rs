@@ -1,7 +1,9 @@
-//! Flies the oracle through every shipped course with every drone and prints how many episodes arrived.
+//! Flies the oracle through every shipped course with every drone and prints how many episodes
+//! arrived.
 //!
-//! `cargo run --release -p skein-simulator --example oracle_episode [episodes]` (100 per course, drone and start level by default).
-//! Below 99 % either the course or the drone is wrong. What the same policy makes of an evaluation suite: `oracle_suite`.
+//! `cargo run --release -p skein-simulator --example oracle_episode [episodes]` (100 per course,
+//! drone and start level by default). Below 99 % either the course or the drone is wrong. What the
+//! same policy makes of an evaluation suite: `oracle_suite`.
 
 use std::error::Error;
 use std::path::Path;
@@ -15,10 +17,13 @@ use skein_simulator::simulator::{Outcome, Simulator, SimulatorSettings};
 use skein_simulator::vehicle::{Preset, VehicleSettings};
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let episodes: u64 = std::env::args().nth(1).map_or(Ok(100), |argument| argument.parse())?;
-    let mut files: Vec<_> = std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses"))?
-        .map(|entry| entry.map(|entry| entry.path()))
-        .collect::<Result<_, _>>()?;
+    let episodes: u64 = std::env::args()
+        .nth(1)
+        .map_or(Ok(100), |argument| argument.parse())?;
+    let mut files: Vec<_> =
+        std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses"))?
+            .map(|entry| entry.map(|entry| entry.path()))
+            .collect::<Result<_, _>>()?;
     files.sort();
 
     println!(
@@ -36,7 +41,11 @@ fn main() -> Result<(), Box<dyn Error>> {
                 ..Default::default()
             };
             let mut simulator = Simulator::new(course.clone(), &settings)?;
-            print!("{:<20} {:<12}", course.name(), format!("{preset:?}").to_lowercase());
+            print!(
+                "{:<20} {:<12}",
+                course.name(),
+                format!("{preset:?}").to_lowercase()
+            );
             for level in 1..=course.levels() {
                 let mut arrived = 0;
                 for episode in 0..episodes {

@@ -1,8 +1,10 @@
-//! Flies the oracle through an evaluation suite: what a policy that knows where it is, and where the openings are, makes of the same episodes.
+//! Flies the oracle through an evaluation suite: what a policy that knows where it is, and where
+//! the openings are, makes of the same episodes.
 //!
-//! `cargo run --release -p skein-simulator --example oracle_suite [suite] [episodes]` (configs/evaluations/generalist.toml, and as many episodes as it says, by default).
-//! A policy's distance from it is what the policy could learn; the oracle's own distance from 100 % is the drone's, or its simple rule's. Depth noise does
-//! nothing to it, for it does not look.
+//! `cargo run --release -p skein-simulator --example oracle_suite [suite] [episodes]`
+//! (configs/evaluations/generalist.toml, and as many episodes as it says, by default). A policy's
+//! distance from it is what the policy could learn; the oracle's own distance from 100 % is the
+//! drone's, or its simple rule's. Depth noise does nothing to it, for it does not look.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -16,9 +18,13 @@ use skein_simulator::suite::{Suite, SuiteEntry};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args().skip(1);
-    let shipped = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/evaluations/generalist.toml");
+    let shipped =
+        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/evaluations/generalist.toml");
     let suite = Suite::load(arguments.next().map_or_else(shipped, PathBuf::from))?;
-    let episodes: Option<u64> = arguments.next().map(|argument| argument.parse()).transpose()?;
+    let episodes: Option<u64> = arguments
+        .next()
+        .map(|argument| argument.parse())
+        .transpose()?;
     println!(
         "{:<34} {:>7} {:>9} {:>7}  hit wall, hit corridor, timed out",
         "entry", "episodes", "completed", "R"

@@ -9,7 +9,9 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
-use skein_simulator::camera::{CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use skein_simulator::camera::{
+    CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH,
+};
 use skein_simulator::course::Course;
 
 /// Metres before a wall from which it is looked at.
@@ -25,7 +27,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut camera = DepthCamera::new(&CameraSettings::default(), &course)?;
     let mut image = [0; IMAGE_PIXELS];
     for wall in course.walls() {
-        let middle = Translation3::new(wall.x_m() - BEFORE_M, 0.0, course.corridor().height_m / 2.0);
+        let middle =
+            Translation3::new(wall.x_m() - BEFORE_M, 0.0, course.corridor().height_m / 2.0);
         let poses = [
             ("level", UnitQuaternion::identity()),
             // As an AirSim quadrotor leans when it moves sideways at full command.
@@ -42,7 +45,8 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 fn write_png(path: &Path, image: &[u8]) -> Result<(), Box<dyn Error>> {
-    let mut encoder = png::Encoder::new(File::create(path)?, IMAGE_WIDTH as u32, IMAGE_HEIGHT as u32);
+    let mut encoder =
+        png::Encoder::new(File::create(path)?, IMAGE_WIDTH as u32, IMAGE_HEIGHT as u32);
     encoder.set_color(png::ColorType::Grayscale);
     encoder.set_depth(png::BitDepth::Eight);
     encoder.write_header()?.write_image_data(image)?;

@@ -1,10 +1,11 @@
 //! The walled corridor, the quadrotor that flies it, and the depth camera it sees by.
 //!
-//! Usable alone: nothing here knows of actors, learners or transports. All is `f32` and deterministic: the same course, settings,
-//! start and actions give the same episode, bit for bit, on one machine type.
+//! Usable alone: nothing here knows of actors, learners or transports. All is `f32` and
+//! deterministic: the same course, settings, start and actions give the same episode, bit for bit,
+//! on one machine type.
 //!
-//! World frame: x forward along the corridor, y to the left, z up. Body frame: x forward, y left, z up. Metres, seconds,
-//! radians, unless a name says otherwise.
+//! World frame: x forward along the corridor, y to the left, z up. Body frame: x forward, y left, z
+//! up. Metres, seconds, radians, unless a name says otherwise.
 
 pub mod camera;
 pub mod course;

@@ -1,4 +1,5 @@
-//! A policy that sees the course itself instead of the depth image: proof that a course can be flown by a given drone.
+//! A policy that sees the course itself instead of the depth image: proof that a course can be
+//! flown by a given drone.
 
 use crate::course::{Course, Wall};
 use crate::simulator::walls_ahead;
@@ -7,10 +8,12 @@ use crate::vehicle::VehicleState;
 /// Velocity asked for per metre of distance to the safe point, 1/s.
 const APPROACH_PER_SEC: f32 = 0.8;
 
-/// Share of the present velocity taken off the one asked for, so that a sluggish drone does not overshoot.
+/// Share of the present velocity taken off the one asked for, so that a sluggish drone does not
+/// overshoot.
 const DAMPING: f32 = 0.5;
 
-/// Flies to the next opening's safe point, and behind the last one to the middle of the corridor, where gusts find the least to blow it into.
+/// Flies to the next opening's safe point, and behind the last one to the middle of the corridor,
+/// where gusts find the least to blow it into.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Oracle;
 
@@ -19,9 +22,12 @@ impl Oracle {
     #[must_use]
     pub fn act(course: &Course, state: &VehicleState) -> [f32; 2] {
         let middle = [0.0, course.corridor().height_m / 2.0];
-        let [y_m, z_m] = walls_ahead(course, state).next().map_or(middle, Wall::safe_point);
-        let steer =
-            |error_m: f32, velocity_mps: f32| (APPROACH_PER_SEC * error_m - DAMPING * velocity_mps).clamp(-1.0, 1.0);
+        let [y_m, z_m] = walls_ahead(course, state)
+            .next()
+            .map_or(middle, Wall::safe_point);
+        let steer = |error_m: f32, velocity_mps: f32| {
+            (APPROACH_PER_SEC * error_m - DAMPING * velocity_mps).clamp(-1.0, 1.0)
+        };
         let velocity = state.heading_velocity_mps();
         [
             steer(y_m - state.position_m.y, velocity.y),
@@ -44,14 +50,22 @@ mod tests {
     use crate::simulator::{Outcome, Simulator, SimulatorSettings};
     use crate::vehicle::{Preset, VehicleSettings};
 
-    /// Per course and drone, spread over the levels; `examples/oracle_episode.rs` flies a hundred from each.
+    /// Per course and drone, spread over the levels; `examples/oracle_episode.rs` flies a hundred
+    /// from each.
     const EPISODES: u64 = 10;
 
     #[test]
     fn every_shipped_course_can_be_flown_from_every_level_with_every_drone() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
-        let files: Vec<_> = folder.read_dir().unwrap().map(|entry| entry.unwrap().path()).collect();
-        assert!(files.len() >= 4, "the shipped courses are missing: {files:?}");
+        let files: Vec<_> = folder
+            .read_dir()
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+            .collect();
+        assert!(
+            files.len() >= 4,
+            "the shipped courses are missing: {files:?}"
+        );
         for file in files {
             let course = Arc::new(Course::load(&file).unwrap());
             for preset in [Preset::Airsim, Preset::Hummingbird, Preset::Point] {
@@ -108,7 +122,11 @@ mod tests {
         let course = test_course();
         let wall = &course.walls()[0];
         let [y_m, z_m] = wall.safe_point();
-        let inside = VehicleState::at_rest(Point3::new(wall.x_m() + course.wall_thickness_m() + 0.5, y_m, z_m));
+        let inside = VehicleState::at_rest(Point3::new(
+            wall.x_m() + course.wall_thickness_m() + 0.5,
+            y_m,
+            z_m,
+        ));
         assert_eq!(Oracle::act(&course, &inside), [0.0, 0.0]);
     }
 }

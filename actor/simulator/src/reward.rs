@@ -1,6 +1,8 @@
-//! The paper's reward: a penalty for colliding, bonuses for passing a wall and for arriving, and one for looking into free space.
+//! The paper's reward: a penalty for colliding, bonuses for passing a wall and for arriving, and
+//! one for looking into free space.
 //!
-//! Its Table 1, which holds the numbers, is lost; the defaults are of our choosing and were enough to learn the task.
+//! Its Table 1, which holds the numbers, is lost; the defaults are of our choosing and were enough
+//! to learn the task.
 
 use serde::{Deserialize, Serialize};
 
@@ -87,7 +89,11 @@ impl RewardTerms {
     /// Terms of the step that `report` tells of and after which the camera saw `image_after`.
     ///
     /// Source: Xue & Gonsalves 2021, section on the reward function.
-    pub fn of(settings: &RewardSettings, report: &StepReport, image_after: &[u8; IMAGE_PIXELS]) -> Self {
+    pub fn of(
+        settings: &RewardSettings,
+        report: &StepReport,
+        image_after: &[u8; IMAGE_PIXELS],
+    ) -> Self {
         let mut terms = Self {
             action: settings.action_scale * centre_minus_whole(image_after),
             ..Self::default()
@@ -146,7 +152,10 @@ mod tests {
                 ..RewardSettings::default()
             };
             let refusal = settings.validate().unwrap_err().to_string();
-            assert!(refusal.contains("[simulator.reward] collision ="), "{refusal}");
+            assert!(
+                refusal.contains("[simulator.reward] collision ="),
+                "{refusal}"
+            );
         }
         assert_eq!(RewardSettings::default().validate(), Ok(()));
     }
@@ -157,7 +166,11 @@ mod tests {
         for row in 28..44 {
             image[row * IMAGE_WIDTH + 56..row * IMAGE_WIDTH + 72].fill(255);
         }
-        let terms = RewardTerms::of(&RewardSettings::default(), &report(LevelUp::No, None), &image);
+        let terms = RewardTerms::of(
+            &RewardSettings::default(),
+            &report(LevelUp::No, None),
+            &image,
+        );
         // 256 of 9216 pixels are 1, the rest 0.2: mean 0.2 + 0.8 / 36.
         assert!((terms.action - (1.0 - (0.2 + 0.8 / 36.0))).abs() < 1e-6);
         assert_eq!(terms.total(), terms.action);
@@ -185,7 +198,10 @@ mod tests {
             &report(LevelUp::Yes, Some(Outcome::Collided)),
             &[0; IMAGE_PIXELS],
         );
-        assert_eq!((terms.collision, terms.level_up, terms.destination), (-3.0, 2.0, 0.0));
+        assert_eq!(
+            (terms.collision, terms.level_up, terms.destination),
+            (-3.0, 2.0, 0.0)
+        );
         assert_eq!(terms.total(), -1.0);
     }
 

@@ -1,9 +1,10 @@
 //! The rigid body among the course's surfaces: rapier integrates it, parry says what it touches.
 //!
-//! Any contact ends an episode, so contact forces never act and rapier's solver has nothing to solve: the course is not in
-//! rapier's world at all. After each step the body's cuboid is tested, exactly, against the triangles that the depth camera
-//! also draws; a bounding-volume tree makes that some 0.1 µs when nothing is near. The body moves centimetres a step and is
-//! longer than that in every direction it can move, so it cannot pass a surface between two tests.
+//! Any contact ends an episode, so contact forces never act and rapier's solver has nothing to
+//! solve: the course is not in rapier's world at all. After each step the body's cuboid is tested,
+//! exactly, against the triangles that the depth camera also draws; a bounding-volume tree makes
+//! that some 0.1 µs when nothing is near. The body moves centimetres a step and is longer than that
+//! in every direction it can move, so it cannot pass a surface between two tests.
 //!
 //! rapier and parry speak glam, the rest of this crate nalgebra: they meet here and nowhere else.
 
@@ -45,7 +46,11 @@ impl World {
     ///
     /// # Errors
     /// parry's reason if the course's surfaces make no triangle mesh.
-    pub(crate) fn new(course: &Course, properties: BodyProperties, dt_secs: f32) -> Result<Self, TriMeshBuilderError> {
+    pub(crate) fn new(
+        course: &Course,
+        properties: BodyProperties,
+        dt_secs: f32,
+    ) -> Result<Self, TriMeshBuilderError> {
         let (physics, body) = pristine_physics(&properties, dt_secs, &Point3::origin());
         Ok(Self {
             obstacles: triangles(&course.mesh(), |kind| kind != SurfaceKind::EndWall)?,
@@ -59,15 +64,17 @@ impl World {
         })
     }
 
-    /// Puts the body at rest at `position_m`, `mass_factor` times as heavy as it nominally is. Physics is rebuilt, so that nothing of an earlier episode
-    /// remains in rapier's caches: an episode is a function of its start and actions alone.
+    /// Puts the body at rest at `position_m`, `mass_factor` times as heavy as it nominally is.
+    /// Physics is rebuilt, so that nothing of an earlier episode remains in rapier's caches: an
+    /// episode is a function of its start and actions alone.
     pub(crate) fn reset(&mut self, position_m: &Point3<f32>, mass_factor: f32) {
         let body = self.nominal.scaled(mass_factor);
         self.mass_kg = body.mass_kg;
         (self.physics, self.body) = pristine_physics(&body, self.dt_secs, position_m);
     }
 
-    /// Integrates one physics step, in which `gust_n` pushes the body as well (world frame, N). A state that is no longer finite shows in [`World::is_quarantined`].
+    /// Integrates one physics step, in which `gust_n` pushes the body as well (world frame, N). A
+    /// state that is no longer finite shows in [`World::is_quarantined`].
     pub(crate) fn advance(&mut self, actuation: &Actuation, gust_n: Option<Vector3<f32>>) {
         let body = &mut self.physics.bodies[self.body];
         match actuation {
@@ -90,8 +97,9 @@ impl World {
     pub(crate) fn state(&self) -> VehicleState {
         let body = &self.physics.bodies[self.body];
         let rotation = body.rotation();
-        let world_from_body =
-            UnitQuaternion::from_quaternion(Quaternion::new(rotation.w, rotation.x, rotation.y, rotation.z));
+        let world_from_body = UnitQuaternion::from_quaternion(Quaternion::new(
+            rotation.w, rotation.x, rotation.y, rotation.z,
+        ));
         VehicleState {
             position_m: Point3::from(nalgebra(body.translation())),
             world_from_body,
@@ -105,7 +113,8 @@ impl World {
         self.physics.bodies[self.body].translation().x
     }
 
-    /// `true` once rapier has met a pose or velocity that is not finite in the last step and has switched the body off.
+    /// `true` once rapier has met a pose or velocity that is not finite in the last step and has
+    /// switched the body off.
     pub(crate) fn is_quarantined(&self) -> bool {
         !self.physics.quarantine().is_empty()
     }
@@ -114,7 +123,8 @@ impl World {
     pub(crate) fn touched_wall(&self, course: &Course) -> Option<usize> {
         let mesh = course.mesh();
         (0..course.walls().len()).find(|&place| {
-            triangles(&mesh, |kind| kind == SurfaceKind::Wall(place)).is_ok_and(|wall| self.touches(&wall))
+            triangles(&mesh, |kind| kind == SurfaceKind::Wall(place))
+                .is_ok_and(|wall| self.touches(&wall))
         })
     }
 
@@ -122,7 +132,8 @@ impl World {
     pub(crate) fn contact(&self) -> Contact {
         let world_from_body = self.physics.bodies[self.body].position();
         let touches_obstacle = self.touches(&self.obstacles);
-        // The end wall fills the whole section: a body that touches nothing else meets it as it would meet a plane.
+        // The end wall fills the whole section: a body that touches nothing else meets it as it
+        // would meet a plane.
         let past_end_wall = self.body_shape.compute_aabb(world_from_body).maxs.x >= self.end_wall_m;
         if touches_obstacle {
             Contact::Obstacle
@@ -154,7 +165,11 @@ fn pristine_physics(
     physics.integration_parameters.dt = dt_secs;
     // Solver iterations are for contacts and joints, of which there are none.
     physics.integration_parameters.num_solver_iterations = 1;
-    let mass = MassProperties::new(Vector::ZERO, properties.mass_kg, glam(&properties.inertia_kgm2));
+    let mass = MassProperties::new(
+        Vector::ZERO,
+        properties.mass_kg,
+        glam(&properties.inertia_kgm2),
+    );
     let body = RigidBodyBuilder::dynamic()
         .translation(glam(&position_m.coords))
         .additional_mass_properties(mass)
@@ -165,8 +180,15 @@ fn pristine_physics(
 }
 
 /// The surfaces of some kinds, as triangles.
-fn triangles(mesh: &Mesh, wanted: impl Fn(SurfaceKind) -> bool) -> Result<TriMesh, TriMeshBuilderError> {
-    let vertices = mesh.vertices.iter().map(|vertex| glam(&vertex.coords)).collect();
+fn triangles(
+    mesh: &Mesh,
+    wanted: impl Fn(SurfaceKind) -> bool,
+) -> Result<TriMesh, TriMeshBuilderError> {
+    let vertices = mesh
+        .vertices
+        .iter()
+        .map(|vertex| glam(&vertex.coords))
+        .collect();
     let triangles = mesh
         .triangles()
         .into_iter()
@@ -212,7 +234,11 @@ mod tests {
         let mut world = world_at(Point3::new(5.0, 0.0, 6.0));
         push(&mut world, Vector3::zeros(), Vector3::zeros(), 1.0);
         let state = world.state();
-        assert!((state.velocity_mps.z + 9.81).abs() < 1e-3, "{}", state.velocity_mps);
+        assert!(
+            (state.velocity_mps.z + 9.81).abs() < 1e-3,
+            "{}",
+            state.velocity_mps
+        );
         // Half a step's length more than g/2, for velocity is stepped before position.
         assert!(
             (state.position_m.z - (6.0 - 4.905)).abs() < 0.03,
@@ -223,9 +249,18 @@ mod tests {
 
     #[test]
     fn force_and_torque_act_through_mass_and_inertia() {
-        for (axis, rate_radps) in [(Vector3::x(), 1.0), (Vector3::y(), 0.5), (Vector3::z(), 0.25)] {
+        for (axis, rate_radps) in [
+            (Vector3::x(), 1.0),
+            (Vector3::y(), 0.5),
+            (Vector3::z(), 0.25),
+        ] {
             let mut world = world_at(Point3::new(5.0, 0.0, 3.5));
-            push(&mut world, Vector3::new(1.0, 0.0, 2.0 * 9.81), axis * 0.1, 0.1);
+            push(
+                &mut world,
+                Vector3::new(1.0, 0.0, 2.0 * 9.81),
+                axis * 0.1,
+                0.1,
+            );
             let state = world.state();
             assert!(
                 (state.velocity_mps - Vector3::new(0.05, 0.0, 0.0)).norm() < 1e-4,
@@ -242,7 +277,8 @@ mod tests {
 
     #[test]
     fn contact_begins_where_surfaces_meet() {
-        // The corridor's left side is at y = 3, its floor at z = 0, the body 0.4 m and 0.1 m to each side.
+        // The corridor's left side is at y = 3, its floor at z = 0, the body 0.4 m and 0.1 m to
+        // each side.
         for (y_m, z_m, contact) in [
             (2.599, 3.5, Contact::Nothing),
             (2.601, 3.5, Contact::Obstacle),
@@ -262,16 +298,30 @@ mod tests {
         let mut world = world_at(Point3::new(5.0, 0.0, 0.15));
         assert_eq!(world.contact(), Contact::Nothing);
         // Pitched by some 0.25 rad, its corners hang 0.5 m · sin(0.25) below the middle and more.
-        push(&mut world, Vector3::z() * 2.0 * 9.81, Vector3::y() * 0.1, 0.32);
+        push(
+            &mut world,
+            Vector3::z() * 2.0 * 9.81,
+            Vector3::y() * 0.1,
+            0.32,
+        );
         assert!((world.state().position_m.z - 0.15).abs() < 1e-3);
         assert_eq!(world.contact(), Contact::Obstacle);
     }
 
     #[test]
     fn end_wall_is_reached_by_the_nose_but_not_along_a_side() {
-        assert_eq!(world_at(Point3::new(59.499, 0.0, 3.5)).contact(), Contact::Nothing);
-        assert_eq!(world_at(Point3::new(59.501, 0.0, 3.5)).contact(), Contact::EndWall);
-        assert_eq!(world_at(Point3::new(59.501, 2.7, 3.5)).contact(), Contact::Obstacle);
+        assert_eq!(
+            world_at(Point3::new(59.499, 0.0, 3.5)).contact(),
+            Contact::Nothing
+        );
+        assert_eq!(
+            world_at(Point3::new(59.501, 0.0, 3.5)).contact(),
+            Contact::EndWall
+        );
+        assert_eq!(
+            world_at(Point3::new(59.501, 2.7, 3.5)).contact(),
+            Contact::Obstacle
+        );
     }
 
     #[test]
@@ -280,7 +330,10 @@ mod tests {
         let wall = &course.walls()[0];
         let [y_m, z_m] = wall.safe_point();
         let mid_wall_m = wall.x_m() + course.wall_thickness_m() / 2.0;
-        assert_eq!(world_at(Point3::new(mid_wall_m, y_m, z_m)).contact(), Contact::Nothing);
+        assert_eq!(
+            world_at(Point3::new(mid_wall_m, y_m, z_m)).contact(),
+            Contact::Nothing
+        );
         let beside_m = y_m + wall.clearance_m();
         let beside = world_at(Point3::new(mid_wall_m, beside_m, z_m));
         assert_eq!(beside.contact(), Contact::Obstacle);
@@ -298,7 +351,12 @@ mod tests {
     fn twice_the_mass_is_moved_half_as_far_and_falls_alike() {
         let mut world = World::new(&test_course(), PROPERTIES, 0.005).unwrap();
         world.reset(&Point3::new(5.0, 0.0, 6.0), 2.0);
-        push(&mut world, Vector3::new(1.0, 0.0, 0.0), Vector3::x() * 0.1, 0.1);
+        push(
+            &mut world,
+            Vector3::new(1.0, 0.0, 0.0),
+            Vector3::x() * 0.1,
+            0.1,
+        );
         let state = world.state();
         let expected_mps = Vector3::new(0.025, 0.0, -0.981);
         assert!(

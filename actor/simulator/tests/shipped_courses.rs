@@ -35,7 +35,12 @@ fn rearranged_courses_hold_the_walls_of_training() {
                 .iter()
                 .find(|other| other.label() == wall.label())
                 .unwrap();
-            assert_eq!(wall.opening(), same.opening(), "{name}: wall {}", wall.label());
+            assert_eq!(
+                wall.opening(),
+                same.opening(),
+                "{name}: wall {}",
+                wall.label()
+            );
         }
     }
 }

@@ -21,29 +21,36 @@ use skein_simulator::suite::{EntryCourses, MOST_EPISODES, Suite, SuiteEntry};
 
 /// Flies a trained snapshot through courses and prints how it fares.
 ///
-/// Every episode takes off from the start of level 1 and follows the policy without noise. The episodes are the same each time, whatever the number of threads:
-/// their seeds derive from the seed of the run that trained the snapshot, whose configuration lies in the snapshot file.
+/// Every episode takes off from the start of level 1 and follows the policy without noise. The
+/// episodes are the same each time, whatever the number of threads: their seeds derive from the
+/// seed of the run that trained the snapshot, whose configuration lies in the snapshot file.
 ///
-/// R is the average rate of walls passed, (t_1 + … + t_n) / (n · episodes), where t_i counts the episodes that passed wall i. Beside it stands what the other episodes
-/// failed by: which wall they hit, or before which one they hit the corridor or ran out of steps. Walls are counted in the order in which they are met.
+/// R is the average rate of walls passed, (t_1 + … + t_n) / (n · episodes), where t_i counts the
+/// episodes that passed wall i. Beside it stands what the other episodes failed by: which wall they
+/// hit, or before which one they hit the corridor or ran out of steps. Walls are counted in the
+/// order in which they are met.
 #[derive(Parser)]
 #[command(version, after_long_help = columns_help())]
 struct Arguments {
     #[command(flatten)]
     subject: Subject,
-    /// A course file to fly, once for each course. By default the evaluation courses of the run that trained the snapshot.
+    /// A course file to fly, once for each course. By default the evaluation courses of the run
+    /// that trained the snapshot.
     #[arg(long, value_name = "FILE")]
     course: Vec<PathBuf>,
-    /// A suite file to fly instead: courses, all orders of a course's walls, generated courses, each with disturbances of its own; as configs/evaluations/generalist.toml.
+    /// A suite file to fly instead: courses, all orders of a course's walls, generated courses,
+    /// each with disturbances of its own; as configs/evaluations/generalist.toml.
     #[arg(long, value_name = "FILE", conflicts_with = "course")]
     suite: Option<PathBuf>,
-    /// Episodes per course, or of each entry of the suite. By default evaluation.episodes of that run, or what the suite says.
+    /// Episodes per course, or of each entry of the suite. By default evaluation.episodes of that
+    /// run, or what the suite says.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=MOST_EPISODES))]
     episodes: Option<u64>,
     /// Also write the result to this file, as JSON.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Also write every step of every episode to this file, as .npz; takes 9.3 KiB of memory for each step, about 1 MiB for each whole episode.
+    /// Also write every step of every episode to this file, as .npz; takes 9.3 KiB of memory for
+    /// each step, about 1 MiB for each whole episode.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     // Not a doc comment: those cannot name the constant.
@@ -55,7 +62,8 @@ struct Arguments {
 #[derive(Args)]
 #[group(required = true, multiple = false)]
 struct Subject {
-    /// Directory of a run: its best snapshot is flown, or the latest where none has been confirmed as best.
+    /// Directory of a run: its best snapshot is flown, or the latest where none has been confirmed
+    /// as best.
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
     /// A snapshot file (.safetensors).
@@ -104,7 +112,10 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "snapshot {} of {}: {}, {} threads",
         snapshot.version,
         path.display(),
-        what_is_flown(&courses, arguments.suite.as_ref().map_or("courses", |_| "entries")),
+        what_is_flown(
+            &courses,
+            arguments.suite.as_ref().map_or("courses", |_| "entries")
+        ),
         evaluation.threads()
     );
     eprintln!(
@@ -120,17 +131,22 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
     println!("{}", evaluated.report);
     if let Some(file) = &arguments.json {
-        let json = serde_json::to_string_pretty(&evaluated.report).context("the result is no JSON")?;
+        let json =
+            serde_json::to_string_pretty(&evaluated.report).context("the result is no JSON")?;
         fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))?;
     }
     if let Some(file) = &arguments.record {
-        let names: Vec<_> = courses.evaluation().map(|entry| entry.name.as_str()).collect();
+        let names: Vec<_> = courses
+            .evaluation()
+            .map(|entry| entry.name.as_str())
+            .collect();
         write_recording(file, &names, config.vae.latent, &evaluated.episodes)?;
     }
     Ok(())
 }
 
-/// Minutes of flying must not end in a file that cannot be written. Leaves nothing behind and an existing file as it is.
+/// Minutes of flying must not end in a file that cannot be written. Leaves nothing behind and an
+/// existing file as it is.
 fn check_writable(file: &Path) -> anyhow::Result<()> {
     check_folder(file)?;
     let cannot_write = || format!("cannot write {}", file.display());
@@ -174,7 +190,8 @@ fn snapshot_path(subject: &Subject) -> anyhow::Result<PathBuf> {
             .context("neither --run nor --snapshot is given");
     };
     let directory = RunDirectory::new(run);
-    // Of a run that has an identity, it can be told whether its courses are those that it was trained and evaluated on.
+    // Of a run that has an identity, it can be told whether its courses are those that it was
+    // trained and evaluated on.
     if directory.identity().is_file() {
         directory.open()?;
     }
@@ -217,7 +234,8 @@ fn what_is_flown(courses: &Courses, entries: &str) -> String {
     }
 }
 
-/// A line for each entry that generates shapes which the snapshot was trained on: what it measures is not what an agent makes of new shapes.
+/// A line for each entry that generates shapes which the snapshot was trained on: what it measures
+/// is not what an agent makes of new shapes.
 fn shapes_trained_on(config: &Config, courses: &Courses) -> Vec<String> {
     let trained = &courses.settings().generator.shapes;
     let known = |entry: &SuiteEntry| match &entry.courses {
@@ -241,9 +259,11 @@ fn shapes_trained_on(config: &Config, courses: &Courses) -> Vec<String> {
         .collect()
 }
 
-/// The evaluation courses of the run that trained the snapshot: in the run's directory, wherever that has moved.
+/// The evaluation courses of the run that trained the snapshot: in the run's directory, wherever
+/// that has moved.
 fn evaluation_courses(config: &Config, snapshot: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let snapshot = std::path::absolute(snapshot).with_context(|| format!("{}", snapshot.display()))?;
+    let snapshot =
+        std::path::absolute(snapshot).with_context(|| format!("{}", snapshot.display()))?;
     // DIR/snapshots/best.safetensors, beside DIR/courses/.
     let folder = RunDirectory::new(snapshot.ancestors().nth(2).unwrap_or(Path::new("/"))).courses();
     let find = |path: &PathBuf| {
@@ -259,7 +279,9 @@ fn evaluation_courses(config: &Config, snapshot: &Path) -> anyhow::Result<Vec<Pa
 }
 
 fn threads_help() -> String {
-    format!("Most threads to fly on, at most {MAX_THREADS} and one an episode. By default one a core")
+    format!(
+        "Most threads to fly on, at most {MAX_THREADS} and one an episode. By default one a core"
+    )
 }
 
 /// The arrays of a recording, for the long help.

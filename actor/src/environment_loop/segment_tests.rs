@@ -3,7 +3,9 @@
 use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion};
 use skein_protocol::ticket::{CourseChoice, Exploration};
 
-use super::tests::{ACTOR, INCARNATION, STORMY, Tape, environment_loop, flown, fly, network, raw, ticket};
+use super::tests::{
+    ACTOR, INCARNATION, STORMY, Tape, environment_loop, flown, fly, network, raw, ticket,
+};
 use super::*;
 
 /// `ticket` for the `steps` that follow `flown`.
@@ -17,13 +19,15 @@ fn segment(ticket: &Ticket, steps: u32, flown: &[[f32; ACTION]]) -> Ticket {
     }
 }
 
-/// Flies `ticket` in segments of `steps`, each with what `fly` makes of it; the records without the segments' ends, and those apart.
+/// Flies `ticket` in segments of `steps`, each with what `fly` makes of it; the records without the
+/// segments' ends, and those apart.
 fn flown_in_segments(
     ticket: &Ticket,
     steps: u32,
     mut fly: impl FnMut(&Ticket) -> (Option<EpisodeScore>, Tape),
 ) -> (Vec<Box<TransitionRecord>>, Vec<Box<TransitionRecord>>) {
-    let (mut records, mut ends, mut flown): (Vec<Box<TransitionRecord>>, Vec<_>, Vec<_>) = Default::default();
+    let (mut records, mut ends, mut flown): (Vec<Box<TransitionRecord>>, Vec<_>, Vec<_>) =
+        Default::default();
     loop {
         let segment = segment(ticket, steps, &flown);
         let (score, mut tape) = fly(&segment);
@@ -61,7 +65,8 @@ fn an_episode_in_segments_without_noise_is_the_episode_flown_whole() {
             let mut used = environment_loop(simulator);
             let (_, whole) = flown(&mut used, &ticket);
             for steps in [1, 3, 200] {
-                let (records, ends) = flown_in_segments(&ticket, steps, |segment| fly(&mut used, segment));
+                let (records, ends) =
+                    flown_in_segments(&ticket, steps, |segment| fly(&mut used, segment));
                 assert!(raw(&records) == raw(&whole.sent), "in segments of {steps}");
                 // What a segment ends with is what the next one begins with.
                 for (end, next) in ends
@@ -69,7 +74,12 @@ fn an_episode_in_segments_without_noise_is_the_episode_flown_whole() {
                     .zip(records.iter().skip(steps as usize).step_by(steps as usize))
                 {
                     let seen = |record: &TransitionRecord| {
-                        (record.position_m, record.velocity_mps, record.latent, record.depth)
+                        (
+                            record.position_m,
+                            record.velocity_mps,
+                            record.latent,
+                            record.depth,
+                        )
                     };
                     assert!(seen(end) == seen(next));
                     assert_eq!(end.action, [0.0; ACTION]);
@@ -87,9 +97,11 @@ fn a_segment_is_the_same_whoever_flew_what_came_before() {
             let mut one = environment_loop(simulator);
             let (alone, _) = flown_in_segments(&ticket, 2, |segment| fly(&mut one, segment));
             assert!(alone.len() > 6, "too short to compare anything");
-            // Each segment by a environment_loop that has flown nothing, or something else meanwhile.
-            let (strangers, _) =
-                flown_in_segments(&ticket, 2, |segment| fly(&mut environment_loop(simulator), segment));
+            // Each segment by a environment_loop that has flown nothing, or something else
+            // meanwhile.
+            let (strangers, _) = flown_in_segments(&ticket, 2, |segment| {
+                fly(&mut environment_loop(simulator), segment)
+            });
             assert!(raw(&strangers) == raw(&alone));
             let (distracted, _) = flown_in_segments(&ticket, 2, |next| {
                 let other = Ticket {
@@ -101,7 +113,10 @@ fn a_segment_is_the_same_whoever_flew_what_came_before() {
             });
             assert!(raw(&distracted) == raw(&alone));
             let (longer, _) = flown_in_segments(&ticket, 3, |segment| fly(&mut one, segment));
-            assert!(raw(&longer) != raw(&alone), "the noise of each segment is its own");
+            assert!(
+                raw(&longer) != raw(&alone),
+                "the noise of each segment is its own"
+            );
         }
     }
 }
@@ -114,7 +129,8 @@ fn an_environment_loop_flies_on_from_where_it_is_and_from_nowhere_else() {
     let flown: Vec<_> = tape.sent[..2].iter().map(|record| record.action).collect();
     let flies_on = |environment_loop: &EnvironmentLoop, ticket: &Ticket| {
         let under_way = environment_loop.under_way.as_ref();
-        under_way.is_some_and(|under_way| under_way.is_before(ticket, ticket.segment.as_ref().unwrap()))
+        under_way
+            .is_some_and(|under_way| under_way.is_before(ticket, ticket.segment.as_ref().unwrap()))
     };
     let next = segment(&ticket, 5, &flown);
     let again = Ticket {
@@ -124,7 +140,10 @@ fn an_environment_loop_flies_on_from_where_it_is_and_from_nowhere_else() {
         ..next.clone()
     };
     assert!(flies_on(&environment_loop, &next) && flies_on(&environment_loop, &again));
-    let nearly = [flown[0], [flown[1][0], f32::from_bits(flown[1][1].to_bits() ^ 1)]];
+    let nearly = [
+        flown[0],
+        [flown[1][0], f32::from_bits(flown[1][1].to_bits() ^ 1)],
+    ];
     for elsewhere in [
         segment(&ticket, 5, &flown[..1]),
         segment(&ticket, 5, &nearly),

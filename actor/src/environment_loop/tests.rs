@@ -42,7 +42,9 @@ impl RecordLink for Tape {
     }
 
     fn directive(&mut self) -> Result<Directive, Self::Error> {
-        let enough = self.abandon_after.is_some_and(|steps| self.sent.len() >= steps);
+        let enough = self
+            .abandon_after
+            .is_some_and(|steps| self.sent.len() >= steps);
         Ok(if enough {
             Directive::Abandon
         } else {
@@ -83,8 +85,7 @@ pub(super) fn environment_loop(simulator: &str) -> EnvironmentLoop {
 }
 
 /// Everything that may disturb an episode.
-pub(super) const STORMY: &str =
-    "disturbances = { mass_spread = 0.2, latency_periods = 1, gust.force_rms_n = 0.15, depth.model = \"stereo\" }";
+pub(super) const STORMY: &str = "disturbances = { mass_spread = 0.2, latency_periods = 1, gust.force_rms_n = 0.15, depth.model = \"stereo\" }";
 
 pub(super) fn network(change: impl Fn(&mut [f32])) -> Network {
     let layout = SnapshotLayout::new(&view(), 16);
@@ -93,14 +94,22 @@ pub(super) fn network(change: impl Fn(&mut [f32])) -> Network {
     Network::new(&snapshot, &layout, Precision::F32)
 }
 
-pub(super) fn flown(environment_loop: &mut EnvironmentLoop, ticket: &Ticket) -> (EpisodeScore, Tape) {
+pub(super) fn flown(
+    environment_loop: &mut EnvironmentLoop,
+    ticket: &Ticket,
+) -> (EpisodeScore, Tape) {
     let (score, tape) = fly(environment_loop, ticket);
     (score.expect("the episode is flown whole"), tape)
 }
 
-pub(super) fn fly(environment_loop: &mut EnvironmentLoop, ticket: &Ticket) -> (Option<EpisodeScore>, Tape) {
+pub(super) fn fly(
+    environment_loop: &mut EnvironmentLoop,
+    ticket: &Ticket,
+) -> (Option<EpisodeScore>, Tape) {
     let mut tape = Tape::default();
-    let score = environment_loop.fly(ticket, &network(|_| {}), &mut tape).unwrap();
+    let score = environment_loop
+        .fly(ticket, &network(|_| {}), &mut tape)
+        .unwrap();
     (score, tape)
 }
 
@@ -109,7 +118,10 @@ fn bytes(tape: &Tape) -> Vec<&[u8]> {
 }
 
 pub(super) fn raw(records: &[Box<TransitionRecord>]) -> Vec<&[u8]> {
-    records.iter().map(|record| bytemuck::bytes_of(&**record)).collect()
+    records
+        .iter()
+        .map(|record| bytemuck::bytes_of(&**record))
+        .collect()
 }
 
 #[test]
@@ -129,7 +141,12 @@ fn a_ticket_flown_again_is_the_same_episode_bit_for_bit() {
 
 #[test]
 fn how_actions_are_chosen_does_not_move_the_start() {
-    let start = |exploration| flown(&mut environment_loop(""), &ticket(exploration, 1)).1.sent[0].position_m;
+    let start = |exploration| {
+        flown(&mut environment_loop(""), &ticket(exploration, 1))
+            .1
+            .sent[0]
+            .position_m
+    };
     assert_eq!(start(Exploration::Uniform), start(Exploration::Mode));
     assert_eq!(start(Exploration::Uniform), start(Exploration::Sample));
 }
@@ -153,7 +170,10 @@ fn an_episode_is_its_steps_without_a_gap_and_one_closing_record() {
     assert_eq!(closing.course_walls, 5);
     assert_eq!(closing.hit_wall, score.hit_wall.unwrap_or(0));
     let ends = |record: &&TransitionRecord| record.terminated + record.truncated > 0;
-    assert!(steps.iter().rev().skip(1).all(|record| !ends(&&**record)) && ends(&&**steps.last().unwrap()));
+    assert!(
+        steps.iter().rev().skip(1).all(|record| !ends(&&**record))
+            && ends(&&**steps.last().unwrap())
+    );
     let sum: f64 = steps.iter().map(|record| f64::from(record.reward)).sum();
     assert_eq!(f64::from(sum as f32), score.episode_return);
 }
@@ -189,7 +209,10 @@ fn images_are_rendered_into_the_loaned_record_and_sent_from_there() {
 
 #[test]
 fn an_episode_cut_off_by_the_step_limit_is_truncated_and_not_terminated() {
-    let (score, tape) = flown(&mut environment_loop("max_steps = 3"), &ticket(Exploration::Mode, 1));
+    let (score, tape) = flown(
+        &mut environment_loop("max_steps = 3"),
+        &ticket(Exploration::Mode, 1),
+    );
     assert_eq!((score.outcome, tape.sent.len()), (Outcome::TimedOut, 4));
     assert_eq!((tape.sent[2].truncated, tape.sent[2].terminated), (1, 0));
 }
@@ -203,7 +226,11 @@ fn an_abandoned_episode_has_no_closing_record() {
     let end = environment_loop("").fly(&ticket(Exploration::Mode, 1), &network(|_| {}), &mut tape);
     assert!(matches!(end, Err(EpisodeError::Abandoned)));
     assert_eq!(tape.sent.len(), 2);
-    assert!(tape.sent.iter().all(|record| record.kind == RecordKind::Step.code()));
+    assert!(
+        tape.sent
+            .iter()
+            .all(|record| record.kind == RecordKind::Step.code())
+    );
 }
 
 #[test]
@@ -223,7 +250,10 @@ fn a_fault_ends_the_episode_with_a_record_that_says_so() {
         "{end:?}"
     );
     assert_eq!(
-        tape.sent.last().unwrap().check(&ticket, ACTOR, INCARNATION, 0),
+        tape.sent
+            .last()
+            .unwrap()
+            .check(&ticket, ACTOR, INCARNATION, 0),
         Ok(RecordKind::Failed)
     );
 }
@@ -267,7 +297,10 @@ fn a_disturbed_episode_is_a_function_of_its_ticket_too() {
     let (score, first) = flown(&mut used, &ticket(Exploration::Sample, 1));
     let (_, other) = flown(&mut used, &ticket(Exploration::Sample, 2));
     let (score_again, again) = flown(&mut used, &ticket(Exploration::Sample, 1));
-    let (_, elsewhere) = flown(&mut environment_loop(STORMY), &ticket(Exploration::Sample, 1));
+    let (_, elsewhere) = flown(
+        &mut environment_loop(STORMY),
+        &ticket(Exploration::Sample, 1),
+    );
     assert_eq!(score, score_again);
     assert_eq!(bytes(&first), bytes(&again));
     assert_eq!(bytes(&first), bytes(&elsewhere));
@@ -286,10 +319,18 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
         history_steps: vec![1, 3],
     };
     let layout = SnapshotLayout::new(&view, 16);
-    let network = Network::new(&random_snapshot(&layout, NETWORK.0), &layout, Precision::F32);
+    let network = Network::new(
+        &random_snapshot(&layout, NETWORK.0),
+        &layout,
+        Precision::F32,
+    );
     let courses = Arc::new(Courses::of_run(&config("")).unwrap());
-    let mut environment_loop =
-        EnvironmentLoop::new(ACTOR, INCARNATION, Simulators::new(courses), Agent::new(view.clone()));
+    let mut environment_loop = EnvironmentLoop::new(
+        ACTOR,
+        INCARNATION,
+        Simulators::new(courses),
+        Agent::new(view.clone()),
+    );
     // The second episode must not remember the first.
     for seed in [1, 2] {
         let mut tape = Tape::default();
@@ -311,7 +352,9 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
                     tape.sent[moment - 1].action
                 });
             }
-            let action = network.distribution(&observed, &mut Scratch::default()).mode();
+            let action = network
+                .distribution(&observed, &mut Scratch::default())
+                .mode();
             assert_eq!(record.action, action, "step {step}");
         }
     }
@@ -319,7 +362,8 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
 
 #[test]
 fn what_was_hit_is_in_the_closing_record() {
-    // A environment_loop that wants straight on hits the first wall; one that wants up, the ceiling.
+    // A environment_loop that wants straight on hits the first wall; one that wants up, the
+    // ceiling.
     let closing = |bias: f32| {
         let mut tape = Tape::default();
         let layout = SnapshotLayout::new(&view(), 16);
@@ -334,7 +378,10 @@ fn what_was_hit_is_in_the_closing_record() {
             start_level: 1,
             ..ticket(Exploration::Mode, 1)
         };
-        let score = environment_loop("").fly(&ticket, &steady, &mut tape).unwrap().unwrap();
+        let score = environment_loop("")
+            .fly(&ticket, &steady, &mut tape)
+            .unwrap()
+            .unwrap();
         let closing = tape.sent.pop().unwrap();
         assert_eq!((score.outcome, score.walls_passed), (Outcome::Collided, 0));
         (score.hit_wall, closing.hit_wall)

@@ -20,7 +20,8 @@ use crate::environment_loop::{Directive, RecordLink};
 use crate::weights::Weights;
 use skein_inference::Network;
 
-/// The actor's end of the line to the learner: hears tickets, snapshots and the stop, sends records and heartbeats.
+/// The actor's end of the line to the learner: hears tickets, snapshots and the stop, sends records
+/// and heartbeats.
 pub(super) struct LearnerLine<'a> {
     ports: ActorPorts,
     identity: &'a RunIdentity,
@@ -56,7 +57,8 @@ struct Limits {
 }
 
 impl<'a> LearnerLine<'a> {
-    /// A line over `ports`, for the present incarnation of `service`. It begins with nothing: what an earlier incarnation knew is not taken over.
+    /// A line over `ports`, for the present incarnation of `service`. It begins with nothing: what
+    /// an earlier incarnation knew is not taken over.
     pub(super) fn new(service: &Service<'a>, ports: ActorPorts) -> Self {
         let transport = &service.config.transport;
         Self {
@@ -150,7 +152,8 @@ impl<'a> LearnerLine<'a> {
         Ok(())
     }
 
-    /// Whether the learner that was joined is still the one that lives: a dead one falls silent too, but this is known at once.
+    /// Whether the learner that was joined is still the one that lives: a dead one falls silent
+    /// too, but this is known at once.
     fn look_at_learner(&mut self) {
         match self.identity.present_incarnation() {
             Ok(Some(present)) if present.incarnation == self.ports.incarnation() => {}
@@ -170,7 +173,8 @@ impl<'a> LearnerLine<'a> {
             Control::Stop => self.parting = Some(Parting::Leave(Ending::Stopped)),
             Control::Fly(ticket) => {
                 // An episode issued again replaces its earlier ticket.
-                self.tickets.retain(|queued| queued.ticket.episode != ticket.episode);
+                self.tickets
+                    .retain(|queued| queued.ticket.episode != ticket.episode);
                 if self.tickets.len() >= self.limits.tickets {
                     warn!(episode = %ticket.episode, limit = self.limits.tickets, "more tickets than agreed; the oldest is dropped");
                     self.tickets.pop_front();
@@ -196,16 +200,18 @@ impl<'a> LearnerLine<'a> {
         Some((ticket, network))
     }
 
-    /// Waits for the learner, not longer than until the next heartbeat. The learner is told first: it wakes actors only to what one that waits would miss.
+    /// Waits for the learner, not longer than until the next heartbeat. The learner is told first:
+    /// it wakes actors only to what one that waits would miss.
     pub(super) fn wait(&mut self) -> Result<(), ServiceError> {
         if !self.has_told_of_waiting {
             self.has_told_of_waiting = true;
             self.report(ActorState::Serving)?;
         }
-        if let Err(error) = self
-            .ports
-            .wait(self.limits.heartbeat.saturating_sub(self.last_said.elapsed()))
-        {
+        if let Err(error) = self.ports.wait(
+            self.limits
+                .heartbeat
+                .saturating_sub(self.last_said.elapsed()),
+        ) {
             // Anything lasting shows as silence, so there is no hurry.
             debug!(%error, "cannot wait for the learner");
             std::thread::sleep(Duration::from_millis(10));
@@ -230,7 +236,8 @@ impl<'a> LearnerLine<'a> {
             episodes_flown: self.episodes_flown,
             times: *self.timer.times(),
         };
-        self.ports.send_status(StatusRecord::new(self.ports.run(), &status))?;
+        self.ports
+            .send_status(StatusRecord::new(self.ports.run(), &status))?;
         self.ports.wake_learner()
     }
 }

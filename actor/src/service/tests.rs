@@ -110,7 +110,11 @@ impl Run {
 
     fn until_status(&self, what: &str, holds: impl Fn(&ActorStatus) -> bool) -> ActorStatus {
         self.until(what, || {
-            let status = self.learner().receive_status().unwrap()?.read(self.identity.run)?;
+            let status = self
+                .learner()
+                .receive_status()
+                .unwrap()?
+                .read(self.identity.run)?;
             holds(&status).then_some(status)
         })
     }
@@ -156,11 +160,19 @@ fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
             assert!(step > 3 && Outcome::from_code(record.outcome).is_some());
             break;
         }
-        assert_eq!(record.check(&ticket, ACTOR, incarnation, step), Ok(RecordKind::Step));
+        assert_eq!(
+            record.check(&ticket, ACTOR, incarnation, step),
+            Ok(RecordKind::Step)
+        );
     }
     run.say(ControlRecord::stop(run.identity.run));
-    let last = run.until_status("the last word", |status| status.state == ActorState::Leaving);
-    assert_eq!((last.episodes_flown, last.newest_policy), (1, Some(PolicyVersion(1))));
+    let last = run.until_status("the last word", |status| {
+        status.state == ActorState::Leaving
+    });
+    assert_eq!(
+        (last.episodes_flown, last.newest_policy),
+        (1, Some(PolicyVersion(1)))
+    );
     let done = [
         Stage::TakeSnapshot,
         Stage::Reset,
@@ -246,7 +258,8 @@ fn heartbeats_keep_an_actor_and_a_signal_ends_it() {
 fn an_actor_joins_the_learners_next_incarnation_with_nothing_of_the_former_one() {
     let mut run = Run::start(30.0);
     let former = run.joined();
-    // Waits for a snapshot that never comes, and would be flown in the next incarnation if it were taken along.
+    // Waits for a snapshot that never comes, and would be flown in the next incarnation if it were
+    // taken along.
     run.say(ControlRecord::fly(&run.ticket(2), ACTOR, former));
     run.publish(1);
     run.until_status("the first snapshot", |status| {
@@ -263,7 +276,11 @@ fn an_actor_joins_the_learners_next_incarnation_with_nothing_of_the_former_one()
     });
     run.until_status("a heartbeat later", |_| true);
     assert!(run.learner().receive_transition().unwrap().is_none());
-    run.say(ControlRecord::fly(&run.ticket(2), ACTOR, status.incarnation));
+    run.say(ControlRecord::fly(
+        &run.ticket(2),
+        ACTOR,
+        status.incarnation,
+    ));
     let record = run.until("a record", || run.learner().receive_transition().unwrap());
     assert_eq!(
         record.check(&run.ticket(2), ACTOR, status.incarnation, 0),

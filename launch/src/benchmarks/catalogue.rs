@@ -1,4 +1,5 @@
-//! `launch/benchmarks.toml`: which benchmarks there are, what they must reach, and what they are compared with.
+//! `launch/benchmarks.toml`: which benchmarks there are, what they must reach, and what they are
+//! compared with.
 
 use serde::Deserialize;
 
@@ -41,8 +42,8 @@ pub enum BenchKind {
     /// By criterion, pinned to one core.
     #[default]
     OneCore,
-    /// By itself, on all cores: it starts processes. It is given `--quick` or nothing, and prints a line of JSON for each figure: see
-    /// [`figures`](super::figures).
+    /// By itself, on all cores: it starts processes. It is given `--quick` or nothing, and prints a
+    /// line of JSON for each figure: see [`figures`](super::figures).
     Processes,
 }
 
@@ -80,7 +81,8 @@ pub struct Row {
     pub baseline: Option<Baseline>,
     /// How many times better than the baseline it must be.
     pub ratio_at_least: Option<f64>,
-    /// Instruction set, as `/proc/cpuinfo` spells it, without which what is measured is emulated; the row then says so.
+    /// Instruction set, as `/proc/cpuinfo` spells it, without which what is measured is emulated;
+    /// the row then says so.
     pub native_with: Option<String>,
 }
 
@@ -102,7 +104,8 @@ pub enum Show {
     Rate,
     /// Time of one element.
     Time,
-    /// Time of one iteration, whose elements are floating-point operations, and how much of the core's peak that is.
+    /// Time of one iteration, whose elements are floating-point operations, and how much of the
+    /// core's peak that is.
     PeakShare,
     /// As it comes; of figures that come as JSON.
     Value,
@@ -167,7 +170,8 @@ impl Row {
         self
     }
 
-    /// How a figure that its baseline is made of is shown, and in what unit. Times add up, rates do not.
+    /// How a figure that its baseline is made of is shown, and in what unit. Times add up, rates do
+    /// not.
     pub(super) fn part_shown(&self) -> (Show, &str) {
         match self.show {
             Show::Rate | Show::Time => (Show::Time, "s"),
@@ -215,21 +219,41 @@ mod tests {
                 row.unit,
                 row.stage
             );
-            assert!(row.at_least.is_none() || row.at_most.is_none(), "{}", row.stage);
-            let compared = row.baseline.as_ref().is_some_and(|baseline| !baseline.of.is_empty());
+            assert!(
+                row.at_least.is_none() || row.at_most.is_none(),
+                "{}",
+                row.stage
+            );
+            let compared = row
+                .baseline
+                .as_ref()
+                .is_some_and(|baseline| !baseline.of.is_empty());
             assert!(
                 row.ratio_at_least.is_none() || compared,
                 "{} has no baseline",
                 row.stage
             );
             for figure in row.baseline.iter().flat_map(|baseline| &baseline.of) {
-                assert_eq!(bench_of(figure), bench_of(&row.figure), "one run measures both");
+                assert_eq!(
+                    bench_of(figure),
+                    bench_of(&row.figure),
+                    "one run measures both"
+                );
             }
         }
         for growth in &catalogue.growths {
-            assert!(growth.series.iter().all(|series| timed(series.show, &series.unit)));
+            assert!(
+                growth
+                    .series
+                    .iter()
+                    .all(|series| timed(series.show, &series.unit))
+            );
         }
-        let named: BTreeSet<&str> = catalogue.benches.iter().map(|bench| bench.name.as_str()).collect();
+        let named: BTreeSet<&str> = catalogue
+            .benches
+            .iter()
+            .map(|bench| bench.name.as_str())
+            .collect();
         let series = catalogue.growths.iter().flat_map(|growth| &growth.series);
         let figures = catalogue
             .rows
@@ -237,7 +261,10 @@ mod tests {
             .map(|row| &row.figure)
             .chain(series.map(|series| &series.of));
         for figure in figures {
-            assert!(named.contains(bench_of(figure)), "no benchmark measures {figure}");
+            assert!(
+                named.contains(bench_of(figure)),
+                "no benchmark measures {figure}"
+            );
         }
     }
 
@@ -271,16 +298,27 @@ mod tests {
             .flat_map(|member| manifest(&root.join(member)).bench)
             .map(|target| target.name)
             .collect();
-        let named: BTreeSet<String> = Catalogue::load().benches.into_iter().map(|bench| bench.name).collect();
+        let named: BTreeSet<String> = Catalogue::load()
+            .benches
+            .into_iter()
+            .map(|bench| bench.name)
+            .collect();
         assert_eq!(named, there);
     }
 
     #[test]
     fn a_row_says_what_is_emulated() {
         let catalogue = Catalogue::load();
-        let row = catalogue.rows.iter().find(|row| row.native_with.is_some()).unwrap();
+        let row = catalogue
+            .rows
+            .iter()
+            .find(|row| row.native_with.is_some())
+            .unwrap();
         assert_eq!(row.clone().on(&["avx512_bf16"]), *row);
         let emulated = row.clone().on(&["avx2"]);
-        assert_eq!(emulated.stage, format!("{} (emulated: no avx512_bf16)", row.stage));
+        assert_eq!(
+            emulated.stage,
+            format!("{} (emulated: no avx512_bf16)", row.stage)
+        );
     }
 }

@@ -1,11 +1,13 @@
-//! What the benchmarks should have told and did not: a figure that was renamed in one place alone must not pass for one that is not asked for.
+//! What the benchmarks should have told and did not: a figure that was renamed in one place alone
+//! must not pass for one that is not asked for.
 
 use std::collections::BTreeSet;
 
 use super::catalogue::{Growth, Row, Show};
 use super::figures::Figures;
 
-/// A line for each figure that `rows` and `growths` ask for, and that `figures` lack or have otherwise.
+/// A line for each figure that `rows` and `growths` ask for, and that `figures` lack or have
+/// otherwise.
 pub fn faults(rows: &[Row], growths: &[Growth], figures: &Figures) -> Vec<String> {
     let of_rows = rows.iter().flat_map(|row| {
         let (show, unit) = row.part_shown();

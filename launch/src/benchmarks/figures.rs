@@ -1,7 +1,9 @@
-//! What the benchmarks left: criterion's samples, and lines of JSON of those that criterion cannot run.
+//! What the benchmarks left: criterion's samples, and lines of JSON of those that criterion cannot
+//! run.
 //!
-//! The figure is the fastest sample. Virtual machines share their cores with strangers, who slow whole seconds down by half, unseen from within; nothing
-//! makes code faster than it is. The median is kept beside it, so that it is seen how much the machine was disturbed.
+//! The figure is the fastest sample. Virtual machines share their cores with strangers, who slow
+//! whole seconds down by half, unseen from within; nothing makes code faster than it is. The median
+//! is kept beside it, so that it is seen how much the machine was disturbed.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -110,7 +112,8 @@ struct Samples {
 }
 
 impl Figures {
-    /// All figures that `directory` holds: criterion's in `criterion/`, and those in the lines of `*.figures` that begin with a brace.
+    /// All figures that `directory` holds: criterion's in `criterion/`, and those in the lines of
+    /// `*.figures` that begin with a brace.
     ///
     /// # Errors
     /// [`FiguresError`] names the file.
@@ -118,7 +121,10 @@ impl Figures {
         let mut figures = Self::default();
         figures.read_criterion(&directory.join("criterion"))?;
         for path in entries(directory)? {
-            if path.extension().is_some_and(|extension| extension == "figures") {
+            if path
+                .extension()
+                .is_some_and(|extension| extension == "figures")
+            {
                 figures.read_lines(&path)?;
             }
         }
@@ -130,7 +136,8 @@ impl Figures {
         self.0.is_empty()
     }
 
-    /// The figure that others held up longest, and how many times longer its median is than its fastest sample.
+    /// The figure that others held up longest, and how many times longer its median is than its
+    /// fastest sample.
     pub fn most_disturbed(&self) -> Option<(&str, f64)> {
         self.0
             .iter()
@@ -159,7 +166,10 @@ impl Figures {
     fn read_criterion(&mut self, folder: &Path) -> Result<(), FiguresError> {
         let about = folder.join("new/benchmark.json");
         if about.exists() {
-            let About { full_id, throughput } = json(&about)?;
+            let About {
+                full_id,
+                throughput,
+            } = json(&about)?;
             let samples: Samples = json(&folder.join("new/sample.json"))?;
             if let Some((secs, median_secs)) = samples.secs() {
                 let figure = Figure::Timed {
@@ -184,10 +194,11 @@ impl Figures {
             source,
         })?;
         for line in text.lines().filter(|line| line.starts_with('{')) {
-            let told: Told = serde_json::from_str(line).map_err(|source| FiguresError::Malformed {
-                path: path.to_owned(),
-                source,
-            })?;
+            let told: Told =
+                serde_json::from_str(line).map_err(|source| FiguresError::Malformed {
+                    path: path.to_owned(),
+                    source,
+                })?;
             self.0.insert(told.name.clone(), Figure::Told(told));
         }
         Ok(())
@@ -235,7 +246,9 @@ impl Figure {
     pub fn at_median(&self) -> Option<Self> {
         match *self {
             Self::Timed {
-                median_secs, elements, ..
+                median_secs,
+                elements,
+                ..
             } => Some(Self::Timed {
                 secs: median_secs,
                 median_secs,
@@ -248,7 +261,9 @@ impl Figure {
     /// How many times longer than the fastest sample the median took, if it was timed.
     pub fn disturbance(&self) -> Option<f64> {
         match self {
-            Self::Timed { secs, median_secs, .. } => Some(median_secs / secs),
+            Self::Timed {
+                secs, median_secs, ..
+            } => Some(median_secs / secs),
             Self::Told(_) => None,
         }
     }
@@ -260,7 +275,11 @@ fn entries(folder: &Path) -> Result<Vec<PathBuf>, FiguresError> {
         entries => entries,
     };
     let mut paths = entries
-        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>())
+        .and_then(|entries| {
+            entries
+                .map(|entry| Ok(entry?.path()))
+                .collect::<io::Result<Vec<_>>>()
+        })
         .map_err(|source| FiguresError::Read {
             path: folder.to_owned(),
             source,
@@ -305,18 +324,25 @@ pub(super) mod tests {
         fs::create_dir_all(&new).unwrap();
         let about = r#"{"full_id":"replay/sample/1024","throughput":{"Elements":4},"title":"any"}"#;
         fs::write(new.join("benchmark.json"), about).unwrap();
-        let samples = r#"{"sampling_mode":"Flat","iters":[2.0,2.0,2.0],"times":[8000.0,4000.0,6000.0]}"#;
+        let samples =
+            r#"{"sampling_mode":"Flat","iters":[2.0,2.0,2.0],"times":[8000.0,4000.0,6000.0]}"#;
         fs::write(new.join("sample.json"), samples).unwrap();
-        let line =
-            r#"{"name":"transport/records","figure":3e5,"unit":"records/s","baseline":"memcpy","baseline_figure":6e5}"#;
-        fs::write(directory.path().join("transport.figures"), format!("a word\n{line}\n")).unwrap();
+        let line = r#"{"name":"transport/records","figure":3e5,"unit":"records/s","baseline":"memcpy","baseline_figure":6e5}"#;
+        fs::write(
+            directory.path().join("transport.figures"),
+            format!("a word\n{line}\n"),
+        )
+        .unwrap();
 
         let figures = Figures::read(directory.path()).unwrap();
         let timed = figures.get("replay/sample/1024").unwrap();
         assert_eq!(timed.shown(Show::Time, "µs", 1.0), Ok(0.5));
         assert_eq!(timed.shown(Show::Rate, "any", 0.5), Ok(1e6));
         assert_eq!(timed.disturbance(), Some(1.5));
-        assert_eq!(timed.at_median().unwrap().shown(Show::Time, "µs", 1.0), Ok(0.75));
+        assert_eq!(
+            timed.at_median().unwrap().shown(Show::Time, "µs", 1.0),
+            Ok(0.75)
+        );
         assert_eq!(timed.shown(Show::Value, "any", 1.0), Err(Unfit::Timed));
         let told = figures.get("transport/records").unwrap();
         assert_eq!(told.shown(Show::Value, "records/s", 1.0), Ok(3e5));
@@ -331,7 +357,11 @@ pub(super) mod tests {
 
     #[test]
     fn a_series_is_in_the_order_of_its_numbers() {
-        let figures = timed(&[("a/b/1024", 2.0, 1.0), ("a/b/64", 1.0, 1.0), ("a/b/other", 1.0, 1.0)]);
+        let figures = timed(&[
+            ("a/b/1024", 2.0, 1.0),
+            ("a/b/64", 1.0, 1.0),
+            ("a/b/other", 1.0, 1.0),
+        ]);
         let xs: Vec<f64> = figures.series("a/b").iter().map(|(x, _)| *x).collect();
         assert_eq!(xs, [64.0, 1024.0]);
     }

@@ -29,8 +29,9 @@ const INSTRUCTIONS: [&str; 10] = [
     "amx_int8",
 ];
 
-/// What one core can do at best, measured. A line of `machine.jsonl`, written between two benchmarks: what holds the core up then must not pass for all it
-/// can do, so the best of all lines counts.
+/// What one core can do at best, measured. A line of `machine.jsonl`, written between two
+/// benchmarks: what holds the core up then must not pass for all it can do, so the best of all
+/// lines counts.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Core {
     /// f32 operations a second.
@@ -71,10 +72,13 @@ impl Core {
         }
     }
 
-    /// The best of what the lines of `path` say, and the worst of what disturbed it; measured now where there are none.
+    /// The best of what the lines of `path` say, and the worst of what disturbed it; measured now
+    /// where there are none.
     pub fn best_of(path: &Path) -> Self {
         let text = fs::read_to_string(path).unwrap_or_default();
-        let lines = text.lines().filter_map(|line| serde_json::from_str(line).ok());
+        let lines = text
+            .lines()
+            .filter_map(|line| serde_json::from_str(line).ok());
         lines
             .reduce(|a: Self, b: Self| Self {
                 f32_flops: a.f32_flops.max(b.f32_flops),
@@ -98,9 +102,13 @@ impl Machine {
         };
         let flags = field("flags");
         let memory = read("/proc/meminfo");
-        let memory_kib = memory
-            .lines()
-            .find_map(|line| line.strip_prefix("MemTotal:")?.split_whitespace().next()?.parse().ok());
+        let memory_kib = memory.lines().find_map(|line| {
+            line.strip_prefix("MemTotal:")?
+                .split_whitespace()
+                .next()?
+                .parse()
+                .ok()
+        });
         Self {
             processor: format!(
                 "{} (family {}, model {})",
@@ -143,7 +151,10 @@ fn others_running(load: &str) -> u32 {
 
 /// The machine's cores; the calling thread itself may be pinned to one.
 fn cores(info: &str) -> usize {
-    let listed = info.lines().filter(|line| line.starts_with("processor")).count();
+    let listed = info
+        .lines()
+        .filter(|line| line.starts_with("processor"))
+        .count();
     listed.max(thread::available_parallelism().map_or(1, Into::into))
 }
 
@@ -167,7 +178,11 @@ impl fmt::Display for Machine {
             f,
             "{}; one core{}: {:.1} GFLOP/s in f32, {:.1} GB/s copied",
             self.instructions.join(" "),
-            if self.core.is_pinned { "" } else { ", NOT pinned to it" },
+            if self.core.is_pinned {
+                ""
+            } else {
+                ", NOT pinned to it"
+            },
             self.core.f32_flops / 1e9,
             self.core.copied_bytes_per_sec / 1e9
         )
@@ -191,7 +206,11 @@ mod tests {
             };
             serde_json::to_string(&core).unwrap()
         };
-        fs::write(&path, format!("{}\n{}\n", line(2e9, 1e9, 0), line(1e9, 3e9, 2))).unwrap();
+        fs::write(
+            &path,
+            format!("{}\n{}\n", line(2e9, 1e9, 0), line(1e9, 3e9, 2)),
+        )
+        .unwrap();
         let best = Core::best_of(&path);
         assert_eq!((best.f32_flops, best.copied_bytes_per_sec), (2e9, 3e9));
         // And the worst of what disturbed.

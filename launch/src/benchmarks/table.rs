@@ -64,7 +64,10 @@ impl Table {
     /// `rows` with their `figures`, where one core does `f32_flops`.
     pub fn new(rows: &[Row], figures: &Figures, f32_flops: f64) -> Self {
         Self {
-            lines: rows.iter().map(|row| Line::new(row, figures, f32_flops)).collect(),
+            lines: rows
+                .iter()
+                .map(|row| Line::new(row, figures, f32_flops))
+                .collect(),
         }
     }
 
@@ -86,7 +89,15 @@ impl Table {
 
     fn grid(&self, judging: Judging) -> Grid {
         let mut grid = Grid::new();
-        grid.set_header(["stage", "figure", "median", "must reach", "baseline", "ratio", "met"]);
+        grid.set_header([
+            "stage",
+            "figure",
+            "median",
+            "must reach",
+            "baseline",
+            "ratio",
+            "met",
+        ]);
         for line in &self.lines {
             let right = |text: String| Cell::new(text).set_alignment(CellAlignment::Right);
             grid.add_row([
@@ -117,21 +128,27 @@ impl Line {
         let shown = |figure: &Figure| figure.shown(row.show, &row.unit, row.scale).ok();
         let figure = measured.and_then(shown);
         let peak_share = match (row.show, measured) {
-            (Show::PeakShare, Some(Figure::Timed { secs, elements, .. })) => Some(elements / secs / f32_flops),
+            (Show::PeakShare, Some(Figure::Timed { secs, elements, .. })) => {
+                Some(elements / secs / f32_flops)
+            }
             _ => None,
         };
         let baseline = measured.and_then(|measured| compared(row, measured, figures));
-        let ratio = figure
-            .zip(baseline.as_ref())
-            .map(|(figure, baseline)| match less_is_better(row) {
-                true => baseline.figure / figure,
-                false => figure / baseline.figure,
-            });
+        let ratio =
+            figure
+                .zip(baseline.as_ref())
+                .map(|(figure, baseline)| match less_is_better(row) {
+                    true => baseline.figure / figure,
+                    false => figure / baseline.figure,
+                });
         Self {
             stage: row.stage.clone(),
             unit: row.unit.clone(),
             figure,
-            median: measured.and_then(Figure::at_median).as_ref().and_then(shown),
+            median: measured
+                .and_then(Figure::at_median)
+                .as_ref()
+                .and_then(shown),
             peak_share,
             target: target(row),
             verdict: judge(row, figure, peak_share, ratio),
@@ -144,7 +161,9 @@ impl Line {
         match (self.figure, self.peak_share) {
             (None, _) => "not measured".to_owned(),
             (Some(figure), None) => format!("{} {}", number(figure), self.unit),
-            (Some(figure), Some(share)) => format!("{} {}, {}", number(figure), self.unit, of_peak(share)),
+            (Some(figure), Some(share)) => {
+                format!("{} {}, {}", number(figure), self.unit, of_peak(share))
+            }
         }
     }
 
@@ -198,8 +217,14 @@ fn target(row: &Row) -> String {
         (_, _, Some(most)) => Some(format!("≤ {}", number(most))),
         (_, None, None) => None,
     };
-    let ratio = row.ratio_at_least.map(|ratio| format!("≥ {} ×", number(ratio)));
-    [figure, ratio].into_iter().flatten().collect::<Vec<_>>().join(", ")
+    let ratio = row
+        .ratio_at_least
+        .map(|ratio| format!("≥ {} ×", number(ratio)));
+    [figure, ratio]
+        .into_iter()
+        .flatten()
+        .collect::<Vec<_>>()
+        .join(", ")
 }
 
 fn judge(row: &Row, figure: Option<f64>, peak_share: Option<f64>, ratio: Option<f64>) -> Verdict {
@@ -207,7 +232,8 @@ fn judge(row: &Row, figure: Option<f64>, peak_share: Option<f64>, ratio: Option<
         return Verdict::NotMeasured;
     };
     let reached = [
-        row.at_least.map(|least| peak_share.unwrap_or(figure) >= least),
+        row.at_least
+            .map(|least| peak_share.unwrap_or(figure) >= least),
         row.at_most.map(|most| figure <= most),
         row.ratio_at_least
             .map(|least| ratio.is_some_and(|ratio| ratio >= least)),
@@ -297,7 +323,11 @@ mod tests {
 
     #[test]
     fn the_parts_of_a_baseline_add_up_by_their_times() {
-        let figures = timed(&[("a/figure", 100.0, 10.0), ("a/one", 300.0, 10.0), ("a/two", 100.0, 5.0)]);
+        let figures = timed(&[
+            ("a/figure", 100.0, 10.0),
+            ("a/one", 300.0, 10.0),
+            ("a/two", 100.0, 5.0),
+        ]);
         let compared = Row {
             baseline: Some(Baseline {
                 what: "both".to_owned(),
@@ -309,7 +339,10 @@ mod tests {
         };
         let found = line(&compared, &figures);
         // 10 ns an element, and 30 + 20 ns.
-        assert!((found.figure.unwrap() / 1e8 - 1.0).abs() < 1e-9, "{found:?}");
+        assert!(
+            (found.figure.unwrap() / 1e8 - 1.0).abs() < 1e-9,
+            "{found:?}"
+        );
         assert!(
             (found.baseline.as_ref().unwrap().figure / 2e7 - 1.0).abs() < 1e-9,
             "{found:?}"

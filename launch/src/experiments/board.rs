@@ -1,7 +1,7 @@
 //! The progress of all runs of an experiment in one place.
 //!
-//! A terminal gets one bar for the whole experiment with a line for each run under way; anything else a plain line now and then. What a run itself says goes
-//! to a file beside its directory.
+//! A terminal gets one bar for the whole experiment with a line for each run under way; anything
+//! else a plain line now and then. What a run itself says goes to a file beside its directory.
 
 use std::fmt::Write;
 use std::time::{Duration, Instant};
@@ -126,7 +126,10 @@ fn head(progress: &Progress, elapsed_secs: f64, first_episodes: u64) -> String {
         total_episodes,
         ..
     } = *progress;
-    let mut text = format!("{complete} of {runs} runs complete · {}", Clock(elapsed_secs));
+    let mut text = format!(
+        "{complete} of {runs} runs complete · {}",
+        Clock(elapsed_secs)
+    );
     let pace = episodes.saturating_sub(first_episodes) as f64 / elapsed_secs;
     let left = total_episodes.saturating_sub(episodes) as f64;
     if pace > 0.0 && left > 0.0 {
@@ -137,7 +140,11 @@ fn head(progress: &Progress, elapsed_secs: f64, first_episodes: u64) -> String {
 
 /// A line for each run, under the bar.
 fn lines(under_way: &[Standing]) -> String {
-    let width = under_way.iter().map(|run| run.name.chars().count()).max().unwrap_or(0);
+    let width = under_way
+        .iter()
+        .map(|run| run.name.chars().count())
+        .max()
+        .unwrap_or(0);
     let line = |run: &Standing| format!("\n  {:width$}  {}", run.name, run.figures());
     under_way.iter().map(line).collect()
 }

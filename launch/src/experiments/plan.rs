@@ -12,12 +12,14 @@ use skein_protocol::summary::{Ending, Summary};
 use super::definition::Experiment;
 use crate::prepare;
 
-/// Actors of each run: runs are side by side instead, and how many fly changes nothing that is learned.
+/// Actors of each run: runs are side by side instead, and how many fly changes nothing that is
+/// learned.
 pub const ACTORS: usize = 1;
 /// The folder of the report, beside those of the arms.
 pub const REPORT: &str = "report";
 
-/// The runs of an experiment, in the order in which they are started: first seeds come first, so that early results cover all arms.
+/// The runs of an experiment, in the order in which they are started: first seeds come first, so
+/// that early results cover all arms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     /// Where all of it lies.
@@ -95,8 +97,8 @@ pub struct Claim {
     _directory: File,
 }
 
-/// Where in `runs` the experiment lies. One that is shortened by an option of the command has a place of its own, so that trying it out is never in its
-/// way.
+/// Where in `runs` the experiment lies. One that is shortened by an option of the command has a
+/// place of its own, so that trying it out is never in its way.
 pub fn root(runs: &Path, experiment: &Experiment, episodes: Option<u64>) -> PathBuf {
     runs.join(match episodes {
         Some(episodes) => format!("{}_{episodes}_episodes", experiment.name),
@@ -108,7 +110,8 @@ impl Plan {
     /// `seeds` runs of each arm of `experiment` in `root`, and what is there of them.
     ///
     /// # Errors
-    /// [`PlanError::Runs`] when a run is there that was started with another configuration, or cannot be looked at: nothing is ever removed or overwritten.
+    /// [`PlanError::Runs`] when a run is there that was started with another configuration, or
+    /// cannot be looked at: nothing is ever removed or overwritten.
     pub fn new(experiment: &Experiment, root: &Path, seeds: u64) -> Result<Self, PlanError> {
         let root = std::path::absolute(root).map_err(io_at(root))?;
         let mut plan = Self {
@@ -158,13 +161,16 @@ impl Plan {
     /// [`PlanError::UnderWay`] when another process has it.
     pub fn claim(root: &Path) -> Result<Claim, PlanError> {
         match claim(root).map_err(io_at(root))? {
-            Some(directory) => Ok(Claim { _directory: directory }),
+            Some(directory) => Ok(Claim {
+                _directory: directory,
+            }),
             None => Err(PlanError::UnderWay(root.to_owned())),
         }
     }
 }
 
-/// Makes `folder`, and claims it for this process for as long as what it gives is held; `None` when another process has it.
+/// Makes `folder`, and claims it for this process for as long as what it gives is held; `None` when
+/// another process has it.
 pub(super) fn claim(folder: &Path) -> io::Result<Option<File>> {
     fs::create_dir_all(folder)?;
     let handle = File::open(folder)?;
@@ -195,7 +201,8 @@ fn planned(experiment: &Experiment, root: &Path, number: usize, seed: u64) -> Pl
 }
 
 impl PlannedRun {
-    /// What the run's programs say, on standard output and standard error; beside its directory, which must be empty when it is begun.
+    /// What the run's programs say, on standard output and standard error; beside its directory,
+    /// which must be empty when it is begun.
     pub fn said(&self) -> PathBuf {
         self.directory.root().with_extension("log")
     }
@@ -212,7 +219,8 @@ impl PlannedRun {
                     "  {root} is a link to a run that is gone: bring that back, or remove the link: rm {root}"
                 ));
             }
-            let is_empty = fs::read_dir(self.directory.root()).map_or(true, |mut entries| entries.next().is_none());
+            let is_empty = fs::read_dir(self.directory.root())
+                .map_or(true, |mut entries| entries.next().is_none());
             return match is_empty {
                 true => Ok(State::New),
                 false => Err(format!(
@@ -221,8 +229,8 @@ impl PlannedRun {
             };
         }
         let aside = format!("to begin it anew, move it away: mv {root} {root}.old");
-        let differences =
-            differences(&self.directory, &self.config).map_err(|problem| format!("  {root}: {problem}; {aside}"))?;
+        let differences = differences(&self.directory, &self.config)
+            .map_err(|problem| format!("  {root}: {problem}; {aside}"))?;
         if !differences.is_empty() {
             return Err(format!(
                 "  {root} was started with another configuration (\"there\" is the run's, \"here\" the experiment's as it is now): {}; put the experiment's file back, or, {aside}",
@@ -231,8 +239,15 @@ impl PlannedRun {
         }
         match Summary::of(&self.directory) {
             Some(summary) if summary.ending == Ending::Completed => {
-                let is_flown = self.suite_json.as_ref().is_none_or(|result| result.is_file());
-                return Ok(if is_flown { State::Complete } else { State::Trained });
+                let is_flown = self
+                    .suite_json
+                    .as_ref()
+                    .is_none_or(|result| result.is_file());
+                return Ok(if is_flown {
+                    State::Complete
+                } else {
+                    State::Trained
+                });
             }
             None if self.directory.summary_json().exists() => {
                 return Err(format!(
@@ -250,9 +265,11 @@ impl PlannedRun {
     }
 }
 
-/// In what the configuration of `run`, its courses included, differs from `expected`. Of a key that is younger than the run, the run has the default.
+/// In what the configuration of `run`, its courses included, differs from `expected`. Of a key that
+/// is younger than the run, the run has the default.
 fn differences(run: &RunDirectory, expected: &Config) -> Result<Vec<String>, String> {
-    let mut stored = prepare::resolve(&run.config(), &[], ACTORS).map_err(|error| with_causes(&error))?;
+    let mut stored =
+        prepare::resolve(&run.config(), &[], ACTORS).map_err(|error| with_causes(&error))?;
     let mut expected = expected.clone();
     let mut courses = Vec::new();
     for (here, there) in expected.courses.paths_mut().zip(stored.courses.paths_mut()) {
@@ -296,13 +313,24 @@ mod tests {
         "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
 
     fn begin(run: &PlannedRun, experiment: &Experiment) {
-        prepare(&experiment.base, &run.overrides, run.directory.root(), ACTORS).unwrap();
+        prepare(
+            &experiment.base,
+            &run.overrides,
+            run.directory.root(),
+            ACTORS,
+        )
+        .unwrap();
     }
 
     #[test]
     fn first_seeds_of_all_arms_come_first() {
         let folder = tempfile::tempdir().unwrap();
-        let plan = Plan::new(&experiment(folder.path(), "0.25"), &folder.path().join("runs"), 2).unwrap();
+        let plan = Plan::new(
+            &experiment(folder.path(), "0.25"),
+            &folder.path().join("runs"),
+            2,
+        )
+        .unwrap();
         let names: Vec<_> = plan.runs.iter().map(|run| run.name.as_str()).collect();
         assert_eq!(names, ["a/seed-1", "b/seed-1", "a/seed-2", "b/seed-2"]);
         assert_eq!(plan.count(State::New), 4);
@@ -313,12 +341,19 @@ mod tests {
     #[test]
     fn what_was_begun_is_gone_on_with_and_what_is_complete_is_left_alone() {
         let folder = tempfile::tempdir().unwrap();
-        let (experiment, root) = (experiment(folder.path(), "0.25"), folder.path().join("runs"));
+        let (experiment, root) = (
+            experiment(folder.path(), "0.25"),
+            folder.path().join("runs"),
+        );
         let plan = Plan::new(&experiment, &root, 2).unwrap();
         begin(&plan.runs[0], &experiment);
         begin(&plan.runs[3], &experiment);
         let states = |ending| {
-            fs::write(plan.runs[3].directory.summary_json(), SUMMARY.replace("ENDING", ending)).unwrap();
+            fs::write(
+                plan.runs[3].directory.summary_json(),
+                SUMMARY.replace("ENDING", ending),
+            )
+            .unwrap();
             let plan = Plan::new(&experiment, &root, 2).unwrap();
             plan.runs.iter().map(|run| run.state).collect::<Vec<_>>()
         };
@@ -344,18 +379,28 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().join("runs");
         let suite = |episodes: u64| {
-            let course = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/courses/training.toml");
-            let text =
-                format!("name = \"few\"\nepisodes = {episodes}\n[[entry]]\nname = \"12345\"\ncourse = {course:?}\n");
+            let course =
+                Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/courses/training.toml");
+            let text = format!(
+                "name = \"few\"\nepisodes = {episodes}\n[[entry]]\nname = \"12345\"\ncourse = {course:?}\n"
+            );
             fs::write(folder.path().join("few.toml"), text).unwrap();
-            let experiment = experiment_with(folder.path(), "0.25", "tables = [\"suite\"]\nsuite = \"few.toml\"");
+            let experiment = experiment_with(
+                folder.path(),
+                "0.25",
+                "tables = [\"suite\"]\nsuite = \"few.toml\"",
+            );
             (Plan::new(&experiment, &root, 1).unwrap(), experiment)
         };
         let (plan, experiment) = suite(5);
         let run = &plan.runs[0];
         begin(run, &experiment);
         assert_eq!(suite(5).0.runs[0].state, State::Begun);
-        fs::write(run.directory.summary_json(), SUMMARY.replace("ENDING", "completed")).unwrap();
+        fs::write(
+            run.directory.summary_json(),
+            SUMMARY.replace("ENDING", "completed"),
+        )
+        .unwrap();
         assert_eq!(suite(5).0.runs[0].state, State::Trained);
         let result = run.suite_json.as_ref().unwrap();
         fs::create_dir(result.parent().unwrap()).unwrap();
@@ -375,7 +420,11 @@ mod tests {
                 .unwrap_err()
                 .to_string()
         };
-        for part in ["a/seed-1", "replay.success_share = 0.25 there, 0.5 here", "mv "] {
+        for part in [
+            "a/seed-1",
+            "replay.success_share = 0.25 there, 0.5 here",
+            "mv ",
+        ] {
             assert!(refusal("0.5").contains(part), "{}", refusal("0.5"));
         }
         // A course of the same name is another one all the same.
@@ -395,9 +444,16 @@ mod tests {
         let stray = folder.path().join("runs/b/seed-1/mine.txt");
         fs::create_dir_all(stray.parent().unwrap()).unwrap();
         fs::write(&stray, "").unwrap();
-        let error = Plan::new(&experiment(folder.path(), "0.25"), &folder.path().join("runs"), 1).unwrap_err();
+        let error = Plan::new(
+            &experiment(folder.path(), "0.25"),
+            &folder.path().join("runs"),
+            1,
+        )
+        .unwrap_err();
         assert!(
-            error.to_string().contains("not the directory of a run: move it away"),
+            error
+                .to_string()
+                .contains("not the directory of a run: move it away"),
             "{error}"
         );
     }
@@ -406,7 +462,10 @@ mod tests {
     fn an_experiment_is_run_by_one_process_at_a_time() {
         let folder = tempfile::tempdir().unwrap();
         let claim = Plan::claim(folder.path()).unwrap();
-        assert!(matches!(Plan::claim(folder.path()), Err(PlanError::UnderWay(_))));
+        assert!(matches!(
+            Plan::claim(folder.path()),
+            Err(PlanError::UnderWay(_))
+        ));
         drop(claim);
         Plan::claim(folder.path()).unwrap();
     }

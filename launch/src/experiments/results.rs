@@ -73,7 +73,9 @@ impl RunResult {
     /// What its training came to.
     pub(super) fn trained(run: &PlannedRun) -> Result<Self, ResultError> {
         let Config {
-            evaluation, learning, ..
+            evaluation,
+            learning,
+            ..
         } = &run.config;
         Ok(Self {
             arm: run.arm,
@@ -95,7 +97,8 @@ impl RunResult {
         Ok(self)
     }
 
-    /// Walls passed an episode over the last window of training episodes; `None` if there were none.
+    /// Walls passed an episode over the last window of training episodes; `None` if there were
+    /// none.
     pub fn final_walls_passed(&self) -> Option<f64> {
         trailing_mean(&self.values(Measure::WallsPassed), self.window).pop()
     }
@@ -105,11 +108,14 @@ impl RunResult {
         trailing_mean(&self.values(Measure::Return), self.window).pop()
     }
 
-    /// Training episodes until the average over a window of them first came to one wall passed; `None` if it never did. The rise itself: whether the agent is
-    /// trained is looked at in confirmations alone, which are far apart.
+    /// Training episodes until the average over a window of them first came to one wall passed;
+    /// `None` if it never did. The rise itself: whether the agent is trained is looked at in
+    /// confirmations alone, which are far apart.
     pub fn one_wall_after(&self) -> Option<f64> {
         let mut curve = self.curve(Measure::WallsPassed, Axis::Episodes).into_iter();
-        curve.find(|(_, walls)| *walls >= 1.0).map(|(episodes, _)| episodes)
+        curve
+            .find(|(_, walls)| *walls >= 1.0)
+            .map(|(episodes, _)| episodes)
     }
 
     /// Walls passed an episode that training came to; see [`level`].
@@ -127,13 +133,15 @@ impl RunResult {
         dispersion_across_time(&self.values(Measure::WallsPassed), self.window)
     }
 
-    /// How far the walls passed over a window of training episodes ever fell below the most they had been; `None` if there was no whole window.
+    /// How far the walls passed over a window of training episodes ever fell below the most they
+    /// had been; `None` if there was no whole window.
     pub fn largest_drawdown(&self) -> Option<f64> {
         let fallen = self.curve(Measure::Drawdown, Axis::Episodes).into_iter();
         fallen.map(|(_, below)| below).max_by(f64::total_cmp)
     }
 
-    /// The average of `measure` over each whole window of training episodes, at the episodes, steps or updates that were behind it then.
+    /// The average of `measure` over each whole window of training episodes, at the episodes, steps
+    /// or updates that were behind it then.
     pub fn curve(&self, measure: Measure, over: Axis) -> Vec<(f64, f64)> {
         let partial = self.window.saturating_sub(1);
         let means = trailing_mean(&self.values(measure), self.window);
@@ -142,7 +150,11 @@ impl RunResult {
             Measure::WallsPassed | Measure::Return => whole.to_vec(),
             Measure::Drawdown => drawdowns(whole),
         };
-        self.places(over).into_iter().skip(partial).zip(points).collect()
+        self.places(over)
+            .into_iter()
+            .skip(partial)
+            .zip(points)
+            .collect()
     }
 
     fn values(&self, measure: Measure) -> Vec<f64> {
@@ -155,7 +167,8 @@ impl RunResult {
             .collect()
     }
 
-    /// What was behind the run after each of its episodes. Updates follow from steps: each step after the warm-up brings the same number of them.
+    /// What was behind the run after each of its episodes. Updates follow from steps: each step
+    /// after the warm-up brings the same number of them.
     fn places(&self, over: Axis) -> Vec<f64> {
         let mut steps = 0;
         let learned_steps = self.summary.steps.saturating_sub(self.warmup_steps).max(1);
@@ -168,7 +181,9 @@ impl RunResult {
                 match over {
                     Axis::Episodes => (number + 1) as f64,
                     Axis::Steps => steps as f64,
-                    Axis::Updates => steps.saturating_sub(self.warmup_steps) as f64 * updates_per_step,
+                    Axis::Updates => {
+                        steps.saturating_sub(self.warmup_steps) as f64 * updates_per_step
+                    }
                 }
             })
             .collect()

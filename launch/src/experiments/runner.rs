@@ -1,8 +1,10 @@
-//! Runs side by side: as many at a time as there are cores for, each by a `skein run` of its own, exactly as a user would start it. Once one is trained, its
-//! best snapshot flies the experiment's suite, by a `skein-evaluate` of its own.
+//! Runs side by side: as many at a time as there are cores for, each by a `skein run` of its own,
+//! exactly as a user would start it. Once one is trained, its best snapshot flies the experiment's
+//! suite, by a `skein-evaluate` of its own.
 //!
-//! A run that fails is told and the others go on. An interruption is passed on to every run under way, which stops in order and can be gone on with; no
-//! other is begun then. A suite that was not flown to its end is flown from its beginning the next time.
+//! A run that fails is told and the others go on. An interruption is passed on to every run under
+//! way, which stops in order and can be gone on with; no other is begun then. A suite that was not
+//! flown to its end is flown from its beginning the next time.
 
 use std::collections::VecDeque;
 use std::fs::{self, OpenOptions};
@@ -61,8 +63,9 @@ struct UnderWay<'a> {
     child: Child,
 }
 
-/// Carries out what is not complete of `plan`. Each message on `interrupts` is one interruption by the user: the first stops every run in order, the second
-/// at once; should a `skein run` not heed it, the third kills it.
+/// Carries out what is not complete of `plan`. Each message on `interrupts` is one interruption by
+/// the user: the first stops every run in order, the second at once; should a `skein run` not heed
+/// it, the third kills it.
 pub async fn run(
     experiment: &Experiment,
     plan: &Plan,
@@ -95,7 +98,9 @@ pub async fn run(
                     stage,
                     child,
                 }),
-                Err(error) => session.fail(run, &format!("{what} cannot be started: {error}"), board),
+                Err(error) => {
+                    session.fail(run, &format!("{what} cannot be started: {error}"), board)
+                }
             }
         }
         if under_way.is_empty() {
@@ -157,7 +162,8 @@ fn train(experiment: &Experiment, run: &PlannedRun, skein: &Path) -> io::Result<
     spawn(command, &log, run)
 }
 
-/// Flies the suite with the best snapshot of a run. What comes of it is brought to its place when it is whole: see [`Session::flown`].
+/// Flies the suite with the best snapshot of a run. What comes of it is brought to its place when
+/// it is whole: see [`Session::flown`].
 fn fly(suite: &FlownSuite, run: &PlannedRun, evaluate: &Path) -> io::Result<Child> {
     // It is read again by the other program, and training takes hours.
     if FlownSuite::load(&suite.path, suite.each).as_ref() != Ok(suite) {
@@ -181,15 +187,16 @@ fn fly(suite: &FlownSuite, run: &PlannedRun, evaluate: &Path) -> io::Result<Chil
     spawn(command, OpenOptions::new().append(true), run)
 }
 
-/// What `skein-evaluate` writes, before it is known to be whole. Another experiment may fly the same suite for the same run, to which it has a link.
+/// What `skein-evaluate` writes, before it is known to be whole. Another experiment may fly the
+/// same suite for the same run, to which it has a link.
 fn unfinished(result: &Path) -> PathBuf {
     result.with_extension(format!("part-{}", process::id()))
 }
 
 /// Starts a program for a run. Whatever it says goes to the file beside the run's directory.
 ///
-/// It leads a process group of its own: Ctrl-C in the terminal reaches this process alone, which passes it on once. Should this process die, the kernel
-/// interrupts it, and it stops in order.
+/// It leads a process group of its own: Ctrl-C in the terminal reaches this process alone, which
+/// passes it on once. Should this process die, the kernel interrupts it, and it stops in order.
 fn spawn(mut command: Command, log: &OpenOptions, run: &PlannedRun) -> io::Result<Child> {
     let said = run.said();
     if let Some(folder) = said.parent() {
@@ -217,8 +224,13 @@ impl Session {
             _ => Signal::KILL,
         };
         for one in under_way {
-            // A child that is not reaped keeps its number, so the signal cannot reach a stranger; and that it has just ended is no error.
-            if let Some(pid) = one.child.id().and_then(|id| Pid::from_raw(id.cast_signed())) {
+            // A child that is not reaped keeps its number, so the signal cannot reach a stranger;
+            // and that it has just ended is no error.
+            if let Some(pid) = one
+                .child
+                .id()
+                .and_then(|id| Pid::from_raw(id.cast_signed()))
+            {
                 let _ = kill_process(pid, signal);
             }
         }
@@ -235,7 +247,9 @@ impl Session {
         let how = match (code, stage) {
             (Some(0), Stage::Training) => return self.trained(run, board),
             (Some(0), Stage::Suite) => return self.flown(run, board),
-            (Some(code), _) if code == i32::from(INTERRUPTED) && self.interruptions > 0 => return before,
+            (Some(code), _) if code == i32::from(INTERRUPTED) && self.interruptions > 0 => {
+                return before;
+            }
             (None, _) if self.interruptions >= kills => return before,
             (Some(code), _) => format!("its `{program}` exited with status {code}"),
             (None, _) => format!("its `{program}` was killed"),
@@ -287,9 +301,15 @@ impl Session {
             Ok(report) => {
                 let entries = report.courses.iter();
                 let rates: Vec<_> = entries
-                    .map(|entry| format!("{:.1} % of \"{}\"", 100.0 * entry.completed, entry.course))
+                    .map(|entry| {
+                        format!("{:.1} % of \"{}\"", 100.0 * entry.completed, entry.course)
+                    })
                     .collect();
-                board.say(&format!("{} is complete: it completed {}", run.name, rates.join(", ")));
+                board.say(&format!(
+                    "{} is complete: it completed {}",
+                    run.name,
+                    rates.join(", ")
+                ));
                 State::Complete
             }
             Err(problem) => {
@@ -332,7 +352,10 @@ impl Tally {
 
     fn progress(&mut self, plan: &Plan, under_way: &[UnderWay<'_>]) -> Progress {
         let mut standings = Vec::with_capacity(under_way.len());
-        for &UnderWay { place, run, stage, .. } in under_way {
+        for &UnderWay {
+            place, run, stage, ..
+        } in under_way
+        {
             let walls = flown(&run.directory);
             self.episodes[place] = walls.len() as u64;
             standings.push(Standing {
@@ -340,7 +363,8 @@ impl Tally {
                 stage,
                 episodes: walls.len() as u64,
                 total_episodes: run.config.run.episodes,
-                walls_passed: trailing_mean(&walls, run.config.evaluation.window_episodes as usize).pop(),
+                walls_passed: trailing_mean(&walls, run.config.evaluation.window_episodes as usize)
+                    .pop(),
             });
         }
         Progress {
@@ -353,7 +377,8 @@ impl Tally {
     }
 }
 
-/// Walls passed in each episode that a run has learned from so far. A row that is being written is left out.
+/// Walls passed in each episode that a run has learned from so far. A row that is being written is
+/// left out.
 fn flown(run: &RunDirectory) -> Vec<f64> {
     let text = fs::read_to_string(run.episodes_csv()).unwrap_or_default();
     let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
@@ -364,12 +389,16 @@ fn flown(run: &RunDirectory) -> Vec<f64> {
         .collect()
 }
 
-/// Nothing goes on from a run that is trained, and its checkpoints are most of what it takes of the disk.
+/// Nothing goes on from a run that is trained, and its checkpoints are most of what it takes of the
+/// disk.
 fn remove_checkpoints(run: &PlannedRun, board: &Board) {
     let checkpoints = run.directory.checkpoints();
     match fs::remove_dir_all(&checkpoints) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            board.say(&format!("{} cannot be removed: {error}", checkpoints.display()));
+            board.say(&format!(
+                "{} cannot be removed: {error}",
+                checkpoints.display()
+            ));
         }
         _ => {}
     }

@@ -1,4 +1,5 @@
-//! Runs that another experiment has done already. A run is a function of its configuration and seed: there is no need to train it twice.
+//! Runs that another experiment has done already. A run is a function of its configuration and
+//! seed: there is no need to train it twice.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -10,11 +11,13 @@ use super::plan::{Plan, PlanError, PlannedRun, State, io_at};
 use super::results::RunResult;
 
 impl Plan {
-    /// Makes every run of which there is nothing a link to the same one in another experiment beside this one, where that is trained to its end. Returns the names of those
-    /// it found, and where.
+    /// Makes every run of which there is nothing a link to the same one in another experiment
+    /// beside this one, where that is trained to its end. Returns the names of those it found, and
+    /// where.
     ///
     /// # Errors
-    /// [`PlanError::Io`] when a link cannot be made, [`PlanError::Runs`] when what it leads to is no longer what it was.
+    /// [`PlanError::Io`] when a link cannot be made, [`PlanError::Runs`] when what it leads to is
+    /// no longer what it was.
     pub fn take_over(&mut self) -> Result<Vec<(String, PathBuf)>, PlanError> {
         let others: Vec<PathBuf> = arms_beside(&self.root);
         let mut found = Vec::new();
@@ -37,7 +40,10 @@ impl Plan {
 fn arms_beside(root: &Path) -> Vec<PathBuf> {
     let folders = |path: &Path| -> Vec<PathBuf> {
         let entries = fs::read_dir(path).into_iter().flatten().flatten();
-        entries.map(|entry| entry.path()).filter(|path| path.is_dir()).collect()
+        entries
+            .map(|entry| entry.path())
+            .filter(|path| path.is_dir())
+            .collect()
     };
     let beside = root.parent().map(folders).unwrap_or_default();
     let mut arms: Vec<PathBuf> = beside
@@ -50,7 +56,8 @@ fn arms_beside(root: &Path) -> Vec<PathBuf> {
 }
 
 impl PlannedRun {
-    /// The directory of the same run in the folder `arm` of another experiment, if it is trained to its end. What is a link itself is found where it leads.
+    /// The directory of the same run in the folder `arm` of another experiment, if it is trained to
+    /// its end. What is a link itself is found where it leads.
     fn trained_in(&self, arm: &Path) -> Option<PathBuf> {
         let directory = arm.join(format!("seed-{}", self.seed));
         if directory.is_symlink() || !directory.is_dir() {
@@ -62,14 +69,16 @@ impl PlannedRun {
             ..self.clone()
         };
         // What cannot be reported is of no use here: it is trained anew.
-        (other.look() == Ok(State::Complete) && RunResult::trained(&other).is_ok()).then_some(directory)
+        (other.look() == Ok(State::Complete) && RunResult::trained(&other).is_ok())
+            .then_some(directory)
     }
 
     /// Relative, so that all experiments can be moved together.
     fn link_to(&self, other: &Path) -> Result<(), PlanError> {
         let root = self.directory.root();
         let within: Vec<_> = other.iter().collect();
-        let target: PathBuf = Path::new("../..").join(within.iter().rev().take(3).rev().collect::<PathBuf>());
+        let target: PathBuf =
+            Path::new("../..").join(within.iter().rev().take(3).rev().collect::<PathBuf>());
         if let Some(folder) = root.parent() {
             fs::create_dir_all(folder).map_err(io_at(folder))?;
         }
@@ -91,7 +100,9 @@ mod tests {
     fn experiment(folder: &Path, name: &str, shares: [&str; 2]) -> Experiment {
         let base = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/smoke.toml");
         let arm = |name, share| {
-            format!("[[arm]]\nname = \"{name}\"\nlabel = \"{name}\"\nsettings.replay.success_share = {share}\n")
+            format!(
+                "[[arm]]\nname = \"{name}\"\nlabel = \"{name}\"\nsettings.replay.success_share = {share}\n"
+            )
         };
         let text = format!(
             "question = \"?\"\nbase = {base:?}\nseeds = 2\ntables = []\ncurves = []\n{}{}",
@@ -104,18 +115,32 @@ mod tests {
 
     /// Leaves what a run leaves that is trained to its end.
     fn train(run: &PlannedRun, experiment: &Experiment) {
-        prepare(&experiment.base, &run.overrides, run.directory.root(), ACTORS).unwrap();
+        prepare(
+            &experiment.base,
+            &run.overrides,
+            run.directory.root(),
+            ACTORS,
+        )
+        .unwrap();
         let summary = r#"{"skein_version":"0","run":7,"seed":2,"ending":"completed","policy_sha256":"","final_version":8,"best_version":7,
             "best_confirmed_walls_passed":4.9,"episodes":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_episodes":4,
             "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
         fs::write(run.directory.summary_json(), summary).unwrap();
         let evaluation = r#"{"policy_version":7,"policy_sha256":"","courses":[]}"#;
         fs::write(run.directory.evaluation_json(), evaluation).unwrap();
-        fs::write(run.directory.episodes_csv(), "steps,walls_passed,return\n4,2,1.0\n").unwrap();
+        fs::write(
+            run.directory.episodes_csv(),
+            "steps,walls_passed,return\n4,2,1.0\n",
+        )
+        .unwrap();
     }
 
     fn taken_over(plan: &mut Plan) -> Vec<String> {
-        plan.take_over().unwrap().into_iter().map(|(name, _)| name).collect()
+        plan.take_over()
+            .unwrap()
+            .into_iter()
+            .map(|(name, _)| name)
+            .collect()
     }
 
     #[test]
@@ -135,13 +160,21 @@ mod tests {
 
         let second = experiment(folder.path(), "second", ["0.125", "0.25"]);
         let mut plan = Plan::new(&second, &root("second"), 2).unwrap();
-        assert_eq!(taken_over(&mut plan), ["b/seed-1"], "seed 2 was begun and not ended");
+        assert_eq!(
+            taken_over(&mut plan),
+            ["b/seed-1"],
+            "seed 2 was begun and not ended"
+        );
         assert_eq!(plan.count(State::Complete), 1);
         assert_eq!(
             fs::read_link(root("second/b/seed-1")).unwrap(),
             Path::new("../../first/a/seed-1")
         );
-        assert_eq!(Plan::new(&second, &root("second"), 2).unwrap(), plan, "it stays");
+        assert_eq!(
+            Plan::new(&second, &root("second"), 2).unwrap(),
+            plan,
+            "it stays"
+        );
         assert!(taken_over(&mut plan).is_empty());
 
         // What cannot be reported is not taken over.
@@ -161,7 +194,9 @@ mod tests {
         );
 
         fs::rename(root("first"), folder.path().join("gone")).unwrap();
-        let refusal = Plan::new(&third, &root("third"), 1).unwrap_err().to_string();
+        let refusal = Plan::new(&third, &root("third"), 1)
+            .unwrap_err()
+            .to_string();
         assert!(
             refusal.contains("a/seed-1 is a link to a run that is gone"),
             "{refusal}"

@@ -1,6 +1,8 @@
-//! A few numbers, one a seed, summed up honestly: interquartile mean or mean, and a bootstrap interval; and how restless a curve is.
+//! A few numbers, one a seed, summed up honestly: interquartile mean or mean, and a bootstrap
+//! interval; and how restless a curve is.
 //!
-//! Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv:2108.13264, which recommends the interquartile mean and the bootstrap for few runs.
+//! Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice",
+//! arXiv:2108.13264, which recommends the interquartile mean and the bootstrap for few runs.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -22,8 +24,9 @@ pub struct Estimate {
     pub interval: Option<(f64, f64)>,
 }
 
-/// Mean of the middle half of `values`: a quarter of their weight is left out at either end, and a value on the border counts with the part that lies
-/// inside. Of three values, the middle one counts four times as much as each other. `None` of none.
+/// Mean of the middle half of `values`: a quarter of their weight is left out at either end, and a
+/// value on the border counts with the part that lies inside. Of three values, the middle one
+/// counts four times as much as each other. `None` of none.
 pub fn interquartile_mean(values: &[f64]) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -48,7 +51,8 @@ fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// Resamples of so many seeds, drawn once: all measures of an experiment are resampled alike, and a report drawn again is the same.
+/// Resamples of so many seeds, drawn once: all measures of an experiment are resampled alike, and a
+/// report drawn again is the same.
 #[derive(Debug)]
 pub struct Bootstrap {
     seeds: usize,
@@ -59,7 +63,8 @@ pub struct Bootstrap {
 impl Bootstrap {
     /// `resamples` samples of `seeds` values each, drawn with replacement.
     pub fn new(seeds: usize, resamples: usize) -> Self {
-        let mut rng = Pcg64Mcg::seed_from_u64(derive(seeds as u64, Purpose::Bootstrap, resamples as u64));
+        let mut rng =
+            Pcg64Mcg::seed_from_u64(derive(seeds as u64, Purpose::Bootstrap, resamples as u64));
         let mut resample = || (0..seeds).map(|_| rng.random_range(0..seeds)).collect();
         Self {
             seeds,
@@ -71,8 +76,8 @@ impl Bootstrap {
         }
     }
 
-    /// Interquartile mean of `values`, one a seed, with the interval between the 2.5th and the 97.5th percentile of the resamples' interquartile means.
-    /// `None` of no values.
+    /// Interquartile mean of `values`, one a seed, with the interval between the 2.5th and the
+    /// 97.5th percentile of the resamples' interquartile means. `None` of no values.
     ///
     /// # Panics
     /// When there are not as many values as seeds.
@@ -91,7 +96,11 @@ impl Bootstrap {
         self.estimate(values, |drawn| mean(drawn))
     }
 
-    fn estimate(&self, values: &[f64], statistic: impl Fn(&mut [f64]) -> Option<f64>) -> Option<Estimate> {
+    fn estimate(
+        &self,
+        values: &[f64],
+        statistic: impl Fn(&mut [f64]) -> Option<f64>,
+    ) -> Option<Estimate> {
         assert_eq!(values.len(), self.seeds, "one value a seed");
         let mut drawn = values.to_vec();
         let value = statistic(&mut drawn)?;
@@ -106,7 +115,8 @@ impl Bootstrap {
             })
             .collect();
         resampled.sort_by(f64::total_cmp);
-        let interval = (!resampled.is_empty()).then(|| (quantile(&resampled, TAIL), quantile(&resampled, 1.0 - TAIL)));
+        let interval = (!resampled.is_empty())
+            .then(|| (quantile(&resampled, TAIL), quantile(&resampled, 1.0 - TAIL)));
         Some(Estimate { value, interval })
     }
 }
@@ -119,46 +129,59 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
     sorted[below] + part * (sorted[above] - sorted[below])
 }
 
-/// How restless a curve is once it has risen: the root mean square of the differences between the averages over successive windows of `window` values
-/// that do not overlap. What is left of a slow trend in it is small, as differences of neighbours hardly see one.
+/// How restless a curve is once it has risen: the root mean square of the differences between the
+/// averages over successive windows of `window` values that do not overlap. What is left of a slow
+/// trend in it is small, as differences of neighbours hardly see one.
 ///
 /// The curve has risen when a window first averages 0.9 of the [`level`] that it comes to.
 /// `None` when fewer than three windows follow.
 ///
-/// Where start levels are flown in turn, a window should be whole turns of them (50 episodes of 5 levels, 10 each): otherwise the turns themselves show.
+/// Where start levels are flown in turn, a window should be whole turns of them (50 episodes of 5
+/// levels, 10 each): otherwise the turns themselves show.
 pub fn volatility(values: &[f64], window: usize) -> Option<f64> {
     let differences = differences_once_risen(values, window)?;
-    let squares: f64 = differences.iter().map(|difference| difference.powi(2)).sum();
+    let squares: f64 = differences
+        .iter()
+        .map(|difference| difference.powi(2))
+        .sum();
     Some((squares / differences.len() as f64).sqrt())
 }
 
-/// Dispersion across time: the interquartile range of the differences that [`volatility`] is of. A few large swings, which make most of a volatility, do not
-/// show in it: it tells how restless a curve usually is.
+/// Dispersion across time: the interquartile range of the differences that [`volatility`] is of. A
+/// few large swings, which make most of a volatility, do not show in it: it tells how restless a
+/// curve usually is.
 ///
-/// Source: Chan et al., "Measuring the Reliability of Reinforcement Learning Algorithms", arXiv:1912.05663, with one window for all that follows
-/// the rise.
+/// Source: Chan et al., "Measuring the Reliability of Reinforcement Learning Algorithms",
+/// arXiv:1912.05663, with one window for all that follows the rise.
 pub fn dispersion_across_time(values: &[f64], window: usize) -> Option<f64> {
     let mut differences = differences_once_risen(values, window)?;
     differences.sort_by(f64::total_cmp);
     Some(quantile(&differences, 0.75) - quantile(&differences, 0.25))
 }
 
-/// The level that a curve comes to: the median of the averages over successive windows in its second half. `None` when there is no whole window.
+/// The level that a curve comes to: the median of the averages over successive windows in its
+/// second half. `None` when there is no whole window.
 pub fn level(values: &[f64], window: usize) -> Option<f64> {
     level_of(&window_averages(values, window))
 }
 
-/// Differences between the averages over successive windows, from the one on that has risen; at least two.
+/// Differences between the averages over successive windows, from the one on that has risen; at
+/// least two.
 fn differences_once_risen(values: &[f64], window: usize) -> Option<Vec<f64>> {
     let averages = window_averages(values, window);
     let level = level_of(&averages)?;
-    let risen = averages.iter().position(|average| *average >= RISEN * level)?;
+    let risen = averages
+        .iter()
+        .position(|average| *average >= RISEN * level)?;
     let after = &averages[risen..];
     (after.len() >= 3).then(|| after.windows(2).map(|pair| pair[1] - pair[0]).collect())
 }
 
 fn window_averages(values: &[f64], window: usize) -> Vec<f64> {
-    values.chunks_exact(window.max(1)).filter_map(mean).collect()
+    values
+        .chunks_exact(window.max(1))
+        .filter_map(mean)
+        .collect()
 }
 
 fn level_of(averages: &[f64]) -> Option<f64> {
@@ -167,7 +190,8 @@ fn level_of(averages: &[f64]) -> Option<f64> {
     (!second_half.is_empty()).then(|| quantile(&second_half, 0.5))
 }
 
-/// How far each point of a curve lies below the highest before it: what was learned and is lost again.
+/// How far each point of a curve lies below the highest before it: what was learned and is lost
+/// again.
 ///
 /// Source: as [`dispersion_across_time`], where the worst of it is the long-term risk across time.
 pub fn drawdowns(curve: &[f64]) -> Vec<f64> {
@@ -191,7 +215,8 @@ mod tests {
 
     #[test]
     fn the_level_of_an_even_number_of_windows_lies_between_the_middle_two() {
-        // Risen at 0.9 of 10, with the second value; of 11 it would be with the last but one, and too few would follow.
+        // Risen at 0.9 of 10, with the second value; of 11 it would be with the last but one, and
+        // too few would follow.
         assert!(volatility(&[0.0, 9.2, 9.2, 9.2, 9.0, 9.0, 11.0, 11.0], 1).is_some());
     }
 
@@ -199,11 +224,17 @@ mod tests {
     fn the_interquartile_mean_is_that_of_the_textbook() {
         let of = |values: &[f64]| interquartile_mean(values).unwrap();
         // Twelve values: the middle six, 5 to 8.
-        assert_eq!(of(&[5.0, 8.0, 4.0, 38.0, 8.0, 6.0, 9.0, 7.0, 7.0, 3.0, 1.0, 6.0]), 6.5);
+        assert_eq!(
+            of(&[5.0, 8.0, 4.0, 38.0, 8.0, 6.0, 9.0, 7.0, 7.0, 3.0, 1.0, 6.0]),
+            6.5
+        );
         // Nine: the middle three, and three quarters of their neighbours.
         assert_eq!(of(&[1.0, 3.0, 5.0, 7.0, 9.0, 11.0, 13.0, 15.0, 17.0]), 9.0);
         assert_eq!(of(&[0.0, 1.0, 5.0]), (0.25 * 0.0 + 1.0 + 0.25 * 5.0) / 1.5);
-        assert_eq!(of(&[0.0, 1.0, 2.0, 3.0, 100.0]), (0.75 * 1.0 + 2.0 + 0.75 * 3.0) / 2.5);
+        assert_eq!(
+            of(&[0.0, 1.0, 2.0, 3.0, 100.0]),
+            (0.75 * 1.0 + 2.0 + 0.75 * 3.0) / 2.5
+        );
         assert_eq!((of(&[4.0]), of(&[1.0, 2.0])), (4.0, 1.5));
         assert_eq!(interquartile_mean(&[]), None);
     }
@@ -211,9 +242,13 @@ mod tests {
     #[test]
     fn an_interval_holds_its_mean_and_is_the_same_each_time() {
         let values = [0.91, 0.97, 0.88, 0.99, 0.95];
-        let estimate = Bootstrap::new(5, RESAMPLES).interquartile_mean(&values).unwrap();
+        let estimate = Bootstrap::new(5, RESAMPLES)
+            .interquartile_mean(&values)
+            .unwrap();
         assert_eq!(
-            Bootstrap::new(5, RESAMPLES).interquartile_mean(&values).unwrap(),
+            Bootstrap::new(5, RESAMPLES)
+                .interquartile_mean(&values)
+                .unwrap(),
             estimate
         );
         let (low, high) = estimate.interval.unwrap();
@@ -223,10 +258,13 @@ mod tests {
         );
     }
 
-    /// Of two values a and b, a resample is (a, a), (a, b), (b, a) or (b, b): with a quarter of the resamples at each end, the interval is [a, b].
+    /// Of two values a and b, a resample is (a, a), (a, b), (b, a) or (b, b): with a quarter of the
+    /// resamples at each end, the interval is [a, b].
     #[test]
     fn the_interval_of_two_values_reaches_from_one_to_the_other() {
-        let estimate = Bootstrap::new(2, 1000).interquartile_mean(&[3.0, 1.0]).unwrap();
+        let estimate = Bootstrap::new(2, 1000)
+            .interquartile_mean(&[3.0, 1.0])
+            .unwrap();
         assert_eq!(
             estimate,
             Estimate {
@@ -236,13 +274,17 @@ mod tests {
         );
     }
 
-    /// Values that are equally likely anywhere in [0, 1]: the influence of x on their interquartile mean is 2 (x - 1/2) with x bounded to [1/4, 3/4], whose
-    /// variance is 1/6.
+    /// Values that are equally likely anywhere in [0, 1]: the influence of x on their interquartile
+    /// mean is 2 (x - 1/2) with x bounded to [1/4, 3/4], whose variance is 1/6.
     #[test]
     fn the_interval_of_many_values_is_the_asymptotic_one() {
         let n = 400;
-        let values: Vec<f64> = (0..n).map(|i| (f64::from(i) + 0.5) / f64::from(n)).collect();
-        let estimate = Bootstrap::new(values.len(), 2000).interquartile_mean(&values).unwrap();
+        let values: Vec<f64> = (0..n)
+            .map(|i| (f64::from(i) + 0.5) / f64::from(n))
+            .collect();
+        let estimate = Bootstrap::new(values.len(), 2000)
+            .interquartile_mean(&values)
+            .unwrap();
         let (low, high) = estimate.interval.unwrap();
         let expected = 2.0 * 1.96 * (1.0 / 6.0 / f64::from(n)).sqrt();
         assert!((estimate.value - 0.5).abs() < 1e-9);
@@ -253,7 +295,8 @@ mod tests {
         );
     }
 
-    /// The mean's standard error is that of the textbook, and the worst value, which an interquartile mean of five sets aside, is in it.
+    /// The mean's standard error is that of the textbook, and the worst value, which an
+    /// interquartile mean of five sets aside, is in it.
     #[test]
     fn the_mean_counts_every_value() {
         let five = Bootstrap::new(5, RESAMPLES);
@@ -265,7 +308,9 @@ mod tests {
         assert_eq!(five.interquartile_mean(&values).unwrap().value, 1.0);
 
         let n = 400;
-        let values: Vec<f64> = (0..n).map(|i| (f64::from(i) + 0.5) / f64::from(n)).collect();
+        let values: Vec<f64> = (0..n)
+            .map(|i| (f64::from(i) + 0.5) / f64::from(n))
+            .collect();
         let (low, high) = Bootstrap::new(values.len(), 2000)
             .mean(&values)
             .unwrap()

@@ -1,6 +1,8 @@
-//! Reads back what TensorBoard is shown: every point of every curve, however many event files it is spread over.
+//! Reads back what TensorBoard is shown: every point of every curve, however many event files it is
+//! spread over.
 //!
-//! Field numbers and frame are those that the learner writes by; every length and checksum is checked.
+//! Field numbers and frame are those that the learner writes by; every length and checksum is
+//! checked.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -9,7 +11,8 @@ use std::path::{Path, PathBuf};
 
 use prost::Message;
 
-/// The values at each step of each curve, in the order in which they are in the files. One each, if all is well.
+/// The values at each step of each curve, in the order in which they are in the files. One each, if
+/// all is well.
 pub type Curves = BTreeMap<String, BTreeMap<i64, Vec<f32>>>;
 
 /// Why curves cannot be read.
@@ -68,7 +71,11 @@ fn read_file(bytes: &[u8], curves: &mut Curves) -> Result<(), (usize, String)> {
     while !rest.is_empty() {
         let offset = bytes.len() - rest.len();
         let event = take_event(&mut rest).map_err(|problem| (offset, problem))?;
-        for value in event.summary.map(|summary| summary.value).unwrap_or_default() {
+        for value in event
+            .summary
+            .map(|summary| summary.value)
+            .unwrap_or_default()
+        {
             let points = curves.entry(value.tag).or_default();
             points
                 .entry(event.step)
@@ -97,7 +104,9 @@ fn take_event(rest: &mut &[u8]) -> Result<Event, String> {
 }
 
 fn masked_crc(bytes: &[u8]) -> u32 {
-    crc32c::crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
+    crc32c::crc32c(bytes)
+        .rotate_right(15)
+        .wrapping_add(0xa282_ead8)
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -164,7 +173,10 @@ mod tests {
         )
         .unwrap();
         let curves = read_curves(folder.path()).unwrap();
-        assert_eq!(curves["a"], BTreeMap::from([(1, vec![0.5, 7.0]), (2, vec![-1.0])]));
+        assert_eq!(
+            curves["a"],
+            BTreeMap::from([(1, vec![0.5, 7.0]), (2, vec![-1.0])])
+        );
         assert_eq!(curves["b"], BTreeMap::from([(1, vec![1.0])]));
     }
 

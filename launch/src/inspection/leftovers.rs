@@ -1,4 +1,5 @@
-//! What a run's processes hold of the machine, and may leave behind: other processes, shared memory, the transport's folder.
+//! What a run's processes hold of the machine, and may leave behind: other processes, shared
+//! memory, the transport's folder.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -39,7 +40,13 @@ pub fn footprint(id: RunId) -> Footprint {
 pub fn leftovers(run: &RunDirectory) -> Vec<String> {
     let mut found: Vec<_> = processes_of(run)
         .iter()
-        .map(|process| format!("process {} {:?}", process.pid.as_raw_nonzero(), process.command))
+        .map(|process| {
+            format!(
+                "process {} {:?}",
+                process.pid.as_raw_nonzero(),
+                process.command
+            )
+        })
         .collect();
     // Without an identity, nothing was started that could have left anything else.
     if let Ok((identity, _)) = run.open() {

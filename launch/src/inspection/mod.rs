@@ -1,7 +1,9 @@
-//! Looks at runs from outside: who is alive, what lies about on the machine, and whether two runs came to the same.
+//! Looks at runs from outside: who is alive, what lies about on the machine, and whether two runs
+//! came to the same.
 //!
-//! Nothing here takes part in a run. It is what `skein-chaos` and the whole-system tests judge by, so it trusts no program of ours: processes are
-//! those the kernel lists, results are read from the files.
+//! Nothing here takes part in a run. It is what `skein-chaos` and the whole-system tests judge by,
+//! so it trusts no program of ours: processes are those the kernel lists, results are read from the
+//! files.
 
 mod curves;
 mod leftovers;

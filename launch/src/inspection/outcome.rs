@@ -12,7 +12,8 @@ use skein_protocol::summary::Summary;
 
 use super::curves::{Curves, read_curves};
 
-/// Curves that tell of the machine and of what happened to the processes, not of what was learned: their values differ between any two runs.
+/// Curves that tell of the machine and of what happened to the processes, not of what was learned:
+/// their values differ between any two runs.
 const OF_THE_MACHINE: [&str; 3] = ["rate/", "reissued/", "refused/"];
 /// The column of `episodes.csv` that says who flew.
 const WHO_FLEW: &str = "actor";
@@ -110,11 +111,16 @@ fn episodes(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String>
     let (calm_header, calm_rows) = rows(&calm.episodes_csv())?;
     let (other_header, other_rows) = rows(&other.episodes_csv())?;
     if calm_header != other_header {
-        return Err(format!("columns {other_header:?} instead of {calm_header:?}"));
+        return Err(format!(
+            "columns {other_header:?} instead of {calm_header:?}"
+        ));
     }
     let who = calm_header.iter().position(|column| column == WHO_FLEW);
     let without_who = |row: &StringRecord| -> Vec<String> {
-        let told = row.iter().enumerate().filter(|&(column, _)| Some(column) != who);
+        let told = row
+            .iter()
+            .enumerate()
+            .filter(|&(column, _)| Some(column) != who);
         told.map(|(_, value)| value.to_owned()).collect()
     };
     for (number, (calm, other)) in calm_rows.iter().zip(&other_rows).enumerate() {
@@ -127,9 +133,14 @@ fn episodes(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String>
 }
 
 fn snapshots(calm: &Path, other: &Path) -> Result<String, String> {
-    // The file holds paths of course files in its configuration, and those of no two directories are equal.
+    // The file holds paths of course files in its configuration, and those of no two directories
+    // are equal.
     let load = |path: &Path| match Snapshot::load(path) {
-        Ok((snapshot, _)) => Ok(format!("version {}, {}", snapshot.version, snapshot.sha256())),
+        Ok((snapshot, _)) => Ok(format!(
+            "version {}, {}",
+            snapshot.version,
+            snapshot.sha256()
+        )),
         Err(_) if !path.exists() => Ok("none".to_owned()),
         Err(error) => Err(with_causes(&error)),
     };
@@ -141,7 +152,11 @@ fn snapshots(calm: &Path, other: &Path) -> Result<String, String> {
 fn bytes(calm: &Path, other: &Path) -> Result<String, String> {
     let read = |path: &Path| fs::read(path).map_err(|error| format!("{}: {error}", path.display()));
     let (calm, other) = (read(calm)?, read(other)?);
-    match calm.iter().zip(&other).position(|(calm, other)| calm != other) {
+    match calm
+        .iter()
+        .zip(&other)
+        .position(|(calm, other)| calm != other)
+    {
         Some(at) => Err(format!("byte {at} differs")),
         None => {
             same(&calm.len(), &other.len()).map_err(|problem| format!("{problem} bytes"))?;
@@ -151,7 +166,8 @@ fn bytes(calm: &Path, other: &Path) -> Result<String, String> {
 }
 
 fn curves(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String> {
-    let read = |run: &RunDirectory| read_curves(&run.tensorboard()).map_err(|error| with_causes(&error));
+    let read =
+        |run: &RunDirectory| read_curves(&run.tensorboard()).map_err(|error| with_causes(&error));
     let (calm, other) = (read(calm)?, read(other)?);
     compare_curves(&calm, &other)?;
     let points: usize = calm.values().map(std::collections::BTreeMap::len).sum();
@@ -187,7 +203,8 @@ fn compare_curves(calm: &Curves, other: &Curves) -> Result<(), String> {
 mod tests {
     use super::*;
 
-    const HEADER: &str = "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n";
+    const HEADER: &str =
+        "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n";
 
     fn run_with(rows: &str) -> (tempfile::TempDir, RunDirectory) {
         let folder = tempfile::tempdir().unwrap();
@@ -199,11 +216,13 @@ mod tests {
     #[test]
     fn who_flew_is_no_difference_and_anything_else_is() {
         let (_calm, calm) = run_with("0,0,0,0,1,20,1,0.5,collided\n1,0,0,1,1,20,1,0.5,collided\n");
-        let (_other, other) = run_with("0,0,0,7,1,20,1,0.5,collided\n1,0,0,7,1,20,1,0.5,collided\n");
+        let (_other, other) =
+            run_with("0,0,0,7,1,20,1,0.5,collided\n1,0,0,7,1,20,1,0.5,collided\n");
         assert_eq!(episodes(&calm, &other), Ok("2 rows".to_owned()));
         let (_short, short) = run_with("0,0,0,7,1,20,1,0.5,collided\n");
         assert!(episodes(&calm, &short).is_err());
-        let (_changed, changed) = run_with("0,0,0,7,1,20,1,0.5,collided\n1,0,0,7,1,20,1,0.50000006,collided\n");
+        let (_changed, changed) =
+            run_with("0,0,0,7,1,20,1,0.5,collided\n1,0,0,7,1,20,1,0.50000006,collided\n");
         assert!(episodes(&calm, &changed).unwrap_err().contains("row 1"));
     }
 
@@ -219,14 +238,26 @@ mod tests {
 
     #[test]
     fn a_hole_a_duplicate_and_another_value_are_differences() {
-        let calm = curves_of(&[("sac/loss", 1, 0.5), ("sac/loss", 2, 0.25), ("rate/steps", 1, 100.0)]);
+        let calm = curves_of(&[
+            ("sac/loss", 1, 0.5),
+            ("sac/loss", 2, 0.25),
+            ("rate/steps", 1, 100.0),
+        ]);
         let problem = |points: &[_]| compare_curves(&calm, &curves_of(points)).unwrap_err();
-        let sound = [("sac/loss", 1, 0.5), ("sac/loss", 2, 0.25), ("rate/steps", 1, 99.0)];
+        let sound = [
+            ("sac/loss", 1, 0.5),
+            ("sac/loss", 2, 0.25),
+            ("rate/steps", 1, 99.0),
+        ];
         assert_eq!(compare_curves(&calm, &curves_of(&sound)), Ok(()));
         assert!(problem(&[sound[0], sound[2]]).contains("hole at 2"));
         assert!(problem(&[sound[0], sound[1], sound[1], sound[2]]).contains("2 points at 2"));
-        assert!(problem(&[sound[0], ("sac/loss", 2, 0.26), sound[2]]).contains("0.26 instead of 0.25"));
+        assert!(
+            problem(&[sound[0], ("sac/loss", 2, 0.26), sound[2]]).contains("0.26 instead of 0.25")
+        );
         assert!(problem(&[sound[0], sound[1]]).contains("only one"));
-        assert!(problem(&[sound[0], sound[1], sound[2], ("rate/steps", 3, 1.0)]).contains("calm run"));
+        assert!(
+            problem(&[sound[0], sound[1], sound[2], ("rate/steps", 3, 1.0)]).contains("calm run")
+        );
     }
 }

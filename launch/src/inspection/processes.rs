@@ -14,7 +14,8 @@ pub struct Process {
     pub pid: Pid,
     /// Program and arguments.
     pub command: Vec<String>,
-    /// When it was started, in clock ticks since the machine was: tells it from a later process of the same number.
+    /// When it was started, in clock ticks since the machine was: tells it from a later process of
+    /// the same number.
     started_ticks: u64,
 }
 
@@ -87,7 +88,10 @@ impl Process {
 
     /// The actor's number, of an actor.
     pub fn actor(&self) -> Option<u32> {
-        let flag = self.command.iter().position(|argument| argument == "--id")?;
+        let flag = self
+            .command
+            .iter()
+            .position(|argument| argument == "--id")?;
         self.command.get(flag + 1)?.parse().ok()
     }
 
@@ -133,8 +137,19 @@ impl Process {
         let figure = |key: &str| {
             status
                 .lines()
-                .find_map(|line| line.strip_prefix(key)?.split_whitespace().next()?.parse::<u64>().ok())
-                .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, format!("no {key} in {}", folder.display())))
+                .find_map(|line| {
+                    line.strip_prefix(key)?
+                        .split_whitespace()
+                        .next()?
+                        .parse::<u64>()
+                        .ok()
+                })
+                .ok_or_else(|| {
+                    io::Error::new(
+                        io::ErrorKind::InvalidData,
+                        format!("no {key} in {}", folder.display()),
+                    )
+                })
         };
         Ok(Usage {
             resident_bytes: figure("VmRSS:")? * 1024,
@@ -160,7 +175,8 @@ struct Stat {
 /// Of the process that `folder` in /proc is about; `None` when there is none.
 fn stat(folder: &Path) -> Option<Stat> {
     let stat = fs::read_to_string(folder.join("stat")).ok()?;
-    // The program's name, in brackets, may hold anything, brackets and blanks included. Field 3, the state, follows: proc_pid_stat(5).
+    // The program's name, in brackets, may hold anything, brackets and blanks included. Field 3,
+    // the state, follows: proc_pid_stat(5).
     let fields: Vec<_> = stat[stat.rfind(')')? + 1..].split_whitespace().collect();
     let field = |number: usize| fields.get(number - 3);
     Some(Stat {
@@ -170,7 +186,8 @@ fn stat(folder: &Path) -> Option<Stat> {
     })
 }
 
-/// The living processes that were given the run's directory as an argument: all of its own are. In the order in which they were started.
+/// The living processes that were given the run's directory as an argument: all of its own are. In
+/// the order in which they were started.
 pub fn processes_of(run: &RunDirectory) -> Vec<Process> {
     let directory = run.root().to_string_lossy();
     let process = |entry: fs::DirEntry| {
@@ -253,7 +270,9 @@ mod tests {
         // Just after exec it has hardly a page yet.
         until(|| {
             let usage = process.usage().unwrap();
-            usage.threads == 1 && usage.descriptors >= 3 && usage.resident_bytes > usage.anonymous_bytes
+            usage.threads == 1
+                && usage.descriptors >= 3
+                && usage.resident_bytes > usage.anonymous_bytes
         });
         process.signal(Signal::STOP);
         until(|| process.is_frozen());
@@ -269,6 +288,9 @@ mod tests {
     #[test]
     fn the_processes_of_another_run_are_not_found() {
         let _sleeper = Sleeper::given("/no-run-has-this-name/here");
-        assert_eq!(processes_of(&RunDirectory::new("/no-run-has-this-name/there")), []);
+        assert_eq!(
+            processes_of(&RunDirectory::new("/no-run-has-this-name/there")),
+            []
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! Whether a configuration can be flown: its simulator settings, its courses, and what only shows when they are seen together.
+//! Whether a configuration can be flown: its simulator settings, its courses, and what only shows
+//! when they are seen together.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -9,8 +10,13 @@ use skein_simulator::simulator::{Simulator, SimulatorSettings};
 
 use super::PrepareError;
 
-/// Checks everything that must hold for `actors` actors to fly for `config`, which was read from `config_file`, and returns the simulator's settings.
-pub(crate) fn check(config_file: &Path, config: &Config, actors: usize) -> Result<SimulatorSettings, PrepareError> {
+/// Checks everything that must hold for `actors` actors to fly for `config`, which was read from
+/// `config_file`, and returns the simulator's settings.
+pub(crate) fn check(
+    config_file: &Path,
+    config: &Config,
+    actors: usize,
+) -> Result<SimulatorSettings, PrepareError> {
     let in_file = || config_file.to_owned();
     let settings: SimulatorSettings =
         config
@@ -21,7 +27,12 @@ pub(crate) fn check(config_file: &Path, config: &Config, actors: usize) -> Resul
                 config: in_file(),
                 problem: error.to_string().trim_end().replace('\n', " "),
             })?;
-    for path in config.courses.evaluation.iter().chain([&config.courses.training]) {
+    for path in config
+        .courses
+        .evaluation
+        .iter()
+        .chain([&config.courses.training])
+    {
         let course = Arc::new(Course::load(path)?);
         Simulator::new(course, &settings).map_err(|source| PrepareError::Settings {
             config: in_file(),
@@ -36,12 +47,18 @@ pub(crate) fn check(config_file: &Path, config: &Config, actors: usize) -> Resul
     )?;
     let trains_on_generated = config.courses.generated_share > 0.0;
     if trains_on_generated || config.evaluation.confirm_on == ConfirmOn::Generated {
-        let course = Course::generate(0, &settings.generator).map_err(|source| PrepareError::Ranges {
-            config: in_file(),
-            source,
-        })?;
+        let course =
+            Course::generate(0, &settings.generator).map_err(|source| PrepareError::Ranges {
+                config: in_file(),
+                source,
+            })?;
         if trains_on_generated {
-            check_level_count(config_file, config, &course, &"[simulator.generator] wall_x_m")?;
+            check_level_count(
+                config_file,
+                config,
+                &course,
+                &"[simulator.generator] wall_x_m",
+            )?;
         }
     }
     let records = config.transport.max_records_per_episode;
@@ -60,7 +77,8 @@ pub(crate) fn check(config_file: &Path, config: &Config, actors: usize) -> Resul
     Ok(settings)
 }
 
-/// Whether training can start from every level it is to start from on `course`, which the user knows as `name`.
+/// Whether training can start from every level it is to start from on `course`, which the user
+/// knows as `name`.
 fn check_level_count(
     config_file: &Path,
     config: &Config,
@@ -80,7 +98,12 @@ fn check_level_count(
 }
 
 /// Adds to the `error` of a check the override that brought it about, if one did.
-pub(super) fn blame(error: PrepareError, config_file: &Path, overrides: &[String], actors: usize) -> PrepareError {
+pub(super) fn blame(
+    error: PrepareError,
+    config_file: &Path,
+    overrides: &[String],
+    actors: usize,
+) -> PrepareError {
     let told = |overrides: &[String]| {
         let checked = Config::load(config_file, overrides)
             .map_err(PrepareError::from)

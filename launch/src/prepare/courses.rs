@@ -28,7 +28,8 @@ pub fn load_courses(config: &Config) -> Result<Vec<NamedCourse>, CourseError> {
     config.courses.evaluation.iter().map(load).collect()
 }
 
-/// Walls that an agent which passes every wall of the training course would pass an episode, on average over all start levels.
+/// Walls that an agent which passes every wall of the training course would pass an episode, on
+/// average over all start levels.
 ///
 /// # Errors
 /// [`CourseError`] names the file, the wall and the key.

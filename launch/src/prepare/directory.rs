@@ -1,4 +1,5 @@
-//! The directory of a new run: created, filled with copies, and taken back if the run does not come to incarnation.
+//! The directory of a new run: created, filled with copies, and taken back if the run does not come
+//! to incarnation.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -79,7 +80,8 @@ impl NewDirectory {
     }
 }
 
-/// Copies the course files into the run's directory and has the configuration name the copies: what was flown stays known when the originals change.
+/// Copies the course files into the run's directory and has the configuration name the copies: what
+/// was flown stays known when the originals change.
 pub(super) fn copy_courses(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
     let folder = RunDirectory::new(root).courses();
     fs::create_dir_all(&folder).map_err(|source| PrepareError::Io {

@@ -1,6 +1,8 @@
-//! Everything that can be checked before the first process of a run is started, and the run's directory.
+//! Everything that can be checked before the first process of a run is started, and the run's
+//! directory.
 //!
-//! A mistake in a configuration or a course file is found here, in the terminal of whoever made it, and not in the log of the third actor.
+//! A mistake in a configuration or a course file is found here, in the terminal of whoever made it,
+//! and not in the log of the third actor.
 
 mod checks;
 mod courses;
@@ -36,8 +38,8 @@ pub struct Prepared {
     pub new: Option<NewDirectory>,
 }
 
-/// Checks the configuration in `config_file` with `overrides`, the courses it names, the number of `actors` and the machine's room for them; then creates
-/// `run_directory` with copies of it all.
+/// Checks the configuration in `config_file` with `overrides`, the courses it names, the number of
+/// `actors` and the machine's room for them; then creates `run_directory` with copies of it all.
 ///
 /// # Errors
 /// [`PrepareError`] names file, key and remedy; nothing was created then.
@@ -64,15 +66,19 @@ pub fn prepare(
     }
 }
 
-/// The configuration in `config_file` with `overrides`, checked as that of a run with `actors` actors is, with all that the simulator was not told written
-/// out.
+/// The configuration in `config_file` with `overrides`, checked as that of a run with `actors`
+/// actors is, with all that the simulator was not told written out.
 ///
 /// # Errors
 /// [`PrepareError`] names file, key and remedy, and the override that is to blame.
-pub fn resolve(config_file: &Path, overrides: &[String], actors: usize) -> Result<Config, PrepareError> {
+pub fn resolve(
+    config_file: &Path,
+    overrides: &[String],
+    actors: usize,
+) -> Result<Config, PrepareError> {
     let mut config = Config::load(config_file, overrides)?;
-    let settings =
-        check(config_file, &config, actors).map_err(|error| checks::blame(error, config_file, overrides, actors))?;
+    let settings = check(config_file, &config, actors)
+        .map_err(|error| checks::blame(error, config_file, overrides, actors))?;
     config.simulator = written_out(&settings);
     Ok(config)
 }
@@ -93,7 +99,8 @@ fn fill(new: &NewDirectory, mut config: Config) -> Result<Prepared, PrepareError
     })
 }
 
-/// The `[simulator]` section with the defaults of all that was not set: what was flown stays known when the defaults change.
+/// The `[simulator]` section with the defaults of all that was not set: what was flown stays known
+/// when the defaults change.
 fn written_out(settings: &SimulatorSettings) -> toml::Table {
     // By way of text: a number of single precision would drag the digits of its double along.
     let text = toml::to_string(settings).expect("every setting is representable in TOML");

@@ -1,5 +1,6 @@
-//! Whether the machine has room for a run: shared memory that is used up ends a process with SIGBUS in the middle of an episode, a full disk stops the
-//! learner until there is room again. Both can be foreseen.
+//! Whether the machine has room for a run: shared memory that is used up ends a process with SIGBUS
+//! in the middle of an episode, a full disk stops the learner until there is room again. Both can
+//! be foreseen.
 
 use std::path::{Path, PathBuf};
 
@@ -16,8 +17,9 @@ const FOLDERS: &str = "/tmp";
 /// More than the small files of a hundred actors take: a dozen each, of a block each.
 const TRANSPORT_FILES: u64 = 8 << 20;
 const MIB: u64 = 1 << 20;
-/// All that is trained, targets and moments, in snapshots of the same configuration. 23 were measured: `tensors.safetensors` of a checkpoint of
-/// `tests/small.toml` has 73.1 MB, `latest.safetensors` 3.2 MB.
+/// All that is trained, targets and moments, in snapshots of the same configuration. 23 were
+/// measured: `tensors.safetensors` of a checkpoint of `tests/small.toml` has 73.1 MB,
+/// `latest.safetensors` 3.2 MB.
 const CHECKPOINT_SNAPSHOTS: u64 = 24;
 
 /// There is less shared memory than a run needs.
@@ -42,19 +44,28 @@ pub struct SharedMemoryTooSmall {
     enough: u64,
 }
 
-/// Checks that there is shared memory for a learner and `actors` actors with `config`. Where it cannot be asked for, nothing is foreseen.
+/// Checks that there is shared memory for a learner and `actors` actors with `config`. Where it
+/// cannot be asked for, nothing is foreseen.
 ///
 /// # Errors
 /// [`SharedMemoryTooSmall`] names what is needed, what there is, and the remedy.
 pub fn check_shared_memory(config: &Config, actors: usize) -> Result<(), SharedMemoryTooSmall> {
-    check_memory_in(Path::new(SHARED_MEMORY), actors, shared_memory_needed(config, actors))
+    check_memory_in(
+        Path::new(SHARED_MEMORY),
+        actors,
+        shared_memory_needed(config, actors),
+    )
 }
 
-/// Checks that there is shared memory for `actors` more actors of a run with `config` that is under way.
+/// Checks that there is shared memory for `actors` more actors of a run with `config` that is under
+/// way.
 ///
 /// # Errors
 /// [`SharedMemoryTooSmall`] names what is needed, what there is, and the remedy.
-pub fn check_shared_memory_for_more(config: &Config, actors: usize) -> Result<(), SharedMemoryTooSmall> {
+pub fn check_shared_memory_for_more(
+    config: &Config,
+    actors: usize,
+) -> Result<(), SharedMemoryTooSmall> {
     let needed = shared_memory_needed(config, actors) - shared_memory_needed(config, 0);
     check_memory_in(Path::new(SHARED_MEMORY), actors, needed)
 }
@@ -99,7 +110,8 @@ pub fn free_shared_memory() -> Option<u64> {
     space(Path::new(SHARED_MEMORY)).map(|space| space.free)
 }
 
-/// A warning, if the disk that `directory` lies on has no room for the checkpoints of a run with `config`.
+/// A warning, if the disk that `directory` lies on has no room for the checkpoints of a run with
+/// `config`.
 pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
     let free = space(directory)?.free;
     // The one being written lies beside those that are kept.
@@ -115,7 +127,8 @@ pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
     })
 }
 
-/// Bytes of a checkpoint when the replay buffer is as full as it can become, with the depth images that are learned from.
+/// Bytes of a checkpoint when the replay buffer is as full as it can become, with the depth images
+/// that are learned from.
 fn checkpoint_bytes(config: &Config) -> u64 {
     let learning = &config.learning;
     let records = (config.transport.max_records_per_episode * learning.times_stored()) as u64;

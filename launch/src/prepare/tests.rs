@@ -33,10 +33,19 @@ pub(crate) fn prepared_run(directory: &Path) -> Prepared {
 fn a_prepared_run_holds_copies_of_all_it_needs() {
     let directory = tempfile::tempdir().unwrap();
     let config = config_file(directory.path(), "");
-    let prepared = prepare(&config, &["run.seed=7".to_owned()], &directory.path().join("run"), 2).unwrap();
+    let prepared = prepare(
+        &config,
+        &["run.seed=7".to_owned()],
+        &directory.path().join("run"),
+        2,
+    )
+    .unwrap();
     assert_eq!(prepared.config.run.seed, 7);
     let root = directory.path().join("run").canonicalize().unwrap();
-    assert_eq!(prepared.config.courses.training, root.join("courses/training.toml"));
+    assert_eq!(
+        prepared.config.courses.training,
+        root.join("courses/training.toml")
+    );
     assert_eq!(
         prepared.courses[0].course,
         Course::load(shipped("training.toml")).unwrap()
@@ -61,7 +70,10 @@ fn two_courses_of_one_file_name_stay_two() {
     let other = directory.path().join("training.toml");
     fs::copy(shipped("non_rectangular.toml"), &other).unwrap();
     let config = config_file(directory.path(), "");
-    let set = format!("courses.evaluation=[{:?}, {other:?}]", shipped("training.toml"));
+    let set = format!(
+        "courses.evaluation=[{:?}, {other:?}]",
+        shipped("training.toml")
+    );
     let prepared = prepare(&config, &[set], &directory.path().join("run"), 1).unwrap();
     assert_eq!(prepared.courses.len(), 2);
     assert_ne!(prepared.courses[0].course, prepared.courses[1].course);
@@ -75,7 +87,12 @@ fn two_courses_of_one_file_name_stay_two() {
 fn what_cannot_run_is_refused_before_anything_is_created() {
     let directory = tempfile::tempdir().unwrap();
     for (text, set, actors, expected) in [
-        ("[run]\nseed = -1", "", 1, vec!["test.toml", "[run]", "seed"]),
+        (
+            "[run]\nseed = -1",
+            "",
+            1,
+            vec!["test.toml", "[run]", "seed"],
+        ),
         (
             "[simulator]\nmax_step = 1",
             "",
@@ -87,7 +104,11 @@ fn what_cannot_run_is_refused_before_anything_is_created() {
             "[simulator]\nmax_steps = 256",
             "",
             1,
-            vec!["max_steps = 256", "transport.max_records_per_episode = 256", "257"],
+            vec![
+                "max_steps = 256",
+                "transport.max_records_per_episode = 256",
+                "257",
+            ],
         ),
         (
             "",
@@ -99,19 +120,31 @@ fn what_cannot_run_is_refused_before_anything_is_created() {
             "",
             "simulator.max_step=1",
             1,
-            vec!["with --set simulator.max_step=1, ", "test.toml", "[simulator]"],
+            vec![
+                "with --set simulator.max_step=1, ",
+                "test.toml",
+                "[simulator]",
+            ],
         ),
         (
             "",
             "simulator.max_steps=256",
             1,
-            vec!["with --set simulator.max_steps=256, ", "max_records_per_episode"],
+            vec![
+                "with --set simulator.max_steps=256, ",
+                "max_records_per_episode",
+            ],
         ),
         (
             "[learning]\nlevels = 6",
             "",
             1,
-            vec!["test.toml", "learning.levels = 6", "5 walls", "training.toml"],
+            vec![
+                "test.toml",
+                "learning.levels = 6",
+                "5 walls",
+                "training.toml",
+            ],
         ),
         (
             "[simulator.generator]\nwall_x_m = [10.0, 20.0]",
@@ -139,7 +172,9 @@ fn what_cannot_run_is_refused_before_anything_is_created() {
             .map(ToString::to_string)
             .collect();
         let run = directory.path().join("run");
-        let error = prepare(&config, &overrides, &run, actors).unwrap_err().to_string();
+        let error = prepare(&config, &overrides, &run, actors)
+            .unwrap_err()
+            .to_string();
         for part in expected {
             assert!(error.contains(part), "`{error}` does not mention `{part}`");
         }
@@ -151,6 +186,11 @@ fn what_cannot_run_is_refused_before_anything_is_created() {
 fn a_used_directory_is_refused_with_a_remedy() {
     let directory = tempfile::tempdir().unwrap();
     let config = config_file(directory.path(), "");
-    let error = prepare(&config, &[], directory.path(), 1).unwrap_err().to_string();
-    assert!(error.contains("not empty") && error.contains("--run-dir"), "{error}");
+    let error = prepare(&config, &[], directory.path(), 1)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("not empty") && error.contains("--run-dir"),
+        "{error}"
+    );
 }

@@ -1,7 +1,8 @@
 //! A picture in memory, and the style all plots share.
 //!
-//! The plotting library leaves the edges of thick lines jagged. A canvas is therefore drawn [`SCALE`] times too large and averaged down when it is
-//! saved. Text is set in a font compiled into the program: a fresh machine may have none.
+//! The plotting library leaves the edges of thick lines jagged. A canvas is therefore drawn
+//! [`SCALE`] times too large and averaged down when it is saved. Text is set in a font compiled
+//! into the program: a fresh machine may have none.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter};
@@ -74,13 +75,24 @@ impl Canvas {
             .map_err(|error| ReportError::Draw(error.to_string()))
     }
 
-    /// Puts an 8-bit grey image of `image_width` columns with its corner at `corner` (saved pixels), each of its pixels `zoom` saved pixels wide.
+    /// Puts an 8-bit grey image of `image_width` columns with its corner at `corner` (saved
+    /// pixels), each of its pixels `zoom` saved pixels wide.
     ///
     /// # Panics
     /// If the image does not fit into the canvas.
-    pub(super) fn put_grey(&mut self, image: &[u8], image_width: usize, corner: (u32, u32), zoom: u32) {
+    pub(super) fn put_grey(
+        &mut self,
+        image: &[u8],
+        image_width: usize,
+        corner: (u32, u32),
+        zoom: u32,
+    ) {
         let stride = px(self.width) as usize;
-        let (left, top, side) = (px(corner.0) as usize, px(corner.1) as usize, px(zoom) as usize);
+        let (left, top, side) = (
+            px(corner.0) as usize,
+            px(corner.1) as usize,
+            px(zoom) as usize,
+        );
         for (row, line) in image.chunks_exact(image_width).enumerate() {
             for y in top + row * side..top + (row + 1) * side {
                 for (column, &grey) in line.iter().enumerate() {
@@ -109,7 +121,8 @@ impl Canvas {
         if let Some(directory) = path.parent() {
             fs::create_dir_all(directory)?;
         }
-        let mut encoder = png::Encoder::new(BufWriter::new(File::create(path)?), self.width, self.height);
+        let mut encoder =
+            png::Encoder::new(BufWriter::new(File::create(path)?), self.width, self.height);
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
         let mut writer = encoder.write_header()?;
@@ -141,8 +154,15 @@ impl Canvas {
 fn register_plot_font() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
-        let registered = register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
-        assert!(registered.is_ok(), "the font compiled into the program is a valid one");
+        let registered = register_font(
+            "sans-serif",
+            FontStyle::Normal,
+            epaint_default_fonts::UBUNTU_LIGHT,
+        );
+        assert!(
+            registered.is_ok(),
+            "the font compiled into the program is a valid one"
+        );
     });
 }
 
@@ -157,7 +177,10 @@ mod tests {
         let mut canvas = Canvas::new(10, 6);
         canvas
             .draw(|area| {
-                area.draw(&Rectangle::new([(0, 0), (px(5) as i32, px(6) as i32)], RED.filled()))?;
+                area.draw(&Rectangle::new(
+                    [(0, 0), (px(5) as i32, px(6) as i32)],
+                    RED.filled(),
+                ))?;
                 Ok(())
             })
             .unwrap();

@@ -1,4 +1,5 @@
-//! Several ways of training beside each other: a line each, and a band of what other seeds might have shown.
+//! Several ways of training beside each other: a line each, and a band of what other seeds might
+//! have shown.
 
 use std::path::Path;
 
@@ -16,7 +17,8 @@ const HEIGHT: u32 = 640;
 
 /// A level to compare with: no arm.
 const LEVEL: RGBColor = RGBColor(0x99, 0x9c, 0xa0);
-/// One colour a line, told apart by those who see colours differently too as far as so many can be (after Okabe and Ito).
+/// One colour a line, told apart by those who see colours differently too as far as so many can be
+/// (after Okabe and Ito).
 const COLOURS: [RGBColor; MOST_ARMS] = [
     STRONG,
     REFERENCE,
@@ -101,12 +103,21 @@ impl Comparison<'_> {
         if let Some((level, label)) = &self.level {
             let ends = [(0.0, *level), (self.furthest(), *level)];
             chart
-                .draw_series(DashedLineSeries::new(ends, px(8), px(6), LEVEL.stroke_width(px(2))))?
+                .draw_series(DashedLineSeries::new(
+                    ends,
+                    px(8),
+                    px(6),
+                    LEVEL.stroke_width(px(2)),
+                ))?
                 .label(label)
                 .legend(|point| legend_line(point, LEVEL));
         }
         for (line, colour) in self.lines.iter().zip(COLOURS) {
-            let points: Vec<_> = line.points.iter().map(|(x, estimate)| (*x, estimate.value)).collect();
+            let points: Vec<_> = line
+                .points
+                .iter()
+                .map(|(x, estimate)| (*x, estimate.value))
+                .collect();
             chart
                 .draw_series(thick_line(&points, colour, px(2)))?
                 .label(line.label)
@@ -132,17 +143,23 @@ impl Comparison<'_> {
     fn ranges(&self) -> (std::ops::Range<f64>, std::ops::Range<f64>) {
         let mut values: Vec<f64> = self.level.iter().map(|level| level.0).collect();
         for (_, estimate) in self.lines.iter().flat_map(|line| &line.points) {
-            let (low, high) = estimate.interval.unwrap_or((estimate.value, estimate.value));
+            let (low, high) = estimate
+                .interval
+                .unwrap_or((estimate.value, estimate.value));
             values.extend([low, high]);
         }
         let (low, high) = padded_range(&values);
         // What cannot be negative has no axis below zero.
         let is_negative = values.iter().any(|value| *value < 0.0);
-        (0.0..self.furthest().max(1.0), if is_negative { low } else { 0.0 }..high)
+        (
+            0.0..self.furthest().max(1.0),
+            if is_negative { low } else { 0.0 }..high,
+        )
     }
 }
 
-/// The corners of a line's band: along the upper ends of its intervals, and back along the lower ones. `None` where there are no intervals.
+/// The corners of a line's band: along the upper ends of its intervals, and back along the lower
+/// ones. `None` where there are no intervals.
 fn band(line: &Line<'_>) -> Option<Vec<(f64, f64)>> {
     let ends: Option<Vec<_>> = line
         .points

@@ -23,8 +23,9 @@ pub(crate) struct EpisodeRow {
     pub(crate) episode_return: f64,
 }
 
-/// No return is larger: an episode has at most 65536 records, of rewards up to `skein_protocol::transition::LARGEST_NUMBER`. An axis much longer than any
-/// return would take for ever to divide.
+/// No return is larger: an episode has at most 65536 records, of rewards up to
+/// `skein_protocol::transition::LARGEST_NUMBER`. An axis much longer than any return would take for
+/// ever to divide.
 const LARGEST_RETURN: f64 = 1e12;
 
 /// Reads `episodes.csv`.
@@ -44,19 +45,29 @@ pub(crate) fn read_episodes(path: &Path) -> Result<Vec<EpisodeRow>, ReportError>
         let row: EpisodeRow = row.map_err(|error| malformed(error.to_string()))?;
         if !(-LARGEST_RETURN..=LARGEST_RETURN).contains(&row.episode_return) {
             let (line, value) = (rows.reader().position().line() - 1, row.episode_return);
-            return Err(malformed(format!("line {line}: a return of {value} is none")));
+            return Err(malformed(format!(
+                "line {line}: a return of {value} is none"
+            )));
         }
         episodes.push(row);
     }
     Ok(episodes)
 }
 
-/// Draws the return of every episode and its moving average over `window` episodes (paper, figure 9).
+/// Draws the return of every episode and its moving average over `window` episodes (paper, figure
+/// 9).
 ///
 /// # Errors
 /// [`ReportError`] if the picture cannot be drawn or written.
-pub(super) fn draw_return(episodes: &[EpisodeRow], window: usize, path: &Path) -> Result<(), ReportError> {
-    let values: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
+pub(super) fn draw_return(
+    episodes: &[EpisodeRow],
+    window: usize,
+    path: &Path,
+) -> Result<(), ReportError> {
+    let values: Vec<f64> = episodes
+        .iter()
+        .map(|episode| episode.episode_return)
+        .collect();
     Curve {
         title: "Return of the training episodes".to_owned(),
         y_label: "return",
@@ -69,8 +80,8 @@ pub(super) fn draw_return(episodes: &[EpisodeRow], window: usize, path: &Path) -
     .save(path)
 }
 
-/// Draws the walls passed, averaged over `window` episodes (paper, figure 10). `ideal` is what an agent that passes every wall would average: episodes
-/// start at each of the levels in turn.
+/// Draws the walls passed, averaged over `window` episodes (paper, figure 10). `ideal` is what an
+/// agent that passes every wall would average: episodes start at each of the levels in turn.
 ///
 /// # Errors
 /// [`ReportError`] if the picture cannot be drawn or written.
@@ -80,7 +91,10 @@ pub(super) fn draw_walls_passed(
     ideal: f64,
     path: &Path,
 ) -> Result<(), ReportError> {
-    let values: Vec<f64> = episodes.iter().map(|episode| f64::from(episode.walls_passed)).collect();
+    let values: Vec<f64> = episodes
+        .iter()
+        .map(|episode| f64::from(episode.walls_passed))
+        .collect();
     Curve {
         title: format!("Walls passed, average over {window} episodes"),
         y_label: "walls passed",
@@ -166,12 +180,19 @@ impl Curve {
                         .map(|point| Circle::new(at(point), px(2), STRONG.mix(0.28).filled())),
                 )?
                 .label("one episode")
-                .legend(|(x, y)| Circle::new((x + px(12) as i32, y), px(3), STRONG.mix(0.4).filled()));
+                .legend(|(x, y)| {
+                    Circle::new((x + px(12) as i32, y), px(3), STRONG.mix(0.4).filled())
+                });
         }
         if let Some((level, label)) = &self.level {
             let ends = [(1.0, *level), (episodes as f64, *level)];
             chart
-                .draw_series(DashedLineSeries::new(ends, px(8), px(6), REFERENCE.stroke_width(px(2))))?
+                .draw_series(DashedLineSeries::new(
+                    ends,
+                    px(8),
+                    px(6),
+                    REFERENCE.stroke_width(px(2)),
+                ))?
                 .label(label)
                 .legend(|point| legend_line(point, REFERENCE));
         }
@@ -181,7 +202,11 @@ impl Curve {
         let points: Vec<_> = mean.iter().enumerate().map(at).collect();
         chart.draw_series(thick_line(&points[..filling], FAINT, px(2)))?;
         chart
-            .draw_series(thick_line(&points[filling.saturating_sub(1)..], STRONG, px(2)))?
+            .draw_series(thick_line(
+                &points[filling.saturating_sub(1)..],
+                STRONG,
+                px(2),
+            ))?
             .label(format!("average over {} episodes", self.window))
             .legend(|point| legend_line(point, STRONG));
 
@@ -198,7 +223,8 @@ impl Curve {
     }
 }
 
-/// A line of `width` drawn pixels, segment by segment: the library's own leaves holes where a thick line turns sharply.
+/// A line of `width` drawn pixels, segment by segment: the library's own leaves holes where a thick
+/// line turns sharply.
 pub(super) fn thick_line(
     points: &[(f64, f64)],
     colour: RGBColor,
@@ -234,7 +260,10 @@ mod tests {
 
     #[test]
     fn trailing_mean_equals_the_mean_by_hand() {
-        assert_eq!(trailing_mean(&[1.0, 3.0, 5.0, 1.0], 2), [1.0, 2.0, 4.0, 3.0]);
+        assert_eq!(
+            trailing_mean(&[1.0, 3.0, 5.0, 1.0], 2),
+            [1.0, 2.0, 4.0, 3.0]
+        );
         assert_eq!(trailing_mean(&[2.0, 4.0], 50), [2.0, 3.0]);
         assert!(trailing_mean(&[], 50).is_empty());
     }
@@ -251,9 +280,16 @@ mod tests {
     fn a_damaged_row_is_named_by_its_line() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("episodes.csv");
-        std::fs::write(&path, "episode,steps,walls_passed,return\n0,9,2,1.5\n1,9,two,1.5\n").unwrap();
+        std::fs::write(
+            &path,
+            "episode,steps,walls_passed,return\n0,9,2,1.5\n1,9,two,1.5\n",
+        )
+        .unwrap();
         let error = read_episodes(&path).unwrap_err().to_string();
-        assert!(error.contains("episodes.csv") && error.contains("line: 3"), "{error}");
+        assert!(
+            error.contains("episodes.csv") && error.contains("line: 3"),
+            "{error}"
+        );
     }
 
     #[test]

@@ -41,7 +41,12 @@ pub fn draw(growth: &Growth, figures: &Figures, path: &Path) -> Result<bool, Rep
             points: figures
                 .series(&series.of)
                 .into_iter()
-                .filter_map(|(x, figure)| Some((x, figure.shown(series.show, &series.unit, series.scale).ok()?)))
+                .filter_map(|(x, figure)| {
+                    Some((
+                        x,
+                        figure.shown(series.show, &series.unit, series.scale).ok()?,
+                    ))
+                })
                 .filter(|&(x, y)| x > 0.0 && y > 0.0 && x.is_finite() && y.is_finite())
                 .collect(),
         })
@@ -56,16 +61,31 @@ pub fn draw(growth: &Growth, figures: &Figures, path: &Path) -> Result<bool, Rep
     Ok(true)
 }
 
-fn draw_lines(area: &Area<'_>, growth: &Growth, lines: &[Line<'_>]) -> Result<(), Box<dyn std::error::Error>> {
-    let xs = bounds(lines.iter().flat_map(|line| line.points.iter().map(|point| point.0)));
-    let ys = bounds(lines.iter().flat_map(|line| line.points.iter().map(|point| point.1)));
+fn draw_lines(
+    area: &Area<'_>,
+    growth: &Growth,
+    lines: &[Line<'_>],
+) -> Result<(), Box<dyn std::error::Error>> {
+    let xs = bounds(
+        lines
+            .iter()
+            .flat_map(|line| line.points.iter().map(|point| point.0)),
+    );
+    let ys = bounds(
+        lines
+            .iter()
+            .flat_map(|line| line.points.iter().map(|point| point.1)),
+    );
     let mut chart = ChartBuilder::on(area)
         .caption(&growth.title, font(20))
         .margin(px(14))
         .margin_right(px(26))
         .x_label_area_size(px(46))
         .y_label_area_size(px(76))
-        .build_cartesian_2d((xs.0 / 1.15..xs.1 * 1.15).log_scale(), decades(ys).log_scale())?;
+        .build_cartesian_2d(
+            (xs.0 / 1.15..xs.1 * 1.15).log_scale(),
+            decades(ys).log_scale(),
+        )?;
     chart
         .configure_mesh()
         .label_style(font(14))
@@ -84,10 +104,18 @@ fn draw_lines(area: &Area<'_>, growth: &Growth, lines: &[Line<'_>]) -> Result<()
         let colour = line.colour;
         let segments = line.points.windows(2);
         chart
-            .draw_series(segments.map(|ends| PathElement::new(ends.to_vec(), colour.stroke_width(px(2)))))?
+            .draw_series(
+                segments.map(|ends| PathElement::new(ends.to_vec(), colour.stroke_width(px(2)))),
+            )?
             .label(line.label)
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + px(24) as i32, y)], colour.stroke_width(px(3))));
-        chart.draw_series(line.points.iter().map(|&at| Circle::new(at, px(4), colour.filled())))?;
+            .legend(move |(x, y)| {
+                PathElement::new([(x, y), (x + px(24) as i32, y)], colour.stroke_width(px(3)))
+            });
+        chart.draw_series(
+            line.points
+                .iter()
+                .map(|&at| Circle::new(at, px(4), colour.filled())),
+        )?;
     }
     chart
         .configure_series_labels()
@@ -120,5 +148,8 @@ pub(super) fn brief(value: f64) -> String {
         value => (value, ""),
     };
     let digits = format!("{value:.6}");
-    format!("{}{suffix}", digits.trim_end_matches('0').trim_end_matches('.'))
+    format!(
+        "{}{suffix}",
+        digits.trim_end_matches('0').trim_end_matches('.')
+    )
 }

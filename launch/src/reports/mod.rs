@@ -1,6 +1,7 @@
 //! Plots of a run, drawn from the files it left.
 //!
-//! Nothing here asks a running process: whatever a run wrote before it ended, however it ended, can be drawn again later.
+//! Nothing here asks a running process: whatever a run wrote before it ended, however it ended, can
+//! be drawn again later.
 
 mod canvas;
 pub mod comparison;
@@ -78,12 +79,15 @@ impl Material {
     }
 }
 
-/// Draws every plot whose input the run left, and returns the pictures. A run that ended early has fewer.
+/// Draws every plot whose input the run left, and returns the pictures. A run that ended early has
+/// fewer.
 ///
-/// `courses` are those of the final evaluation; `window` is the number of episodes averaged over, and `ideal_walls_passed` what a perfect agent would average.
+/// `courses` are those of the final evaluation; `window` is the number of episodes averaged over,
+/// and `ideal_walls_passed` what a perfect agent would average.
 ///
 /// # Errors
-/// [`ReportError`] names the file that is there but cannot be used, or the picture that cannot be written.
+/// [`ReportError`] names the file that is there but cannot be used, or the picture that cannot be
+/// written.
 pub fn draw_all(
     run: &RunDirectory,
     courses: &[NamedCourse],
@@ -99,7 +103,12 @@ pub fn draw_all(
     };
     if let Some(episodes) = &material.episodes {
         curves::draw_return(episodes, window, &picture("return.png"))?;
-        curves::draw_walls_passed(episodes, window, ideal_walls_passed, &picture("walls_passed.png"))?;
+        curves::draw_walls_passed(
+            episodes,
+            window,
+            ideal_walls_passed,
+            &picture("walls_passed.png"),
+        )?;
     }
     if let Some(pairs) = &material.reconstructions {
         reconstructions::draw(pairs, &picture("reconstructions.png"))?;
@@ -145,14 +154,17 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         write_episodes(&run);
-        let rows =
-            "course,episode,step,x_m,y_m,z_m,outcome\ntraining,0,0,1.5,0,3,collided\ntraining,0,1,9.7,1,3,collided\n";
+        let rows = "course,episode,step,x_m,y_m,z_m,outcome\ntraining,0,0,1.5,0,3,collided\ntraining,0,1,9.7,1,3,collided\n";
         fs::write(run.evaluation_trajectories_csv(), rows).unwrap();
         let image = vec![7; skein_protocol::IMAGE_PIXELS];
         let shape = vec![1, skein_protocol::IMAGE_HEIGHT, skein_protocol::IMAGE_WIDTH];
         let view = TensorView::new(Dtype::U8, shape, &image).unwrap();
         let tensors = [("depth", view.clone()), ("reconstruction", view)];
-        fs::write(run.reconstructions(), safetensors::serialize(tensors, None).unwrap()).unwrap();
+        fs::write(
+            run.reconstructions(),
+            safetensors::serialize(tensors, None).unwrap(),
+        )
+        .unwrap();
 
         let pictures = draw_all(&run, &[training()], 50, 3.0).unwrap();
         assert_eq!(pictures.len(), 4);

@@ -40,9 +40,12 @@ impl Pairs {
             path: path.to_owned(),
             problem,
         };
-        let tensors = SafeTensors::deserialize(&bytes).map_err(|error| malformed(error.to_string()))?;
+        let tensors =
+            SafeTensors::deserialize(&bytes).map_err(|error| malformed(error.to_string()))?;
         let images = |name: &str| {
-            let tensor = tensors.tensor(name).map_err(|error| malformed(error.to_string()))?;
+            let tensor = tensors
+                .tensor(name)
+                .map_err(|error| malformed(error.to_string()))?;
             match (tensor.dtype(), tensor.shape()) {
                 (Dtype::U8, [_, IMAGE_HEIGHT, IMAGE_WIDTH]) => Ok(tensor.data().to_vec()),
                 (dtype, shape) => Err(malformed(format!(
@@ -56,7 +59,10 @@ impl Pairs {
                 "the numbers of images and reconstructions differ or are zero".to_owned(),
             ));
         }
-        Ok(Self { depth, reconstruction })
+        Ok(Self {
+            depth,
+            reconstruction,
+        })
     }
 
     fn iter(&self) -> impl Iterator<Item = (&[u8], &[u8])> {

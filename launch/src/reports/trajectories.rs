@@ -70,7 +70,9 @@ pub(super) fn read_paths(path: &Path) -> Result<PathsByCourse, ReportError> {
             .all(|metres| (-LARGEST_NUMBER..=LARGEST_NUMBER).contains(metres))
         {
             let line = rows.reader().position().line() - 1;
-            return Err(malformed(format!("line {line}: no episode comes to {at_m:?}")));
+            return Err(malformed(format!(
+                "line {line}: no episode comes to {at_m:?}"
+            )));
         }
         let episodes = courses.entry(row.course.clone()).or_default();
         let key = Some((row.course, row.episode));
@@ -88,16 +90,25 @@ pub(super) fn read_paths(path: &Path) -> Result<PathsByCourse, ReportError> {
     Ok(courses)
 }
 
-/// Draws the episodes of each course from above and from the side. Courses nobody flew are left out.
+/// Draws the episodes of each course from above and from the side. Courses nobody flew are left
+/// out.
 ///
 /// # Errors
 /// [`ReportError`] if the picture cannot be drawn or written.
-pub(super) fn draw(courses: &[NamedCourse], paths: &PathsByCourse, path: &Path) -> Result<(), ReportError> {
+pub(super) fn draw(
+    courses: &[NamedCourse],
+    paths: &PathsByCourse,
+    path: &Path,
+) -> Result<(), ReportError> {
     let flown: Vec<_> = courses
         .iter()
         .filter_map(|NamedCourse { name, course }| Some((name, course, paths.get(name)?)))
         .collect();
-    let height = TOP + flown.iter().map(|(_, course, _)| block_height(course)).sum::<u32>();
+    let height = TOP
+        + flown
+            .iter()
+            .map(|(_, course, _)| block_height(course))
+            .sum::<u32>();
     let mut canvas = Canvas::new(WIDTH, height);
     canvas.draw(|area| {
         draw_legend(area)?;
@@ -111,8 +122,9 @@ pub(super) fn draw(courses: &[NamedCourse], paths: &PathsByCourse, path: &Path) 
     canvas.save(path)
 }
 
-/// Saved pixels per metre, the same along and across the corridor: angles in the picture are angles in the world. A corridor that is wider or higher than
-/// long does not fill the picture's width: its panels would be higher than memory is large.
+/// Saved pixels per metre, the same along and across the corridor: angles in the picture are angles
+/// in the world. A corridor that is wider or higher than long does not fill the picture's width:
+/// its panels would be higher than memory is large.
 fn pixels_per_metre(course: &Course) -> f32 {
     let corridor = course.corridor();
     let along = (WIDTH - LEFT - RIGHT) as f32 / corridor.length_m;
@@ -125,7 +137,11 @@ fn panel_height(course: &Course, view: View) -> u32 {
 }
 
 fn block_height(course: &Course) -> u32 {
-    CAPTION + panel_height(course, View::Above) + PANEL_GAP + panel_height(course, View::Side) + AXIS
+    CAPTION
+        + panel_height(course, View::Above)
+        + PANEL_GAP
+        + panel_height(course, View::Side)
+        + AXIS
 }
 
 /// From where the corridor is looked at.
@@ -193,7 +209,11 @@ impl Panel<'_> {
         [self.at(x_m.0, across_m.1), self.at(x_m.1, across_m.0)]
     }
 
-    fn draw(&self, area: &Area<'_>, episodes: &[Trajectory]) -> Result<(), Box<dyn std::error::Error>> {
+    fn draw(
+        &self,
+        area: &Area<'_>,
+        episodes: &[Trajectory],
+    ) -> Result<(), Box<dyn std::error::Error>> {
         let length_m = self.course.corridor().length_m;
         let (low, high) = self.view.range_m(self.course);
         area.draw(&Rectangle::new(
@@ -211,15 +231,25 @@ impl Panel<'_> {
             let x_m = (wall.x_m(), wall.x_m() + self.course.wall_thickness_m());
             let (open_low, open_high) = self.view.opening_m(wall);
             for across_m in [(low, open_low), (open_high, high)] {
-                area.draw(&Rectangle::new(self.rectangle(x_m, across_m), WALL.filled()))?;
+                area.draw(&Rectangle::new(
+                    self.rectangle(x_m, across_m),
+                    WALL.filled(),
+                ))?;
             }
         }
-        let outline = Rectangle::new(self.rectangle((0.0, length_m), (low, high)), WALL.stroke_width(px(2)));
+        let outline = Rectangle::new(
+            self.rectangle((0.0, length_m), (low, high)),
+            WALL.stroke_width(px(2)),
+        );
         area.draw(&outline)?;
         self.draw_scale(area)
     }
 
-    fn draw_episode(&self, area: &Area<'_>, episode: &Trajectory) -> Result<(), Box<dyn std::error::Error>> {
+    fn draw_episode(
+        &self,
+        area: &Area<'_>,
+        episode: &Trajectory,
+    ) -> Result<(), Box<dyn std::error::Error>> {
         let points: Vec<_> = episode
             .points_m
             .iter()
@@ -234,7 +264,10 @@ impl Panel<'_> {
             points.clone(),
             colour.mix(opacity).stroke_width(px(1)),
         ))?;
-        if let Some(&end) = points.last().filter(|_| episode.outcome != Outcome::ReachedEnd) {
+        if let Some(&end) = points
+            .last()
+            .filter(|_| episode.outcome != Outcome::ReachedEnd)
+        {
             area.draw(&Cross::new(end, px(5), colour.stroke_width(px(2))))?;
         }
         Ok(())
@@ -247,12 +280,20 @@ impl Panel<'_> {
         let right_aligned = font(14).pos(Pos::new(HPos::Right, VPos::Center));
         for across_m in [low, (low + high) / 2.0, high] {
             let (x, y) = self.at(0.0, across_m);
-            area.draw_text(&format!("{across_m}"), &right_aligned, (x - px(6) as i32, y))?;
+            area.draw_text(
+                &format!("{across_m}"),
+                &right_aligned,
+                (x - px(6) as i32, y),
+            )?;
         }
         let turned = font(14)
             .transform(FontTransform::Rotate270)
             .pos(Pos::new(HPos::Center, VPos::Center));
-        area.draw_text(self.view.axis_label(), &turned, (left - px(46) as i32, middle))?;
+        area.draw_text(
+            self.view.axis_label(),
+            &turned,
+            (left - px(46) as i32, middle),
+        )?;
         Ok(())
     }
 }
@@ -265,7 +306,12 @@ fn draw_course(
     top: u32,
 ) -> Result<(), Box<dyn std::error::Error>> {
     use plotters::style::text_anchor::{HPos, Pos, VPos};
-    let count = |outcome| episodes.iter().filter(|episode| episode.outcome == outcome).count();
+    let count = |outcome| {
+        episodes
+            .iter()
+            .filter(|episode| episode.outcome == outcome)
+            .count()
+    };
     let caption = format!(
         "{name}: {} episodes, {} reached the end, {} collided, {} timed out",
         episodes.len(),
@@ -296,7 +342,11 @@ fn draw_course(
 
 fn draw_legend(area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
     let y = px(22) as i32;
-    area.draw_text("Evaluation episodes", &font(22), (px(LEFT) as i32, y - px(11) as i32))?;
+    area.draw_text(
+        "Evaluation episodes",
+        &font(22),
+        (px(LEFT) as i32, y - px(11) as i32),
+    )?;
     let mut x = px(LEFT + 230) as i32;
     for (label, colour) in [
         ("reached the end", STRONG),
@@ -308,7 +358,11 @@ fn draw_legend(area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
             [(x, y), (x + px(26) as i32, y)],
             colour.stroke_width(px(3)),
         ))?;
-        area.draw_text(label, &font(16).color(&INK), (x + px(34) as i32, y - px(8) as i32))?;
+        area.draw_text(
+            label,
+            &font(16).color(&INK),
+            (x + px(34) as i32, y - px(8) as i32),
+        )?;
         x += px(60 + 9 * label.len() as u32) as i32;
     }
     Ok(())
@@ -344,7 +398,10 @@ mod tests {
                     start = { offset_m = 1.5, jitter_y_m = 0.0, jitter_z_m = 0.0 }\n\
                     [[wall]]\nlabel = 1\nshape = \"circle\"\ncentre_m = [0.0, 50.0]\ndiameter_m = 2.2\n";
         let hall = Course::parse(text, "hall.toml").unwrap();
-        assert_eq!(block_height(&hall), CAPTION + 2 * HIGHEST_PANEL + PANEL_GAP + AXIS);
+        assert_eq!(
+            block_height(&hall),
+            CAPTION + 2 * HIGHEST_PANEL + PANEL_GAP + AXIS
+        );
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! Actors that were added to a run under way. Its learner is none of their supervisor's business: they find it, and its next incarnations, by themselves.
+//! Actors that were added to a run under way. Its learner is none of their supervisor's business:
+//! they find it, and its next incarnations, by themselves.
 
 use skein_protocol::summary::Summary;
 use tokio::sync::mpsc;
@@ -12,8 +13,9 @@ use super::{EVENTS, Ended, Event, Plan, SupervisorError, Watcher};
 /// Between two looks whether the run is still under way.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// Supervises actors that join a run under way, until they end. They do so by themselves when the run does; those that cannot are ended when
-/// `is_under_way` has said no for [`Deadlines::actor_silence`](super::Deadlines).
+/// Supervises actors that join a run under way, until they end. They do so by themselves when the
+/// run does; those that cannot are ended when `is_under_way` has said no for
+/// [`Deadlines::actor_silence`](super::Deadlines).
 ///
 /// # Errors
 /// As [`run`](super::run).

@@ -19,7 +19,8 @@ use super::work::Work;
 use super::{Event, SupervisorError};
 use crate::prepare::room::free_shared_memory;
 
-/// An incarnation that lasted so long was a good start, whether or not there are reports that show it.
+/// An incarnation that lasted so long was a good start, whether or not there are reports that show
+/// it.
 const GOOD_START: Duration = Duration::from_secs(10);
 
 /// The actors of one supervisor.
@@ -28,7 +29,8 @@ pub(super) struct Crew<'a> {
     program: &'a Path,
     events: mpsc::Sender<Event>,
     members: Vec<Member>,
-    /// What the learner last reported; `None` while there is none that reports, or nobody listens to it.
+    /// What the learner last reported; `None` while there is none that reports, or nobody listens
+    /// to it.
     work: Option<Work>,
     after_death: AfterDeath,
     last_failure: Option<GivenUp>,
@@ -52,7 +54,8 @@ enum State {
     Flying(Process),
     /// Died; will be started again.
     Resting,
-    /// Was sent home, found no learner, or failed too often; will be started again when a learner reports for the first time.
+    /// Was sent home, found no learner, or failed too often; will be started again when a learner
+    /// reports for the first time.
     Stranded,
     /// Not started, or ended.
     Gone,
@@ -102,7 +105,8 @@ enum AfterDeath {
 }
 
 impl<'a> Crew<'a> {
-    /// A crew of `actors`, none of them started yet. Their ends will come as [`Event`]s, numbered as in `actors`.
+    /// A crew of `actors`, none of them started yet. Their ends will come as [`Event`]s, numbered
+    /// as in `actors`.
     pub(super) fn new(
         run: &'a RunDirectory,
         program: &'a Path,
@@ -129,7 +133,8 @@ impl<'a> Crew<'a> {
         }
     }
 
-    /// Starts a process for each actor that waits for a learner: all of them the first time, later those that left or were given up.
+    /// Starts a process for each actor that waits for a learner: all of them the first time, later
+    /// those that left or were given up.
     ///
     /// # Errors
     /// When one cannot be started; the others are told to end at once.
@@ -186,8 +191,9 @@ impl<'a> Crew<'a> {
         Ok(())
     }
 
-    /// Takes note of a report of the learner: it has done `work`, and counts `live` among its actors. An actor whose process lives but of which the
-    /// learner has heard nothing for `patience` is frozen or hangs: it is killed, and then started again as any that died.
+    /// Takes note of a report of the learner: it has done `work`, and counts `live` among its
+    /// actors. An actor whose process lives but of which the learner has heard nothing for
+    /// `patience` is frozen or hangs: it is killed, and then started again as any that died.
     pub(super) fn reported(&mut self, work: Work, live: &[u32], patience: Duration) {
         let now = Instant::now();
         let is_first = self.work.replace(work).is_none();
@@ -214,12 +220,14 @@ impl<'a> Crew<'a> {
         }
     }
 
-    /// Takes note that the learner is dead: until the next one reports, nothing that happens to an actor is held against it.
+    /// Takes note that the learner is dead: until the next one reports, nothing that happens to an
+    /// actor is held against it.
     pub(super) fn learner_died(&mut self) {
         self.work = None;
     }
 
-    /// Takes note that an actor ended. One that failed will be started again after a pause, unless it fails too often or the run is over.
+    /// Takes note that an actor ended. One that failed will be started again after a pause, unless
+    /// it fails too often or the run is over.
     pub(super) fn exited(&mut self, number: usize, exit: &Exit) {
         let (work, learner_reports) = (self.work, self.work.is_some());
         let member = &mut self.members[number];
@@ -231,15 +239,18 @@ impl<'a> Crew<'a> {
             return;
         }
         if *exit == Exit::SUCCESS {
-            // The learner said that the run is over. Should it die before it is, the next one needs actors again.
+            // The learner said that the run is over. Should it die before it is, the next one needs
+            // actors again.
             member.state = State::Stranded;
             return;
         }
         if exit.is_for_want_of_a_learner() && !learner_reports {
             member.state = State::Stranded;
             self.last_failure = Some(GivenUp::LearnerGone);
-            self.warnings
-                .push_back(format!("actor {} heard nothing of the learner and left", member.id));
+            self.warnings.push_back(format!(
+                "actor {} heard nothing of the learner and left",
+                member.id
+            ));
             return;
         }
         if age >= GOOD_START {
@@ -248,13 +259,19 @@ impl<'a> Crew<'a> {
         let want = want_of_memory(exit, free_shared_memory());
         let incarnation = match member.judge(work) {
             // Unless it was the supervisor, which kills only what no longer moves.
-            LearnerIncarnation::InVain if want.is_some() || exit.is_a_kill() && told == Order::Run => {
+            LearnerIncarnation::InVain
+                if want.is_some() || exit.is_a_kill() && told == Order::Run =>
+            {
                 LearnerIncarnation::Interrupted
             }
             incarnation => incarnation,
         };
         match member.deaths.died(Instant::now(), incarnation) {
-            Verdict::RestartAfter(pause) => self.rest(number, &format!("{exit}{}", want.unwrap_or_default()), pause),
+            Verdict::RestartAfter(pause) => self.rest(
+                number,
+                &format!("{exit}{}", want.unwrap_or_default()),
+                pause,
+            ),
             Verdict::GiveUp => self.give_up(number, exit),
         }
     }
@@ -298,7 +315,10 @@ impl<'a> Crew<'a> {
         }
         self.restarts += 1;
         if let Err(error) = self.start_member(number) {
-            self.exited(number, &Exit::Unknown(format!("could not be started: {error}")));
+            self.exited(
+                number,
+                &Exit::Unknown(format!("could not be started: {error}")),
+            );
         }
     }
 

@@ -15,15 +15,18 @@ pub(super) const ACTOR_GRACE: Duration = Duration::from_secs(5);
 /// How long actors may take to follow SIGTERM.
 const TERMINATE_GRACE: Duration = Duration::from_secs(5);
 
-/// Sees to it that no actor is left: those that do not end by themselves are told, those that do not listen are killed. An interruption skips the
-/// waiting.
+/// Sees to it that no actor is left: those that do not end by themselves are told, those that do
+/// not listen are killed. An interruption skips the waiting.
 pub(super) async fn dismiss(
     crew: &mut Crew<'_>,
     inbox: &mut mpsc::Receiver<Event>,
     interrupts: &mut mpsc::Receiver<()>,
 ) {
     crew.let_go();
-    for (grace, next) in [(ACTOR_GRACE, Order::Terminate), (TERMINATE_GRACE, Order::Kill)] {
+    for (grace, next) in [
+        (ACTOR_GRACE, Order::Terminate),
+        (TERMINATE_GRACE, Order::Kill),
+    ] {
         let mut expired = pin!(sleep(grace));
         while crew.is_alive() {
             tokio::select! {

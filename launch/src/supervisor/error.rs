@@ -43,10 +43,14 @@ pub enum SupervisorError {
 }
 
 impl SupervisorError {
-    /// Whether nobody needs to look into a log to know more: a process could not be started, or said itself why it could not begin.
+    /// Whether nobody needs to look into a log to know more: a process could not be started, or
+    /// said itself why it could not begin.
     pub fn tells_all(&self) -> bool {
         match self {
-            Self::Missing(_) | Self::Setup(_) | Self::Start { .. } | Self::LearnerCannotStart(_) => true,
+            Self::Missing(_)
+            | Self::Setup(_)
+            | Self::Start { .. }
+            | Self::LearnerCannotStart(_) => true,
             Self::LearnerFailed { .. } | Self::LearnerGone(_) | Self::NoActors(_) => false,
         }
     }

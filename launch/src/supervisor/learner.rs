@@ -17,7 +17,8 @@ use super::work::Work;
 use super::{Event, Plan, SupervisorError};
 use crate::prepare::room::free_shared_memory;
 
-/// Last words come before the end; a pipe that somebody else holds open must not delay that for ever.
+/// Last words come before the end; a pipe that somebody else holds open must not delay that for
+/// ever.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// The learner of a run.
@@ -63,7 +64,10 @@ impl<'a> Learner<'a> {
     ///
     /// # Errors
     /// [`SupervisorError::Start`].
-    pub(super) fn start(plan: &'a Plan, events: mpsc::Sender<Event>) -> Result<Self, SupervisorError> {
+    pub(super) fn start(
+        plan: &'a Plan,
+        events: mpsc::Sender<Event>,
+    ) -> Result<Self, SupervisorError> {
         let mut learner = Self {
             plan,
             events,
@@ -97,10 +101,9 @@ impl<'a> Learner<'a> {
             program: self.plan.programs.learner.clone(),
             source,
         })?;
-        let said = child
-            .stdout
-            .take()
-            .map(|output| tokio::spawn(listen(BufReader::new(output).lines(), self.events.clone())));
+        let said = child.stdout.take().map(|output| {
+            tokio::spawn(listen(BufReader::new(output).lines(), self.events.clone()))
+        });
         let (orders, receiver) = watch::channel(Order::Run);
         let events = self.events.clone();
         tokio::spawn(async move {
@@ -138,7 +141,11 @@ impl<'a> Learner<'a> {
                     heard,
                     work: done,
                 };
-                if done == work { News::Nothing } else { News::GetsOn }
+                if done == work {
+                    News::Nothing
+                } else {
+                    News::GetsOn
+                }
             }
             state @ (State::Killed | State::Dead) => {
                 self.state = state;
@@ -197,7 +204,8 @@ impl<'a> Learner<'a> {
         self.restarts
     }
 
-    /// Takes note of its end, and has it started again if that may help: [`Event::LearnerDue`] will say when. Returns what the user is told.
+    /// Takes note of its end, and has it started again if that may help: [`Event::LearnerDue`] will
+    /// say when. Returns what the user is told.
     ///
     /// # Errors
     /// Why it is not started again.

@@ -12,7 +12,10 @@ const MAX_BYTES: u64 = 16 * 1024;
 /// The last lines of the log at `path`, indented; a remark if there are none.
 pub(crate) fn log_tail(path: &Path) -> String {
     let text = read_end(path).unwrap_or_default();
-    let lines: Vec<_> = text.lines().filter(|line| !line.trim().is_empty()).collect();
+    let lines: Vec<_> = text
+        .lines()
+        .filter(|line| !line.trim().is_empty())
+        .collect();
     if lines.is_empty() {
         return "    (the log is empty)".to_owned();
     }
@@ -24,14 +27,17 @@ pub(crate) fn log_tail(path: &Path) -> String {
         .join("\n")
 }
 
-/// What `program` printed last about why it ended, without its name: programs of ours write `name: reason` on standard error, which goes to their log.
-/// `None` if the log holds no such words.
+/// What `program` printed last about why it ended, without its name: programs of ours write `name:
+/// reason` on standard error, which goes to their log. `None` if the log holds no such words.
 pub(super) fn last_words(path: &Path, program: &Path) -> Option<String> {
     let start = format!("{}: ", program.file_name()?.to_str()?);
     let text = read_end(path).ok()?;
     let lines: Vec<_> = text.lines().collect();
     let first = lines.iter().rposition(|line| line.starts_with(&start))?;
-    lines[first..].join("\n").strip_prefix(&start).map(str::to_owned)
+    lines[first..]
+        .join("\n")
+        .strip_prefix(&start)
+        .map(str::to_owned)
 }
 
 fn read_end(path: &Path) -> std::io::Result<String> {

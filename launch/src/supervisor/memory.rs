@@ -1,4 +1,5 @@
-//! Shared memory that is used up during a run: whoever touches a page for which there is no room dies of SIGBUS.
+//! Shared memory that is used up during a run: whoever touches a page for which there is no room
+//! dies of SIGBUS.
 
 use rustix::process::Signal;
 
@@ -7,11 +8,16 @@ use super::process::Exit;
 /// With less room than this, in bytes, shared memory is full.
 const FULL: u64 = 8 << 20;
 
-/// What to tell of a process that ended with `exit` because shared memory with `free` bytes left is full; `None` when it ended for another reason.
+/// What to tell of a process that ended with `exit` because shared memory with `free` bytes left is
+/// full; `None` when it ended for another reason.
 pub(super) fn want_of_memory(exit: &Exit, free: Option<u64>) -> Option<String> {
     let free = free.filter(|&free| free < FULL)?;
-    (*exit == Exit::Signal(Signal::BUS.as_raw()))
-        .then(|| format!(": shared memory (/dev/shm) is full: {} MiB free", free >> 20))
+    (*exit == Exit::Signal(Signal::BUS.as_raw())).then(|| {
+        format!(
+            ": shared memory (/dev/shm) is full: {} MiB free",
+            free >> 20
+        )
+    })
 }
 
 #[cfg(test)]

@@ -1,12 +1,14 @@
 //! Starts, watches, restarts, stops and reaps the processes of a run.
 //!
-//! The learner comes first, and the actors once it has reported for the first time: what keeps it from starting is then told once, and nobody waits for
-//! a learner that will not come. Whoever dies is started again; a learner goes on from its newest checkpoint, and the actors, who stay alive, find it by
-//! themselves. Whoever is alive but gives no sign of it is killed first.
+//! The learner comes first, and the actors once it has reported for the first time: what keeps it
+//! from starting is then told once, and nobody waits for a learner that will not come. Whoever dies
+//! is started again; a learner goes on from its newest checkpoint, and the actors, who stay alive,
+//! find it by themselves. Whoever is alive but gives no sign of it is killed first.
 //!
-//! The order of a stop matters: the learner is told first, because it abandons the episodes in the air, saves what was learned and tells the actors
-//! itself; only actors that are still there afterwards are ended from here. Every wait has a deadline, so that a stop always comes to an end, and
-//! every way out of this module leaves no process behind.
+//! The order of a stop matters: the learner is told first, because it abandons the episodes in the
+//! air, saves what was learned and tells the actors itself; only actors that are still there
+//! afterwards are ended from here. Every wait has a deadline, so that a stop always comes to an
+//! end, and every way out of this module leaves no process behind.
 //!
 //! Who may interrupt, and what is done with the progress, is the caller's: see [`Watcher`].
 
@@ -93,13 +95,14 @@ pub struct Plan {
 pub struct Deadlines {
     /// From the learner's start to its first report: it loads its libraries and a checkpoint.
     pub learner_start: Duration,
-    /// Between two reports of the learner, of which it makes two a second from a thread that does nothing else. A learner that is silent for longer is
-    /// frozen.
+    /// Between two reports of the learner, of which it makes two a second from a thread that does
+    /// nothing else. A learner that is silent for longer is frozen.
     pub learner_silence: Duration,
-    /// Before a learner is started again that has died twice without getting any further. It is started at once the first time; later pauses double, up to
-    /// eight times this one.
+    /// Before a learner is started again that has died twice without getting any further. It is
+    /// started at once the first time; later pauses double, up to eight times this one.
     pub learner_pause: Duration,
-    /// How long the learner may show no progress once it is told to stop: it finishes what it is about, which shows, and saves, which does not.
+    /// How long the learner may show no progress once it is told to stop: it finishes what it is
+    /// about, which shows, and saves, which does not.
     pub learner_stop: Duration,
     /// How long the learner may have heard nothing of an actor whose process is alive.
     pub actor_silence: Duration,
@@ -111,7 +114,8 @@ impl Deadlines {
         Self {
             // An overburdened machine may take so long; and killing what only is slow helps nobody.
             learner_start: Duration::from_secs(120),
-            // Actors wait for transport.learner_silence_secs and then leave: the rest of that time is for the next incarnation to begin in.
+            // Actors wait for transport.learner_silence_secs and then leave: the rest of that time
+            // is for the next incarnation to begin in.
             learner_silence: Duration::from_secs_f64(
                 (config.transport.learner_silence_secs * 2.0 / 3.0).clamp(5.0, 60.0),
             ),
@@ -119,7 +123,9 @@ impl Deadlines {
             learner_pause: Duration::from_secs(1),
             learner_stop: Duration::from_secs(90),
             // Six times what makes the learner give its tickets to others, and enough to start in.
-            actor_silence: Duration::from_secs_f64((config.transport.actor_silence_secs * 6.0).max(30.0)),
+            actor_silence: Duration::from_secs_f64(
+                (config.transport.actor_silence_secs * 6.0).max(30.0),
+            ),
         }
     }
 }

@@ -60,15 +60,16 @@ impl Exit {
         *self == Self::Status(EXIT_LEARNER_GONE.into())
     }
 
-    /// Whether somebody ended it by a signal for that purpose. Whether that was the supervisor itself does not show here.
+    /// Whether somebody ended it by a signal for that purpose. Whether that was the supervisor
+    /// itself does not show here.
     pub(super) fn is_a_kill(&self) -> bool {
         [Signal::KILL, Signal::TERM]
             .iter()
             .any(|signal| *self == Self::Signal(signal.as_raw()))
     }
 
-    /// Whether the same program may do better when it is started again: it was killed, it panicked, or its transport failed. An error that it
-    /// told itself would come again.
+    /// Whether the same program may do better when it is started again: it was killed, it panicked,
+    /// or its transport failed. An error that it told itself would come again.
     pub(super) fn may_pass(&self) -> bool {
         match *self {
             Self::Status(status) => status == PANICKED || status == i32::from(EXIT_START_AGAIN),
@@ -111,13 +112,17 @@ pub(super) struct Launch<'a> {
 impl Launch<'_> {
     /// Starts the program.
     ///
-    /// It leads a process group of its own, so that Ctrl-C in the terminal reaches only the supervisor, which knows the order of things. The
-    /// kernel kills it when the *thread* that started it ends, however that comes about: to be called on the main thread.
+    /// It leads a process group of its own, so that Ctrl-C in the terminal reaches only the
+    /// supervisor, which knows the order of things. The kernel kills it when the *thread* that
+    /// started it ends, however that comes about: to be called on the main thread.
     ///
     /// # Errors
     /// When its log cannot be opened or the program cannot be started.
     pub(super) fn start(&self) -> io::Result<Child> {
-        let log = OpenOptions::new().create(true).append(true).open(&self.log)?;
+        let log = OpenOptions::new()
+            .create(true)
+            .append(true)
+            .open(&self.log)?;
         let output = match self.output {
             Output::Piped => Stdio::piped(),
             Output::Logged => log.try_clone()?.into(),
@@ -141,7 +146,8 @@ impl Launch<'_> {
     }
 }
 
-/// Waits for `child`, passing on what `orders` say. Returns only when it is reaped: nothing is left of it then.
+/// Waits for `child`, passing on what `orders` say. Returns only when it is reaped: nothing is left
+/// of it then.
 pub(super) async fn reap(mut child: Child, mut orders: watch::Receiver<Order>) -> Exit {
     let mut listening = true;
     loop {
@@ -149,7 +155,8 @@ pub(super) async fn reap(mut child: Child, mut orders: watch::Receiver<Order>) -
             status = child.wait() => return Exit::of(status),
             changed = orders.changed(), if listening => {
                 listening = changed.is_ok();
-                // Whoever gave the orders is gone without an order: nobody wants the process any more.
+                // Whoever gave the orders is gone without an order: nobody wants the process any
+                // more.
                 let order = if listening { *orders.borrow_and_update() } else { Order::Kill };
                 obey(&child, order);
             }
@@ -163,7 +170,8 @@ fn obey(child: &Child, order: Order) {
         Order::Terminate => Signal::TERM,
         Order::Kill => Signal::KILL,
     };
-    // A child that is not reaped keeps its number, so the signal cannot reach a stranger; and that it has just ended is no error.
+    // A child that is not reaped keeps its number, so the signal cannot reach a stranger; and that
+    // it has just ended is no error.
     if let Some(pid) = child.id().and_then(|id| Pid::from_raw(id.cast_signed())) {
         let _ = kill_process(pid, signal);
     }

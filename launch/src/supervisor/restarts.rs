@@ -1,7 +1,8 @@
 //! When a process that died is started again, and when it is given up.
 //!
-//! Being killed gives nobody up: processes may be killed as often as anybody likes, and are only started again after longer pauses. What counts is
-//! whether those that fail by themselves get anywhere in between.
+//! Being killed gives nobody up: processes may be killed as often as anybody likes, and are only
+//! started again after longer pauses. What counts is whether those that fail by themselves get
+//! anywhere in between.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -27,17 +28,20 @@ pub(super) struct ActorDeaths {
 }
 
 impl ActorDeaths {
-    /// Lives in vain, one after the other, after which an actor is given up: what kills it will kill it again.
+    /// Lives in vain, one after the other, after which an actor is given up: what kills it will
+    /// kill it again.
     pub(super) const MAX_IN_VAIN: usize = 5;
     /// Deaths longer ago than this no longer lengthen the pause.
     const WINDOW: Duration = Duration::from_secs(60);
-    /// Pause before the first restart; it doubles with each further death within the window, up to the longest.
+    /// Pause before the first restart; it doubles with each further death within the window, up to
+    /// the longest.
     const FIRST_PAUSE: Duration = Duration::from_millis(250);
     const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 
     /// Notes a death at `now` and decides what follows.
     pub(super) fn died(&mut self, now: Instant, incarnation: LearnerIncarnation) -> Verdict {
-        self.recent.retain(|&death| now.duration_since(death) < Self::WINDOW);
+        self.recent
+            .retain(|&death| now.duration_since(death) < Self::WINDOW);
         self.recent.push_back(now);
         self.in_vain = match incarnation {
             LearnerIncarnation::Served => 0,
@@ -83,13 +87,15 @@ pub(super) struct LearnerDeaths {
 }
 
 impl LearnerDeaths {
-    /// Failures after which the run fails, if none of these incarnations got further than one before it. Not fewer, because a learner that dies before it has
-    /// written a checkpoint may get no further by no fault of its own.
+    /// Failures after which the run fails, if none of these incarnations got further than one
+    /// before it. Not fewer, because a learner that dies before it has written a checkpoint may get
+    /// no further by no fault of its own.
     pub(super) const MAX_WITHOUT_PROGRESS: u32 = 10;
     /// The longest pause, in first pauses.
     const LONGEST_PAUSE: u32 = 8;
 
-    /// No deaths so far. There is no pause after the first, `first_pause` after the second, then they double.
+    /// No deaths so far. There is no pause after the first, `first_pause` after the second, then
+    /// they double.
     pub(super) fn new(first_pause: Duration) -> Self {
         Self {
             first_pause,
@@ -99,7 +105,8 @@ impl LearnerDeaths {
         }
     }
 
-    /// Notes how far the run has come. Only what no incarnation before has reached is progress: the rest is done over.
+    /// Notes how far the run has come. Only what no incarnation before has reached is progress: the
+    /// rest is done over.
     pub(super) fn reached(&mut self, work: Work) {
         if self.furthest.is_none_or(|furthest| work > furthest) {
             // The first report of all shows where the run began, not that it gets on.
@@ -138,10 +145,18 @@ mod tests {
     fn pauses_double_until_the_actor_is_given_up() {
         let (mut deaths, start) = (ActorDeaths::default(), Instant::now());
         let verdicts: Vec<_> = (0..5)
-            .map(|second| deaths.died(start + Duration::from_secs(second), LearnerIncarnation::InVain))
+            .map(|second| {
+                deaths.died(
+                    start + Duration::from_secs(second),
+                    LearnerIncarnation::InVain,
+                )
+            })
             .collect();
         let pause = |factor| Verdict::RestartAfter(ActorDeaths::FIRST_PAUSE * factor);
-        assert_eq!(verdicts, [pause(1), pause(2), pause(4), pause(8), Verdict::GiveUp]);
+        assert_eq!(
+            verdicts,
+            [pause(1), pause(2), pause(4), pause(8), Verdict::GiveUp]
+        );
     }
 
     #[test]
@@ -156,9 +171,15 @@ mod tests {
             let verdict = deaths.died(start + Duration::from_secs(second), incarnation);
             assert_ne!(verdict, Verdict::GiveUp);
         }
-        let verdict = deaths.died(start + Duration::from_secs(1000), LearnerIncarnation::Served);
+        let verdict = deaths.died(
+            start + Duration::from_secs(1000),
+            LearnerIncarnation::Served,
+        );
         assert_eq!(verdict, Verdict::RestartAfter(ActorDeaths::LONGEST_PAUSE));
-        let verdict = deaths.died(start + Duration::from_secs(1061), LearnerIncarnation::Served);
+        let verdict = deaths.died(
+            start + Duration::from_secs(1061),
+            LearnerIncarnation::Served,
+        );
         assert_eq!(verdict, Verdict::RestartAfter(ActorDeaths::FIRST_PAUSE));
     }
 
@@ -166,7 +187,10 @@ mod tests {
     fn an_actor_is_not_blamed_for_a_learner_that_is_not_there() {
         let (mut deaths, now) = (ActorDeaths::default(), Instant::now());
         for _ in 0..100 {
-            assert_ne!(deaths.died(now, LearnerIncarnation::Interrupted), Verdict::GiveUp);
+            assert_ne!(
+                deaths.died(now, LearnerIncarnation::Interrupted),
+                Verdict::GiveUp
+            );
         }
     }
 
@@ -200,7 +224,10 @@ mod tests {
         for incarnation in 0..1000 {
             deaths.reached(Work::test(incarnation));
             deaths.reached(Work::test(incarnation + 1));
-            assert_eq!(deaths.died(Cause::Failure), Verdict::RestartAfter(Duration::ZERO));
+            assert_eq!(
+                deaths.died(Cause::Failure),
+                Verdict::RestartAfter(Duration::ZERO)
+            );
         }
         // It dies at the same place again and again, having done the same work each time.
         let again: Vec<_> = (0..LearnerDeaths::MAX_WITHOUT_PROGRESS - 1)

@@ -15,14 +15,16 @@ use super::stop::Stop;
 use super::work::Work;
 use super::{EVENTS, Ended, Event, Plan, Restarts, SupervisorError, Watcher};
 
-/// Waking so much later than asked for, the supervisor itself was held up, and what it did not hear in that time proves nothing.
+/// Waking so much later than asked for, the supervisor itself was held up, and what it did not hear
+/// in that time proves nothing.
 const HELD_UP: Duration = Duration::from_secs(1);
 
-/// Supervises a learner and its actors until the run ends. Each message on `interrupts` is one interruption by the user: the first stops in order,
-/// the second at once.
+/// Supervises a learner and its actors until the run ends. Each message on `interrupts` is one
+/// interruption by the user: the first stops in order, the second at once.
 ///
 /// # Errors
-/// [`SupervisorError`] names the program, its log and the log's last lines. No process is left in any case.
+/// [`SupervisorError`] names the program, its log and the log's last lines. No process is left in
+/// any case.
 pub async fn run(
     plan: &Plan,
     interrupts: &mut mpsc::Receiver<()>,
@@ -149,7 +151,8 @@ impl<W: Watcher> Supervision<'_, W> {
             return Break(());
         }
         if let Stop::InOrder { .. } = self.stop {
-            // One that had not even begun had nothing to save, and may have known nothing of signals yet.
+            // One that had not even begun had nothing to save, and may have known nothing of
+            // signals yet.
             if self.learner.is_reporting() {
                 let how = exit.to_string();
                 self.failure.get_or_insert_with(|| self.learner.failed(how));
@@ -188,12 +191,19 @@ impl<W: Watcher> Supervision<'_, W> {
 
     /// When the learner will have done nothing for too long.
     fn deadline(&self) -> Option<Instant> {
-        self.stop.deadline().into_iter().chain(self.learner.deadline()).min()
+        self.stop
+            .deadline()
+            .into_iter()
+            .chain(self.learner.deadline())
+            .min()
     }
 
     /// Kills a learner that has done nothing for too long. Its end will say what follows.
     fn deadline_passed(&mut self) {
-        if self.deadline().is_none_or(|deadline| deadline.elapsed() > HELD_UP) {
+        if self
+            .deadline()
+            .is_none_or(|deadline| deadline.elapsed() > HELD_UP)
+        {
             self.learner.forgive_silence();
             self.stop = self.stop.progressed(self.plan.deadlines.learner_stop);
             return;
@@ -206,13 +216,16 @@ impl<W: Watcher> Supervision<'_, W> {
                 deadlines.learner_start
             }
             .as_secs();
-            self.watcher
-                .warn(&format!("the learner has not reported for {secs} s: it is killed"));
+            self.watcher.warn(&format!(
+                "the learner has not reported for {secs} s: it is killed"
+            ));
         } else {
             self.watcher.warn("the learner does not stop: it is killed");
             self.stop = Stop::AtOnce;
-            self.failure
-                .get_or_insert_with(|| self.learner.failed("did not stop when it was told to".to_owned()));
+            self.failure.get_or_insert_with(|| {
+                self.learner
+                    .failed("did not stop when it was told to".to_owned())
+            });
         }
         self.learner.kill();
     }

@@ -2,7 +2,8 @@
 
 use skein_protocol::progress::Progress;
 
-/// What a run has done so far. More work is greater: episodes come first, then what is made of them.
+/// What a run has done so far. More work is greater: episodes come first, then what is made of
+/// them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Work {
     episodes: u64,

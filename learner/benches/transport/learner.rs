@@ -96,7 +96,10 @@ impl Learner {
         }
         let deadline = Instant::now() + PATIENCE;
         while self.receiver.shared().live_actors().len() < self.actors.len() {
-            assert!(Instant::now() < deadline, "not all of {count} actors have come");
+            assert!(
+                Instant::now() < deadline,
+                "not all of {count} actors have come"
+            );
             sleep(Duration::from_millis(5));
         }
     }
@@ -116,7 +119,10 @@ impl Learner {
 
         let faults = self.receiver.shared().faults();
         assert!(
-            faults.reissued_by_reason().values().all(|&count| count == 0),
+            faults
+                .reissued_by_reason()
+                .values()
+                .all(|&count| count == 0),
             "{faults:?}"
         );
         assert!(
@@ -211,7 +217,8 @@ fn await_ends(actors: &mut [Child]) {
     }
 }
 
-/// Time to copy a record out of memory as large as an actor's into an episode, as [`Keep::Depth`] asks for.
+/// Time to copy a record out of memory as large as an actor's into an episode, as [`Keep::Depth`]
+/// asks for.
 fn copy_micros(time: Duration) -> f64 {
     let record = size_of::<TransitionRecord>();
     let (of_actor, of_episode) = (512, STEPS as usize + 1);
@@ -221,7 +228,8 @@ fn copy_micros(time: Duration) -> f64 {
     while began.elapsed() < time {
         for _ in 0..of_episode {
             let (source, target) = (copied % of_actor * record, copied % of_episode * record);
-            into[target..target + record].copy_from_slice(black_box(&from[source..source + record]));
+            into[target..target + record]
+                .copy_from_slice(black_box(&from[source..source + record]));
             copied += 1;
         }
         black_box(&mut into);

@@ -1,14 +1,20 @@
 //! What the way of the records costs the learner: `cargo bench -p skein-learner --bench transport`.
 //!
-//! The learner's receiver, as in a run, in this process; synthetic actors, processes of their own, which use the actors' ends of the services as actors
-//! do, and send whole episodes of valid records as fast as they can. Nobody simulates and nobody learns, so what is left is transport, assembly and
-//! delivery. The processor's time is the learner's own, so a machine with fewer cores than actors shows whether a record costs more the more actors
-//! there are, though not how many records a larger machine would move.
+//! The learner's receiver, as in a run, in this process; synthetic actors, processes of their own,
+//! which use the actors' ends of the services as actors do, and send whole episodes of valid
+//! records as fast as they can. Nobody simulates and nobody learns, so what is left is transport,
+//! assembly and delivery. The processor's time is the learner's own, so a machine with fewer cores
+//! than actors shows whether a record costs more the more actors there are, though not how many
+//! records a larger machine would move.
 //!
-//! Each figure is a line of JSON on standard output, with the baseline it is to be seen against, measured beside it; a table for people goes to standard
-//! error. `--quick` measures for a moment only, with the fewest and the most actors, to see that it works.
+//! Each figure is a line of JSON on standard output, with the baseline it is to be seen against,
+//! measured beside it; a table for people goes to standard error. `--quick` measures for a moment
+//! only, with the fewest and the most actors, to see that it works.
 
-#![allow(clippy::unwrap_used, reason = "a benchmark fails by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a benchmark fails by panicking, as tests do"
+)]
 
 mod learner;
 mod report;
@@ -38,7 +44,10 @@ fn main() {
     }
     let is_quick = arguments.iter().any(|argument| argument == "--quick");
     // Cargo says `--bench` to every benchmark; a number is one of actors to try instead of all.
-    let chosen: Vec<u32> = arguments.iter().filter_map(|argument| argument.parse().ok()).collect();
+    let chosen: Vec<u32> = arguments
+        .iter()
+        .filter_map(|argument| argument.parse().ok())
+        .collect();
     // Ascending, for actors only come.
     let actors = match (is_quick, chosen.is_empty()) {
         (_, false) => chosen,
@@ -64,8 +73,8 @@ fn main() {
     learner.finish();
 }
 
-/// Prints what was measured with `count` actors, of records of which `kept` is kept; with the least number of actors, the learner needed `least`
-/// microseconds a record.
+/// Prints what was measured with `count` actors, of records of which `kept` is kept; with the least
+/// number of actors, the learner needed `least` microseconds a record.
 fn tell(count: u32, kept: &str, measured: &Throughput, least: f64) {
     let name = |figure: &str| format!("transport/{figure}{kept}/{count}");
     let copied = ("memcpy of the same bytes", measured.copy_micros);
@@ -75,7 +84,12 @@ fn tell(count: u32, kept: &str, measured: &Throughput, least: f64) {
         "records/s",
         ("memcpy of the same bytes", 1e6 / measured.copy_micros),
     );
-    report(&name("receiving_thread"), measured.thread_micros, "µs", copied);
+    report(
+        &name("receiving_thread"),
+        measured.thread_micros,
+        "µs",
+        copied,
+    );
     report(
         &name("learner"),
         measured.process_micros,

@@ -34,11 +34,16 @@ struct Actor {
     image: Box<[u8; IMAGE_PIXELS]>,
 }
 
-/// Serves the learner of the run in `directory` as actor number `id`, until the run is over or nothing is heard of the learner.
+/// Serves the learner of the run in `directory` as actor number `id`, until the run is over or
+/// nothing is heard of the learner.
 pub(crate) fn serve(directory: &Path, id: u32) {
     let (identity, config) = RunDirectory::new(directory).open().unwrap();
     let _presence = Presence::enter(&identity).unwrap();
-    let mut actor = Actor::new(ActorPorts::join(&identity, &config).unwrap(), ActorId(id), &config);
+    let mut actor = Actor::new(
+        ActorPorts::join(&identity, &config).unwrap(),
+        ActorId(id),
+        &config,
+    );
     actor.report(ActorState::Serving);
     while !actor.is_over && actor.last_heard.elapsed() < PATIENCE {
         actor.listen();
@@ -67,7 +72,8 @@ impl Actor {
         }
     }
 
-    /// Hears what there is to hear and sends a heartbeat when one is due, as an actor does before every step.
+    /// Hears what there is to hear and sends a heartbeat when one is due, as an actor does before
+    /// every step.
     fn listen(&mut self) {
         while let Some(record) = self.ports.receive_control().unwrap() {
             self.last_heard = Instant::now();

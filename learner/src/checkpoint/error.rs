@@ -93,14 +93,22 @@ pub enum CheckpointError {
 }
 
 impl CheckpointError {
-    /// Whether the checkpoint is damaged, so that an older one may do; one of another version or configuration is sound, and older ones are no better.
+    /// Whether the checkpoint is damaged, so that an older one may do; one of another version or
+    /// configuration is sound, and older ones are no better.
     pub(super) fn is_damage(&self) -> bool {
         !matches!(self, Self::Format { .. } | Self::Configuration { .. })
     }
 
     /// Names `path` and `action` of an I/O error.
-    pub(super) fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(io::Error) -> Self {
+    pub(super) fn io(
+        action: &'static str,
+        path: impl Into<PathBuf>,
+    ) -> impl FnOnce(io::Error) -> Self {
         let path = path.into();
-        move |source| Self::Io { action, path, source }
+        move |source| Self::Io {
+            action,
+            path,
+            source,
+        }
     }
 }

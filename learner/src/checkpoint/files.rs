@@ -26,7 +26,8 @@ pub(super) const CONFIG: &str = "config.toml";
 /// All files but the manifest.
 pub(super) const NAMES: [&str; 5] = [TENSORS, REPLAY, SNAPSHOTS, PROGRESS, CONFIG];
 
-/// Bytes that reading `progress.bin` may set aside: two windows of a million episodes, and room for the rest. A length that makes no sense ends there.
+/// Bytes that reading `progress.bin` may set aside: two windows of a million episodes, and room for
+/// the rest. A length that makes no sense ends there.
 const PROGRESS_LIMIT: usize = 64 << 20;
 
 // Safetensors are little-endian, and values are written as they lie in memory.
@@ -43,7 +44,11 @@ struct ProgressFile {
 }
 
 /// Writes all files but the manifest into `directory`; `config` is the portable configuration.
-pub(super) fn write(directory: &Path, state: &CheckpointState, config: &str) -> Result<(), CheckpointError> {
+pub(super) fn write(
+    directory: &Path,
+    state: &CheckpointState,
+    config: &str,
+) -> Result<(), CheckpointError> {
     let tensors = state
         .tensors
         .iter()
@@ -68,7 +73,11 @@ pub(super) fn write(directory: &Path, state: &CheckpointState, config: &str) -> 
         progress: state.progress.clone(),
         success_inserted: state.replay.success.inserted,
         regular_inserted: state.replay.regular.inserted,
-        image_blocks: state.replay.images.as_ref().map(|blocks| blocks.len() as u64),
+        image_blocks: state
+            .replay
+            .images
+            .as_ref()
+            .map(|blocks| blocks.len() as u64),
     };
     let bytes = bincode::serde::encode_to_vec(&progress, bincode::config::standard())
         .expect("progress consists of numbers, texts and lists of them");
@@ -86,10 +95,14 @@ pub(super) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), CheckpointErr
 }
 
 /// Reads what [`write`] wrote, each file checked against `manifest`.
-pub(super) fn read(directory: &Path, manifest: &Manifest) -> Result<CheckpointState, CheckpointError> {
+pub(super) fn read(
+    directory: &Path,
+    manifest: &Manifest,
+) -> Result<CheckpointState, CheckpointError> {
     let path = directory.join(PROGRESS);
     let bytes = manifest.read_file(directory, PROGRESS)?;
-    let file = parse_progress(&bytes).map_err(|problem| CheckpointError::Content { path, problem })?;
+    let file =
+        parse_progress(&bytes).map_err(|problem| CheckpointError::Content { path, problem })?;
     let replay = read_replay(&Stored::open(directory, REPLAY, manifest)?, &file)?;
     Ok(CheckpointState {
         progress: file.progress,
@@ -101,7 +114,8 @@ pub(super) fn read(directory: &Path, manifest: &Manifest) -> Result<CheckpointSt
 
 fn parse_progress(bytes: &[u8]) -> Result<ProgressFile, String> {
     let limited = bincode::config::standard().with_limit::<PROGRESS_LIMIT>();
-    let (file, read) = bincode::serde::decode_from_slice(bytes, limited).map_err(|error| error.to_string())?;
+    let (file, read) =
+        bincode::serde::decode_from_slice(bytes, limited).map_err(|error| error.to_string())?;
     match bytes.len() - read {
         0 => Ok(file),
         more => Err(format!("{more} bytes follow what it should hold")),
@@ -128,8 +142,14 @@ fn read_snapshots(stored: &Stored) -> Result<Vec<Snapshot>, CheckpointError> {
 fn replay_tensors(replay: &ReplayState) -> Vec<(String, Borrowed<'_>)> {
     let mut tensors = Vec::new();
     for (part, ring) in [("success", &replay.success), ("regular", &replay.regular)] {
-        tensors.push((format!("{part}.rows"), Borrowed::flat(Dtype::F32, &ring.rows)));
-        tensors.push((format!("{part}.images"), Borrowed::flat(Dtype::U32, &ring.images)));
+        tensors.push((
+            format!("{part}.rows"),
+            Borrowed::flat(Dtype::F32, &ring.rows),
+        ));
+        tensors.push((
+            format!("{part}.images"),
+            Borrowed::flat(Dtype::U32, &ring.images),
+        ));
     }
     for (number, block) in replay.images.iter().flatten().enumerate() {
         let shape = vec![block.len() / IMAGE_PIXELS, IMAGE_HEIGHT, IMAGE_WIDTH];
@@ -158,7 +178,10 @@ fn read_replay(stored: &Stored, file: &ProgressFile) -> Result<ReplayState, Chec
     };
     let block = |number| {
         Ok(Arc::new(
-            stored.tensor(&tensors, &block_name(number), Dtype::U8)?.data().to_vec(),
+            stored
+                .tensor(&tensors, &block_name(number), Dtype::U8)?
+                .data()
+                .to_vec(),
         ))
     };
     Ok(ReplayState {
@@ -201,7 +224,9 @@ fn read_tensors(stored: &Stored) -> Result<Vec<NamedTensor>, CheckpointError> {
             Dtype::F32 => TensorValues::F32(bytemuck::allocation::pod_collect_to_vec(bytes)),
             Dtype::F64 => TensorValues::F64(bytemuck::allocation::pod_collect_to_vec(bytes)),
             Dtype::I64 => TensorValues::I64(bytemuck::allocation::pod_collect_to_vec(bytes)),
-            other => return Err(stored.unusable(format!("tensor {name} has values of type {other:?}"))),
+            other => {
+                return Err(stored.unusable(format!("tensor {name} has values of type {other:?}")));
+            }
         };
         named.push(NamedTensor {
             name: name.to_owned(),
@@ -238,7 +263,9 @@ impl Stored {
         name: &str,
         dtype: Dtype,
     ) -> Result<TensorView<'a>, CheckpointError> {
-        let view = tensors.tensor(name).map_err(|error| self.unusable(error.to_string()))?;
+        let view = tensors
+            .tensor(name)
+            .map_err(|error| self.unusable(error.to_string()))?;
         if view.dtype() != dtype {
             let found = view.dtype();
             return Err(self.unusable(format!(

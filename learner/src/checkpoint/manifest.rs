@@ -18,7 +18,8 @@ pub(super) const FORMAT: u32 = 7;
 /// Bytes of a file that are read at once for its checksum.
 const PIECE: usize = 1 << 20;
 
-/// What stands before the manifest's own checksum, which is its last field in every format: a damaged one is told from another format.
+/// What stands before the manifest's own checksum, which is its last field in every format: a
+/// damaged one is told from another format.
 const OWN_CHECKSUM: &str = ",\n  \"xxh3\": \"";
 /// What stands behind it.
 const END: &str = "\"\n}\n";
@@ -67,11 +68,14 @@ impl Manifest {
     /// Its text: JSON, with a checksum of all that stands before it as the last field.
     pub(super) fn to_text(&self) -> String {
         let json = serde_json::to_string_pretty(self).expect("a manifest is plain data");
-        let body = json.strip_suffix("\n}").expect("an object of several fields ends so");
+        let body = json
+            .strip_suffix("\n}")
+            .expect("an object of several fields ends so");
         format!("{body}{OWN_CHECKSUM}{}{END}", hex(xxh3_64(body.as_bytes())))
     }
 
-    /// Reads the manifest of the checkpoint in `directory` and checks that it is undamaged and of this format.
+    /// Reads the manifest of the checkpoint in `directory` and checks that it is undamaged and of
+    /// this format.
     pub(super) fn read(directory: &Path) -> Result<Self, CheckpointError> {
         let path = directory.join(NAME);
         let bytes = fs::read(&path).map_err(CheckpointError::io("read", &path))?;
@@ -88,7 +92,9 @@ impl Manifest {
         let body = text
             .strip_suffix(END)
             .and_then(|text| text.rsplit_once(OWN_CHECKSUM))
-            .and_then(|(body, checksum)| (hex(xxh3_64(body.as_bytes())) == checksum).then_some(body))
+            .and_then(|(body, checksum)| {
+                (hex(xxh3_64(body.as_bytes())) == checksum).then_some(body)
+            })
             .ok_or_else(|| damaged("its checksum is not that of its content".to_owned()))?;
         let json = format!("{body}\n}}");
         // The format is read first: another one may have other fields.
@@ -96,7 +102,8 @@ impl Manifest {
         struct Format {
             format: u32,
         }
-        let Format { format: found } = serde_json::from_str(&json).map_err(|error| damaged(error.to_string()))?;
+        let Format { format: found } =
+            serde_json::from_str(&json).map_err(|error| damaged(error.to_string()))?;
         if found != FORMAT {
             return Err(CheckpointError::Format {
                 path: path.to_owned(),
@@ -128,7 +135,11 @@ impl Manifest {
     }
 
     /// Reads the file `name` in `directory` and checks that it is what was written.
-    pub(super) fn read_file(&self, directory: &Path, name: &str) -> Result<Vec<u8>, CheckpointError> {
+    pub(super) fn read_file(
+        &self,
+        directory: &Path,
+        name: &str,
+    ) -> Result<Vec<u8>, CheckpointError> {
         let entry = self
             .files
             .iter()

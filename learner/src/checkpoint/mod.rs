@@ -1,7 +1,8 @@
 //! Checkpoints: everything that determines the rest of a run, in a directory of its own.
 //!
-//! A run resumed from one continues bit for bit as if it had never stopped, so all of it is here: parameters and moments of every network, the replay
-//! buffer with the depth images it still needs, snapshots that are still flown or are the best, counters, averages, how far the files of metrics
+//! A run resumed from one continues bit for bit as if it had never stopped, so all of it is here:
+//! parameters and moments of every network, the replay buffer with the depth images it still needs,
+//! snapshots that are still flown or are the best, counters, averages, how far the files of metrics
 //! had come. Random generators are not: they are derived anew for every epoch.
 //!
 //! `checkpoints/episode-<n>/` holds
@@ -12,8 +13,8 @@
 //! - `config.toml`: the configuration, to say what differs from another one;
 //! - `manifest.json`: format, size and checksum of each of the above, and a checksum of itself.
 //!
-//! It is written aside and renamed into place when all of it is on disk ([`store`]): a directory of that name is complete, and what is damaged later
-//! is refused by its checksum, never learned from.
+//! It is written aside and renamed into place when all of it is on disk ([`store`]): a directory of
+//! that name is complete, and what is damaged later is refused by its checksum, never learned from.
 
 mod error;
 mod files;
@@ -59,7 +60,8 @@ pub struct Progress {
     pub episodes: u64,
     /// Epochs learned from.
     pub epochs: u64,
-    /// The version of the newest snapshot. One is published after each epoch, and after each segment within one that brought an update.
+    /// The version of the newest snapshot. One is published after each epoch, and after each
+    /// segment within one that brought an update.
     pub version: u64,
     /// SHA-256 of the newest snapshot.
     pub policy_sha256: String,
@@ -115,7 +117,8 @@ impl Progress {
     }
 }
 
-/// Episodes of one epoch as they were ordered: what makes their tickets, besides configuration and run.
+/// Episodes of one epoch as they were ordered: what makes their tickets, besides configuration and
+/// run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EpochOrder {
     /// The epoch.

@@ -1,8 +1,9 @@
 //! The folder of checkpoints: writing into place, finding, loading, removing old ones.
 //!
-//! Names that begin with a dot are work in progress and never read: a checkpoint is written under such a name, all of it brought to disk, and renamed; to be
-//! removed, it is renamed back to one first. One that is written again, for the same episode, keeps its predecessor beside it until it is in place:
-//! there is no moment without a sound checkpoint, once there is one.
+//! Names that begin with a dot are work in progress and never read: a checkpoint is written under
+//! such a name, all of it brought to disk, and renamed; to be removed, it is renamed back to one
+//! first. One that is written again, for the same episode, keeps its predecessor beside it until it
+//! is in place: there is no moment without a sound checkpoint, once there is one.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -40,7 +41,8 @@ pub fn checkpoint_directory(checkpoints: &Path, episodes: u64) -> PathBuf {
 }
 
 impl CheckpointStore {
-    /// The checkpoints in `directory` of the run configured by `config`; the newest few that are sound are kept, as many as `config` says.
+    /// The checkpoints in `directory` of the run configured by `config`; the newest few that are
+    /// sound are kept, as many as `config` says.
     pub fn new(directory: &Path, config: &Config) -> Self {
         Self {
             directory: directory.to_owned(),
@@ -56,13 +58,20 @@ impl CheckpointStore {
 
     /// Writes `state`, and removes those beyond the newest few. Returns where it lies.
     ///
-    /// `relied_on` are files outside whose content up to now the state counts on: they are brought to disk before the checkpoint is in place.
+    /// `relied_on` are files outside whose content up to now the state counts on: they are brought
+    /// to disk before the checkpoint is in place.
     ///
     /// # Errors
-    /// [`CheckpointError`]; what was there before still is, and what was half written takes no room.
-    pub fn save(&self, state: &CheckpointState, relied_on: &[PathBuf]) -> Result<PathBuf, CheckpointError> {
+    /// [`CheckpointError`]; what was there before still is, and what was half written takes no
+    /// room.
+    pub fn save(
+        &self,
+        state: &CheckpointState,
+        relied_on: &[PathBuf],
+    ) -> Result<PathBuf, CheckpointError> {
         let episodes = state.progress.episodes;
-        // One name for all: whatever an interrupted write left, of this episode or another, makes room for the next.
+        // One name for all: whatever an interrupted write left, of this episode or another, makes
+        // room for the next.
         let aside = self.directory.join(".writing");
         remove(&aside)?;
         if let Err(error) = self.write_aside(&aside, state, relied_on) {
@@ -79,7 +88,12 @@ impl CheckpointStore {
         Ok(place)
     }
 
-    fn write_aside(&self, aside: &Path, state: &CheckpointState, relied_on: &[PathBuf]) -> Result<(), CheckpointError> {
+    fn write_aside(
+        &self,
+        aside: &Path,
+        state: &CheckpointState,
+        relied_on: &[PathBuf],
+    ) -> Result<(), CheckpointError> {
         durable::create_private_directory(aside).map_err(CheckpointError::io("create", aside))?;
         pass(FaultPoint::CheckpointCreated);
         files::write(aside, state, &self.config.portable())?;
@@ -95,16 +109,21 @@ impl CheckpointStore {
         all.try_for_each(sync_once)
     }
 
-    /// Writes the manifest of the files in `directory` as they are now, and so makes them a checkpoint after `episodes` episodes.
+    /// Writes the manifest of the files in `directory` as they are now, and so makes them a
+    /// checkpoint after `episodes` episodes.
     ///
     /// # Errors
     /// [`CheckpointError::Io`] names the file.
     pub fn seal(&self, directory: &Path, episodes: u64) -> Result<(), CheckpointError> {
         let manifest = Manifest::of(directory, &files::NAMES, episodes, self.config.digest())?;
-        files::write_bytes(&directory.join(manifest::NAME), manifest.to_text().as_bytes())
+        files::write_bytes(
+            &directory.join(manifest::NAME),
+            manifest.to_text().as_bytes(),
+        )
     }
 
-    /// Gives the checkpoint at `place`, if there is a sound one, the name under which it is still found until the new one is in its place.
+    /// Gives the checkpoint at `place`, if there is a sound one, the name under which it is still
+    /// found until the new one is in its place.
     fn make_way(&self, place: &Path) -> Result<(), CheckpointError> {
         if !is_sound(place) {
             // Perhaps its predecessor still lies beside it: that one stays.
@@ -118,7 +137,8 @@ impl CheckpointStore {
     /// The episodes of which there is a checkpoint, the newest first.
     ///
     /// # Errors
-    /// [`CheckpointError::Io`] when the folder cannot be read; a folder that does not exist has none.
+    /// [`CheckpointError::Io`] when the folder cannot be read; a folder that does not exist has
+    /// none.
     pub fn list(&self) -> Result<Vec<u64>, CheckpointError> {
         let mut episodes: Vec<u64> = self.places()?.iter().map(|place| place.episodes).collect();
         episodes.dedup();
@@ -141,7 +161,11 @@ impl CheckpointStore {
             let name = entry.file_name();
             let episodes = name.to_str().and_then(|name| {
                 let number = name.strip_prefix("episode-")?;
-                number.strip_suffix(REPLACED).unwrap_or(number).parse::<u64>().ok()
+                number
+                    .strip_suffix(REPLACED)
+                    .unwrap_or(number)
+                    .parse::<u64>()
+                    .ok()
             });
             found.extend(episodes.map(|episodes| Place {
                 episodes,
@@ -149,14 +173,20 @@ impl CheckpointStore {
             }));
         }
         // The shorter of two names is that of the newer one.
-        found.sort_by_key(|place| (std::cmp::Reverse(place.episodes), place.path.as_os_str().len()));
+        found.sort_by_key(|place| {
+            (
+                std::cmp::Reverse(place.episodes),
+                place.path.as_os_str().len(),
+            )
+        });
         Ok(found)
     }
 
     /// Loads the checkpoint after `episodes` committed episodes.
     ///
     /// # Errors
-    /// [`CheckpointError`] names the file that is missing, damaged, or of another version or configuration.
+    /// [`CheckpointError`] names the file that is missing, damaged, or of another version or
+    /// configuration.
     pub fn load(&self, episodes: u64) -> Result<CheckpointState, CheckpointError> {
         self.load_from(&Place {
             episodes,
@@ -178,7 +208,10 @@ impl CheckpointStore {
             if found != state.progress.episodes {
                 return Err(CheckpointError::Content {
                     path: place.path.clone(),
-                    problem: format!("it is of episode {}, but {what} says {found}", state.progress.episodes),
+                    problem: format!(
+                        "it is of episode {}, but {what} says {found}",
+                        state.progress.episodes
+                    ),
                 });
             }
         }
@@ -186,7 +219,9 @@ impl CheckpointStore {
         if !state.progress.metrics.windows.are_over(window as usize) {
             return Err(CheckpointError::Content {
                 path: place.path.clone(),
-                problem: format!("its averages are not over evaluation.window_episodes = {window} episodes"),
+                problem: format!(
+                    "its averages are not over evaluation.window_episodes = {window} episodes"
+                ),
             });
         }
         Ok(state)
@@ -203,12 +238,14 @@ impl CheckpointStore {
         }
     }
 
-    /// Loads the newest checkpoint that is undamaged; `None` when there is none at all. Resuming from an older one costs time, never the result. Each
-    /// damaged one that is newer is given to `passed_over`, and so is one that does not fit what lies beside it, of which `check` tells.
+    /// Loads the newest checkpoint that is undamaged; `None` when there is none at all. Resuming
+    /// from an older one costs time, never the result. Each damaged one that is newer is given to
+    /// `passed_over`, and so is one that does not fit what lies beside it, of which `check` tells.
     ///
     /// # Errors
-    /// [`CheckpointError::NoneUsable`] when all are damaged: a run is not begun anew without a word. [`CheckpointError::Format`] or
-    /// [`CheckpointError::Configuration`] when the newest undamaged one is of another version or configuration.
+    /// [`CheckpointError::NoneUsable`] when all are damaged: a run is not begun anew without a
+    /// word. [`CheckpointError::Format`] or [`CheckpointError::Configuration`] when the newest
+    /// undamaged one is of another version or configuration.
     pub fn load_newest(
         &self,
         check: impl Fn(&CheckpointState) -> Result<(), CheckpointError>,
@@ -237,15 +274,17 @@ impl CheckpointStore {
         })
     }
 
-    /// Keeps the checkpoint just written and the newest sound ones before it. Later ones are of a future that this run has left by resuming from an
-    /// earlier one.
+    /// Keeps the checkpoint just written and the newest sound ones before it. Later ones are of a
+    /// future that this run has left by resuming from an earlier one.
     fn remove_others(&self, newest: u64) -> Result<(), CheckpointError> {
         let mut sound = BTreeSet::from([newest]);
         for place in self.places()? {
             if place.path == checkpoint_directory(&self.directory, newest) {
                 continue;
             }
-            let superfluous = place.episodes >= newest || sound.len() >= self.keep || sound.contains(&place.episodes);
+            let superfluous = place.episodes >= newest
+                || sound.len() >= self.keep
+                || sound.contains(&place.episodes);
             if superfluous {
                 self.retire(&place.path)?;
                 continue;
@@ -297,16 +336,19 @@ fn remove(path: &Path) -> Result<(), CheckpointError> {
         removed => removed,
     };
     match removed {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(CheckpointError::io("remove", path)(error)),
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(CheckpointError::io("remove", path)(error))
+        }
         _ => Ok(()),
     }
 }
 
-/// Brings to disk what others wrote. Whatever this fails of may be lost, and trying again may succeed without bringing it back: so not even a full disk
-/// is waited for.
+/// Brings to disk what others wrote. Whatever this fails of may be lost, and trying again may
+/// succeed without bringing it back: so not even a full disk is waited for.
 fn sync_once(path: &Path) -> Result<(), CheckpointError> {
-    durable::sync(path)
-        .map_err(|error| CheckpointError::io("write to disk", path)(std::io::Error::other(error.to_string())))
+    durable::sync(path).map_err(|error| {
+        CheckpointError::io("write to disk", path)(std::io::Error::other(error.to_string()))
+    })
 }
 
 /// Brings a file or directory to disk.

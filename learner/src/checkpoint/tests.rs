@@ -16,7 +16,8 @@ use crate::metrics::{EventFile, Windows};
 use crate::replay::Replay;
 use crate::state::TensorValues;
 
-/// With bit patterns that only survive a copy: a negative zero, the smallest number, a NaN with a payload.
+/// With bit patterns that only survive a copy: a negative zero, the smallest number, a NaN with a
+/// payload.
 fn state(episodes: u64) -> CheckpointState {
     let mut replay = Replay::new(&Config::default());
     for number in 0..4 {
@@ -92,7 +93,11 @@ fn state(episodes: u64) -> CheckpointState {
             },
         ],
         tensors: vec![
-            tensor("adam.steps", &[1], TensorValues::I64(vec![-9_007_199_254_740_993])),
+            tensor(
+                "adam.steps",
+                &[1],
+                TensorValues::I64(vec![-9_007_199_254_740_993]),
+            ),
             tensor("log_alpha", &[], TensorValues::F64(vec![-1.0 / 3.0])),
             tensor("policy", &[2, 3], TensorValues::F32(odd)),
         ],
@@ -107,12 +112,18 @@ fn bits(state: &CheckpointState) -> Vec<(String, Vec<u64>)> {
         TensorValues::F64(values) => values.iter().map(|value| value.to_bits()).collect(),
         TensorValues::I64(values) => values.iter().map(|value| value.cast_unsigned()).collect(),
     };
-    let tensors = state
-        .tensors
-        .iter()
-        .map(|tensor| (format!("{} {:?}", tensor.name, tensor.shape), bits(&tensor.values)));
+    let tensors = state.tensors.iter().map(|tensor| {
+        (
+            format!("{} {:?}", tensor.name, tensor.shape),
+            bits(&tensor.values),
+        )
+    });
     let snapshots = state.snapshots.iter().map(|snapshot| {
-        let bits = snapshot.values.iter().map(|value| value.to_bits().into()).collect();
+        let bits = snapshot
+            .values
+            .iter()
+            .map(|value| value.to_bits().into())
+            .collect();
         (format!("snapshot {}", snapshot.version), bits)
     });
     tensors.chain(snapshots).collect()
@@ -159,7 +170,10 @@ fn what_is_saved_is_what_is_loaded() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(500),
+    );
 }
 
 #[test]
@@ -208,8 +222,14 @@ fn a_damaged_byte_anywhere_is_refused_and_its_file_named() {
         let sound = fs::read(&path).unwrap();
         let refused = |bytes: &[u8], what: String| {
             fs::write(&path, bytes).unwrap();
-            let error = store.load(500).expect_err(&format!("{name}, {what}")).to_string();
-            assert!(error.contains(path.to_str().unwrap()), "{name}, {what}: {error}");
+            let error = store
+                .load(500)
+                .expect_err(&format!("{name}, {what}"))
+                .to_string();
+            assert!(
+                error.contains(path.to_str().unwrap()),
+                "{name}, {what}: {error}"
+            );
         };
         // A thousand and more positions, of a file that has so many bits.
         for bit in (0..8 * sound.len()).step_by((8 * sound.len() / 1000).max(1)) {
@@ -227,7 +247,10 @@ fn a_damaged_byte_anywhere_is_refused_and_its_file_named() {
         longer.push(b'\n');
         refused(&longer, "a byte more".to_owned());
         fs::remove_file(&path).unwrap();
-        let error = store.load(500).expect_err(&format!("{name} missing")).to_string();
+        let error = store
+            .load(500)
+            .expect_err(&format!("{name} missing"))
+            .to_string();
         assert!(error.contains(name), "{error}");
         fs::write(&path, &sound).unwrap();
     }
@@ -241,7 +264,10 @@ fn another_configuration_is_refused_by_key_with_both_values() {
     let mut config = config(2);
     config.sac.discount = 0.5;
     let other = CheckpointStore::new(store.directory(), &config);
-    let error = other.load_newest(|_| Ok(()), |_| {}).unwrap_err().to_string();
+    let error = other
+        .load_newest(|_| Ok(()), |_| {})
+        .unwrap_err()
+        .to_string();
     for part in ["episode-500", "sac.discount = 0.99 there, 0.5 here"] {
         assert!(error.contains(part), "`{error}` does not mention `{part}`");
     }
@@ -255,7 +281,11 @@ fn another_format_is_refused_before_anything_else_is_believed() {
     let path = store.save(&state(500), &[]).unwrap().join(manifest::NAME);
     let body = "{\n  \"format\": 9,\n  \"something\": \"new\"";
     let checksum = xxhash_rust::xxh3::xxh3_64(body.as_bytes());
-    fs::write(&path, format!("{body},\n  \"xxh3\": \"{checksum:016x}\"\n}}\n")).unwrap();
+    fs::write(
+        &path,
+        format!("{body},\n  \"xxh3\": \"{checksum:016x}\"\n}}\n"),
+    )
+    .unwrap();
     // It is no damage that an older checkpoint could make good.
     let error = store.load_newest(|_| Ok(()), |_| {}).unwrap_err();
     let expected = manifest::FORMAT;
@@ -272,7 +302,10 @@ fn a_run_whose_checkpoints_are_all_damaged_is_not_begun_anew() {
         let place = store.save(&state(episodes), &[]).unwrap();
         fs::write(place.join("progress.bin"), "").unwrap();
     }
-    let error = store.load_newest(|_| Ok(()), |_| {}).unwrap_err().to_string();
+    let error = store
+        .load_newest(|_| Ok(()), |_| {})
+        .unwrap_err()
+        .to_string();
     for part in [
         "none of the 2 checkpoints",
         "episode-1000/progress.bin",
@@ -326,7 +359,10 @@ fn a_checkpoint_that_is_written_again_is_never_missed() {
     // The first half of the exchange, then a death.
     let replaced = store.directory().join("episode-500.replaced");
     fs::rename(&place, &replaced).unwrap();
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(500),
+    );
     assert_eq!(store.list().unwrap(), [500]);
     // The second half, then damage to the new one.
     let place = store.save(&state(500), &[]).unwrap();
@@ -334,7 +370,10 @@ fn a_checkpoint_that_is_written_again_is_never_missed() {
     fs::rename(&place, &replaced).unwrap();
     fs::create_dir(&place).unwrap();
     fs::write(place.join("progress.bin"), "").unwrap();
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(500),
+    );
     store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
     assert_eq!(names(store.directory()), ["episode-500"]);
@@ -356,7 +395,10 @@ fn a_damaged_newest_is_passed_over_and_replaced_when_its_episode_is_reached_agai
         500
     );
     store.save(&state(1000), &[]).unwrap();
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(1000));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(1000),
+    );
 }
 
 #[test]
@@ -422,14 +464,19 @@ fn a_failed_write_is_told_by_the_next_save_or_the_end() {
 
     let mut writer = start();
     writer.save(state(500), Vec::new()).unwrap();
-    assert!(matches!(writer.finish().unwrap_err(), CheckpointError::Io { .. }));
+    assert!(matches!(
+        writer.finish().unwrap_err(),
+        CheckpointError::Io { .. }
+    ));
 }
 
 #[test]
 fn what_a_checkpoint_relies_on_must_be_there() {
     let (directory, store) = store(2);
     let rows = directory.path().join("episodes.csv");
-    store.save(&state(500), std::slice::from_ref(&rows)).unwrap_err();
+    store
+        .save(&state(500), std::slice::from_ref(&rows))
+        .unwrap_err();
     assert!(store.list().unwrap().is_empty());
     fs::write(&rows, "").unwrap();
     store.save(&state(500), &[rows]).unwrap();
@@ -456,7 +503,9 @@ impl SmallDisk {
 
 impl Drop for SmallDisk {
     fn drop(&mut self) {
-        let _ = std::process::Command::new("umount").arg(self.0.path()).status();
+        let _ = std::process::Command::new("umount")
+            .arg(self.0.path())
+            .status();
     }
 }
 
@@ -488,7 +537,10 @@ fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop
     );
     fs::remove_file(&ballast).unwrap();
     writer.finish().unwrap();
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(600));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(600),
+    );
 
     free(&ballast);
     let mut writer = CheckpointWriter::start(store.clone(), disk.clone()).unwrap();
@@ -497,7 +549,10 @@ fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop
     stop.store(true, std::sync::atomic::Ordering::Relaxed);
     let error = writer.finish().unwrap_err().to_string();
     assert!(error.contains("No space left on device"), "{error}");
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(600));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(600),
+    );
 }
 
 fn wait_for(condition: impl Fn() -> bool) {
@@ -521,7 +576,9 @@ fn one_that_does_not_fit_what_lies_beside_it_is_passed_over_and_told() {
         _ => Ok(()),
     };
     let mut told = Vec::new();
-    let newest = store.load_newest(check, |error| told.push(error.to_string())).unwrap();
+    let newest = store
+        .load_newest(check, |error| told.push(error.to_string()))
+        .unwrap();
     assert_same(&newest.unwrap(), &state(500));
     assert_eq!(
         told,

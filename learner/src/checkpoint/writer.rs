@@ -11,7 +11,8 @@ use crate::disk::Disk;
 
 /// Hands states to the writing thread.
 ///
-/// At most one state is written at a time and none queues: handing over the next one waits until the thread is free, so never more than two are in memory.
+/// At most one state is written at a time and none queues: handing over the next one waits until
+/// the thread is free, so never more than two are in memory.
 #[derive(Debug)]
 pub struct CheckpointWriter {
     store: CheckpointStore,
@@ -38,7 +39,10 @@ impl CheckpointWriter {
         let thread = thread::Builder::new()
             .name("checkpoints".to_owned())
             .spawn(move || write_all(&for_thread, &disk, &receiver))
-            .map_err(CheckpointError::io("start a thread that writes to", store.directory()))?;
+            .map_err(CheckpointError::io(
+                "start a thread that writes to",
+                store.directory(),
+            ))?;
         Ok(Self {
             store,
             orders,
@@ -46,11 +50,17 @@ impl CheckpointWriter {
         })
     }
 
-    /// Hands over a state to be written, and the files that it counts on: see [`CheckpointStore::save`].
+    /// Hands over a state to be written, and the files that it counts on: see
+    /// [`CheckpointStore::save`].
     ///
     /// # Errors
-    /// What went wrong with an earlier one. The thread has ended then; whoever wants to go on writing starts another.
-    pub fn save(&mut self, state: CheckpointState, relied_on: Vec<PathBuf>) -> Result<(), CheckpointError> {
+    /// What went wrong with an earlier one. The thread has ended then; whoever wants to go on
+    /// writing starts another.
+    pub fn save(
+        &mut self,
+        state: CheckpointState,
+        relied_on: Vec<PathBuf>,
+    ) -> Result<(), CheckpointError> {
         self.orders
             .send(Order { state, relied_on })
             .or_else(|_| self.join().and_then(|()| Err(self.gone())))
@@ -78,7 +88,11 @@ impl CheckpointWriter {
     }
 }
 
-fn write_all(store: &CheckpointStore, disk: &Disk, orders: &Receiver<Order>) -> Result<(), CheckpointError> {
+fn write_all(
+    store: &CheckpointStore,
+    disk: &Disk,
+    orders: &Receiver<Order>,
+) -> Result<(), CheckpointError> {
     for Order { state, relied_on } in orders {
         let started = std::time::Instant::now();
         let path = disk.with_room(store.directory(), || store.save(&state, &relied_on))?;

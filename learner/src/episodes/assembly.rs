@@ -1,7 +1,8 @@
 //! Assembles streamed records into a whole episode, or into a whole segment of one.
 //!
-//! An episode is committed once, complete and in order, or not at all; nothing downstream ever sees half of one, or one flown with two policies. Of an episode in segments
-//! the same holds for each segment, and each begins where the one before it ended.
+//! An episode is committed once, complete and in order, or not at all; nothing downstream ever sees
+//! half of one, or one flown with two policies. Of an episode in segments the same holds for each
+//! segment, and each begins where the one before it ended.
 
 use skein_protocol::ids::{ActorId, ActorIncarnation, EpisodeId};
 use skein_protocol::transition::{Outcome, RecordFault, RecordKind, TransitionRecord};
@@ -85,7 +86,8 @@ pub enum Assembled {
 }
 
 impl Assembly {
-    /// Nothing yet of what `order` asks for, of an episode of at most `longest_records` with codes of `latent` numbers. A later segment `begins` where the one before it ended.
+    /// Nothing yet of what `order` asks for, of an episode of at most `longest_records` with codes
+    /// of `latent` numbers. A later segment `begins` where the one before it ended.
     pub fn new(
         order: Order,
         begins: Option<SegmentEnd>,
@@ -132,7 +134,8 @@ impl Assembly {
     /// Takes the next record in.
     ///
     /// # Errors
-    /// [`RecordFault`] when it is not the next record of this episode, or makes no sense; the episode is void then.
+    /// [`RecordFault`] when it is not the next record of this episode, or makes no sense; the
+    /// episode is void then.
     pub fn push(&mut self, record: &TransitionRecord) -> Result<Assembled, RecordFault> {
         let step = self.order.ticket.first_step() + self.episode.observations.len() as u32;
         let kind = record.check(&self.order.ticket, self.actor, self.incarnation, step)?;
@@ -171,7 +174,8 @@ impl Assembly {
                 return Ok(Assembled::Step);
             }
         }
-        self.finish().map(|episode| Assembled::Whole(Box::new(episode)))
+        self.finish()
+            .map(|episode| Assembled::Whole(Box::new(episode)))
     }
 
     fn take_step(&mut self, record: &TransitionRecord) {
@@ -183,10 +187,13 @@ impl Assembly {
         self.last_step = StepEnd::of(record);
     }
 
-    /// Makes room for the images of the longest episode at once. The system gives memory as it is written to, so what is not needed costs nothing; images that
-    /// grew would be moved again and again, with as much fresh memory each time.
+    /// Makes room for the images of the longest episode at once. The system gives memory as it is
+    /// written to, so what is not needed costs nothing; images that grew would be moved again and
+    /// again, with as much fresh memory each time.
     fn make_room(&mut self) {
-        let longest = self.segment_steps().map_or(self.longest_records, |steps| steps + 1);
+        let longest = self
+            .segment_steps()
+            .map_or(self.longest_records, |steps| steps + 1);
         if let Some(depth) = &mut self.episode.depth {
             depth.reserve_exact(longest.min(self.longest_records) * IMAGE_PIXELS);
         }
@@ -194,13 +201,21 @@ impl Assembly {
 
     /// Steps of the segment, if it is one.
     fn segment_steps(&self) -> Option<usize> {
-        self.order.ticket.segment.as_ref().map(|segment| segment.steps as usize)
+        self.order
+            .ticket
+            .segment
+            .as_ref()
+            .map(|segment| segment.steps as usize)
     }
 
-    /// Whether a later segment begins where the one before it ended: a record of a machine whose physics come to something else must not go on with the episode.
+    /// Whether a later segment begins where the one before it ended: a record of a machine whose
+    /// physics come to something else must not go on with the episode.
     fn check_begin(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
         let is_elsewhere = self.begins.is_some_and(|begins| !begins.is_at(record));
-        refuse_contradictions([("the segment does not begin where the one before it ended", is_elsewhere)])
+        refuse_contradictions([(
+            "the segment does not begin where the one before it ended",
+            is_elsewhere,
+        )])
     }
 
     /// Whether the episode goes on, and walls are passed as the step says.
@@ -212,11 +227,20 @@ impl Assembly {
         let may_level_up = passes || record.terminated == 1;
         let is_over = self.segment_steps() == Some(self.episode.steps());
         refuse_contradictions([
-            ("a step after the episode's end", self.last_step != StepEnd::Onward),
+            (
+                "a step after the episode's end",
+                self.last_step != StepEnd::Onward,
+            ),
             ("a step after the segment's last", is_over),
-            ("walls passed grow fewer", record.walls_passed < passed_before),
+            (
+                "walls passed grow fewer",
+                record.walls_passed < passed_before,
+            ),
             ("a wall passed without a level-up", passes && !levels_up),
-            ("a level-up without a wall passed", levels_up && !may_level_up),
+            (
+                "a level-up without a wall passed",
+                levels_up && !may_level_up,
+            ),
         ])
     }
 
@@ -231,13 +255,17 @@ impl Assembly {
             StepEnd::Onward => false,
             StepEnd::Truncated => outcome == Some(Outcome::TimedOut),
             StepEnd::Terminated { level_up } => {
-                outcome == Some(Outcome::Collided) || (outcome == Some(Outcome::ReachedEnd) && level_up)
+                outcome == Some(Outcome::Collided)
+                    || (outcome == Some(Outcome::ReachedEnd) && level_up)
             }
         };
         let passed = self.episode.walls_passed;
         refuse_contradictions([
             ("the episode did not end as it closes", !fits),
-            ("walls passed after the last step", record.walls_passed != passed),
+            (
+                "walls passed after the last step",
+                record.walls_passed != passed,
+            ),
         ])
     }
 
@@ -245,7 +273,10 @@ impl Assembly {
     fn check_segment_end(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
         let steps = self.segment_steps();
         refuse_contradictions([
-            ("a segment ends in an episode that is flown whole", steps.is_none()),
+            (
+                "a segment ends in an episode that is flown whole",
+                steps.is_none(),
+            ),
             (
                 "the segment ends before its last step",
                 steps != Some(self.episode.steps()),
@@ -295,7 +326,10 @@ impl Assembly {
 /// The episode or segment that `order` asks for, before its first record.
 fn nothing_of(order: &Order, actor: ActorId) -> CommittedEpisode {
     let ticket = &order.ticket;
-    let flown: &[[f32; ACTION]] = ticket.segment.as_ref().map_or(&[], |segment| &segment.flown);
+    let flown: &[[f32; ACTION]] = ticket
+        .segment
+        .as_ref()
+        .map_or(&[], |segment| &segment.flown);
     CommittedEpisode {
         episode: ticket.episode,
         epoch: order.epoch,
@@ -330,7 +364,9 @@ impl StepEnd {
 }
 
 /// Refuses the first of the contradictions that is there.
-fn refuse_contradictions<const N: usize>(contradictions: [(&'static str, bool); N]) -> Result<(), RecordFault> {
+fn refuse_contradictions<const N: usize>(
+    contradictions: [(&'static str, bool); N],
+) -> Result<(), RecordFault> {
     match contradictions.into_iter().find(|(_, is_there)| *is_there) {
         Some((what, _)) => Err(RecordFault::Contradiction { what }),
         None => Ok(()),

@@ -1,4 +1,5 @@
-//! An episode is whole, in order and makes sense, and so is a segment, or it is refused by what is wrong with it.
+//! An episode is whole, in order and makes sense, and so is a segment, or it is refused by what is
+//! wrong with it.
 
 use bytemuck::Zeroable;
 use skein_protocol::ids::{Attempt, Epoch, PolicyVersion, RunId};
@@ -84,7 +85,14 @@ fn no_episode_mixes_policy_versions() {
         newer.policy_version += 1;
         let fault = assembly.push(&newer).unwrap_err();
         let (name, found, expected) = ("policy_version", 4, 3);
-        assert_eq!(fault, RecordFault::Mismatch { name, found, expected });
+        assert_eq!(
+            fault,
+            RecordFault::Mismatch {
+                name,
+                found,
+                expected
+            }
+        );
     }
     assert_eq!(assemble(Keep::Latents).policy_version, PolicyVersion(3));
 }
@@ -133,16 +141,28 @@ fn segment(begins: Option<SegmentEnd>) -> Assembly {
         segment: Some(segment),
         ..ticket()
     };
-    Assembly::new(order(ticket, Keep::Depth), begins, 100, LATENT, ACTOR, INCARNATION)
+    Assembly::new(
+        order(ticket, Keep::Depth),
+        begins,
+        100,
+        LATENT,
+        ACTOR,
+        INCARNATION,
+    )
 }
 
-fn changed(mut record: TransitionRecord, change: impl FnOnce(&mut TransitionRecord)) -> TransitionRecord {
+fn changed(
+    mut record: TransitionRecord,
+    change: impl FnOnce(&mut TransitionRecord),
+) -> TransitionRecord {
     change(&mut record);
     record
 }
 
 fn segment_end(step: u32) -> TransitionRecord {
-    changed(onward(step), |record| record.kind = RecordKind::SegmentEnd.code())
+    changed(onward(step), |record| {
+        record.kind = RecordKind::SegmentEnd.code()
+    })
 }
 
 /// A step after which the episode goes on.
@@ -160,36 +180,54 @@ fn a_segment_is_its_steps_and_what_they_led_to_and_knows_what_came_before() {
     let Ok(Assembled::Whole(segment)) = assembly.push(&segment_end(3)) else {
         panic!("a segment's end ends it");
     };
-    assert_eq!((segment.first_step, segment.steps(), segment.outcome), (1, 2, None));
-    assert_eq!((segment.action_before, segment.check()), ([0.25, -0.5], Ok(())));
+    assert_eq!(
+        (segment.first_step, segment.steps(), segment.outcome),
+        (1, 2, None)
+    );
+    assert_eq!(
+        (segment.action_before, segment.check()),
+        ([0.25, -0.5], Ok(()))
+    );
     assert!(!segment.terminated());
     let end = SegmentEnd::of(&segment).unwrap();
     assert_eq!((end.episode, end.steps), (EpisodeId(5), 3));
     // The episode may end in a segment, of which no other begins then.
     let mut last = self::segment(None);
-    last.push(&changed(onward(1), |record| record.terminated = 1)).unwrap();
+    last.push(&changed(onward(1), |record| record.terminated = 1))
+        .unwrap();
     let closing = changed(onward(2), |record| {
         (record.kind, record.outcome) = (RecordKind::Closing.code(), Outcome::Collided.code());
     });
     let Ok(Assembled::Whole(last)) = last.push(&closing) else {
         panic!("a closing record ends a segment, too");
     };
-    assert_eq!((last.outcome, SegmentEnd::of(&last)), (Some(Outcome::Collided), None));
+    assert_eq!(
+        (last.outcome, SegmentEnd::of(&last)),
+        (Some(Outcome::Collided), None)
+    );
 }
 
 #[test]
 fn a_segment_that_is_too_short_or_too_long_or_of_a_whole_episode_is_refused() {
     let refusal = |records: &[TransitionRecord], mut assembly: Assembly| {
-        let fault = records.iter().find_map(|record| assembly.push(record).err());
+        let fault = records
+            .iter()
+            .find_map(|record| assembly.push(record).err());
         fault.expect("it makes no sense").to_string()
     };
     assert!(refusal(&[onward(1), segment_end(2)], segment(None)).contains("before its last step"));
-    assert!(refusal(&[onward(1), onward(2), onward(3)], segment(None)).contains("after the segment's last"));
+    assert!(
+        refusal(&[onward(1), onward(2), onward(3)], segment(None))
+            .contains("after the segment's last")
+    );
     assert!(refusal(&[onward(0)], segment(None)).contains("step is 0 where 1"));
     assert!(refusal(&[segment_end(1)], segment(None)).contains("before its last step"));
     assert!(refusal(&[onward(0), segment_end(1)], assembly(Keep::Latents)).contains("flown whole"));
     let end = |change: fn(&mut TransitionRecord)| {
-        refusal(&[onward(1), changed(onward(2), change), segment_end(3)], segment(None))
+        refusal(
+            &[onward(1), changed(onward(2), change), segment_end(3)],
+            segment(None),
+        )
     };
     assert!(end(|last| last.truncated = 1).contains("ended before the segment"));
     assert!(end(|last| (last.walls_passed, last.level_up) = (1, 1)).contains("walls passed after"));
@@ -217,7 +255,10 @@ fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passe
     });
     // An encoder that has learned since sees it otherwise.
     assert_ne!(there.latent, seen.latent);
-    assert!(matches!(segment(Some(begins)).push(&there), Ok(Assembled::Step)));
+    assert!(matches!(
+        segment(Some(begins)).push(&there),
+        Ok(Assembled::Step)
+    ));
     let changes: [fn(&mut TransitionRecord); 3] = [
         |record| record.position_m[2] += 1e-6,
         |record| record.velocity_mps[1] = -0.5,
@@ -225,7 +266,10 @@ fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passe
     ];
     for change in changes {
         let elsewhere = changed(there, change);
-        let fault = segment(Some(begins)).push(&elsewhere).unwrap_err().to_string();
+        let fault = segment(Some(begins))
+            .push(&elsewhere)
+            .unwrap_err()
+            .to_string();
         assert!(fault.contains("does not begin where"), "{fault}");
     }
     let fewer = changed(there, |record| record.walls_passed = 1);
@@ -236,18 +280,31 @@ fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passe
 fn depth_images_are_copied_only_for_who_wants_them() {
     assert_eq!(assemble(Keep::Latents).depth, None);
     let kept = assemble(Keep::Depth).depth.unwrap();
-    let images: Vec<_> = kept.chunks_exact(IMAGE_PIXELS).map(|image| image.to_vec()).collect();
-    assert_eq!(images, (0..=3).map(|step| vec![step; IMAGE_PIXELS]).collect::<Vec<_>>());
+    let images: Vec<_> = kept
+        .chunks_exact(IMAGE_PIXELS)
+        .map(|image| image.to_vec())
+        .collect();
+    assert_eq!(
+        images,
+        (0..=3)
+            .map(|step| vec![step; IMAGE_PIXELS])
+            .collect::<Vec<_>>()
+    );
 }
 
 #[test]
 fn an_episode_that_contradicts_itself_is_refused() {
-    // A change of one record, by its step, and what is said of it or of the first one that shows it.
+    // A change of one record, by its step, and what is said of it or of the first one that shows
+    // it.
     type Case = (u32, fn(&mut TransitionRecord), &'static str);
     let cases: [Case; 9] = [
         (0, |r| r.truncated = 1, "a step after the episode's end"),
         (0, |r| r.terminated = 1, "a step after the episode's end"),
-        (2, |r| r.truncated = 0, "the episode did not end as it closes"),
+        (
+            2,
+            |r| r.truncated = 0,
+            "the episode did not end as it closes",
+        ),
         (
             3,
             |r| r.outcome = Outcome::Collided.code(),
@@ -258,10 +315,22 @@ fn an_episode_that_contradicts_itself_is_refused() {
             |r| (r.truncated, r.terminated) = (0, 1),
             "the episode did not end as it closes",
         ),
-        (1, |r| r.walls_passed = 1, "a wall passed without a level-up"),
+        (
+            1,
+            |r| r.walls_passed = 1,
+            "a wall passed without a level-up",
+        ),
         (1, |r| r.level_up = 1, "a level-up without a wall passed"),
-        (1, |r| (r.walls_passed, r.level_up) = (1, 1), "walls passed grow fewer"),
-        (3, |r| r.walls_passed = 1, "walls passed after the last step"),
+        (
+            1,
+            |r| (r.walls_passed, r.level_up) = (1, 1),
+            "walls passed grow fewer",
+        ),
+        (
+            3,
+            |r| r.walls_passed = 1,
+            "walls passed after the last step",
+        ),
     ];
     for (step, change, expected) in cases {
         let mut assembly = assembly(Keep::Latents);
@@ -273,7 +342,11 @@ fn an_episode_that_contradicts_itself_is_refused() {
             }
             assembly.push(&record).err()
         });
-        assert_eq!(fault, Some(RecordFault::Contradiction { what: expected }), "{expected}");
+        assert_eq!(
+            fault,
+            Some(RecordFault::Contradiction { what: expected }),
+            "{expected}"
+        );
     }
 }
 

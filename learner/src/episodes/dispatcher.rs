@@ -1,10 +1,13 @@
 //! The ticket dispatcher: who flies what, what has come of it, what must be flown again.
 //!
-//! Actors fly only against tickets and get another one only as an episode is taken in, so what is outstanding is bounded and no buffer can overflow. An episode
-//! that arrives with a hole, from a dead actor, or too late is discarded whole and its ticket issued again, with the next attempt number: exactly-once
-//! commit from at-least-once flying. Which actor flies a ticket, and how often, changes nothing in the episode.
+//! Actors fly only against tickets and get another one only as an episode is taken in, so what is
+//! outstanding is bounded and no buffer can overflow. An episode that arrives with a hole, from a
+//! dead actor, or too late is discarded whole and its ticket issued again, with the next attempt
+//! number: exactly-once commit from at-least-once flying. Which actor flies a ticket, and how
+//! often, changes nothing in the episode.
 //!
-//! Deliberately absent: clocks and transport. Time is passed in, messages are passed in and out, so that every path can be tested.
+//! Deliberately absent: clocks and transport. Time is passed in, messages are passed in and out, so
+//! that every path can be tested.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -58,10 +61,12 @@ struct Actor {
     tickets: VecDeque<Issued>,
     /// Episodes it has spoiled since the last one that was committed.
     spoiled: u32,
-    /// What its time had gone into when it was first heard of: an actor that was taken for dead and is not is not counted twice.
+    /// What its time had gone into when it was first heard of: an actor that was taken for dead and
+    /// is not is not counted twice.
     first_times: Times,
     times: Times,
-    /// It has spoken since, and nothing shows that it has seen a ticket that it was given after: it may have found nothing to fly and be waiting.
+    /// It has spoken since, and nothing shows that it has seen a ticket that it was given after: it
+    /// may have found nothing to fly and be waiting.
     may_wait: bool,
 }
 
@@ -151,7 +156,12 @@ impl Dispatcher {
 
     /// Orders that are not committed yet.
     pub fn open_orders(&self) -> usize {
-        self.waiting.len() + self.actors.values().map(|actor| actor.tickets.len()).sum::<usize>()
+        self.waiting.len()
+            + self
+                .actors
+                .values()
+                .map(|actor| actor.tickets.len())
+                .sum::<usize>()
     }
 
     /// Takes an order; it is flown after those taken before.
@@ -159,9 +169,13 @@ impl Dispatcher {
         self.waiting.push_back(order);
     }
 
-    /// Takes an actor's heartbeat: a new actor, or a new incarnation of a known one, can be given tickets from now on.
+    /// Takes an actor's heartbeat: a new actor, or a new incarnation of a known one, can be given
+    /// tickets from now on.
     pub fn on_status(&mut self, status: &ActorStatus, now: Instant) {
-        let known = self.actors.get(&status.actor).map(|actor| actor.incarnation);
+        let known = self
+            .actors
+            .get(&status.actor)
+            .map(|actor| actor.incarnation);
         match status.state {
             ActorState::Leaving => {
                 if known == Some(status.incarnation) {
@@ -178,7 +192,9 @@ impl Dispatcher {
                     self.dismiss(status.actor, Reissue::Restarted);
                 }
                 // A bound, whatever actors say that there be: each would be given tickets.
-                if !self.actors.contains_key(&status.actor) && self.actors.len() >= self.limits.max_actors {
+                if !self.actors.contains_key(&status.actor)
+                    && self.actors.len() >= self.limits.max_actors
+                {
                     self.faults.refuse(Refusal::Status);
                     tracing::debug!(actor = %status.actor, limit = self.limits.max_actors, "more actors than transport.max_actors");
                     return;
@@ -198,7 +214,8 @@ impl Dispatcher {
                 });
                 actor.last_sign = now;
                 actor.times = status.times;
-                // It speaks when it finds nothing to fly. What was on its way to it then, it finds when it is woken.
+                // It speaks when it finds nothing to fly. What was on its way to it then, it finds
+                // when it is woken.
                 actor.may_wait = true;
                 for issued in &mut actor.tickets {
                     self.is_wake_due |= std::mem::take(&mut issued.is_newest_word);
@@ -227,7 +244,8 @@ impl Dispatcher {
         };
         actor.last_sign = now;
         let is_of = |issued: &Issued| {
-            issued.ticket().episode.0 == record.episode && issued.ticket().attempt.0 == record.attempt
+            issued.ticket().episode.0 == record.episode
+                && issued.ticket().attempt.0 == record.attempt
         };
         let Some(position) = actor.tickets.iter().position(is_of) else {
             // The rest of an episode that was given up.
@@ -237,7 +255,8 @@ impl Dispatcher {
         if actor.tickets[position].is_newest_word {
             actor.may_wait = false;
         }
-        // Tickets are flown in order: those before this one never reached the actor, or their records never reached us.
+        // Tickets are flown in order: those before this one never reached the actor, or their
+        // records never reached us.
         for _ in 0..position {
             self.reissue_first(id, Reissue::Skipped);
         }
@@ -251,7 +270,11 @@ impl Dispatcher {
         record: &TransitionRecord,
         now: Instant,
     ) -> Result<Option<(Place, CommittedEpisode)>, HopelessEpisode> {
-        let Some(issued) = self.actors.get_mut(&id).and_then(|actor| actor.tickets.front_mut()) else {
+        let Some(issued) = self
+            .actors
+            .get_mut(&id)
+            .and_then(|actor| actor.tickets.front_mut())
+        else {
             return Ok(None);
         };
         match issued.assembly.push(record) {
@@ -265,7 +288,8 @@ impl Dispatcher {
             }
             Ok(Assembled::Failed) => {
                 let episode = issued.ticket().episode;
-                self.fail(id, episode, "the simulator broke down").map(|()| None)
+                self.fail(id, episode, "the simulator broke down")
+                    .map(|()| None)
             }
             Err(fault) => {
                 let episode = issued.ticket().episode;
@@ -332,7 +356,8 @@ impl Dispatcher {
             } else if let Some(issued) = actor.tickets.front()
                 && now.saturating_duration_since(issued.since) > deadline
             {
-                // Of an actor that speaks, not one record came: its line may be broken in one direction. A new one is not.
+                // Of an actor that speaks, not one record came: its line may be broken in one
+                // direction. A new one is not.
                 if issued.assembly.is_empty() {
                     let letter = ControlRecord::rejoin(self.run, id, actor.incarnation);
                     self.letters.push(Message::Control(letter));
@@ -344,19 +369,20 @@ impl Dispatcher {
         self.failures.on_time(now);
     }
 
-    /// Hands out tickets as far as there are orders and actors with credit: each actor its first before any its second, and none to an actor that spoils
-    /// every episode while there are others. Returns what to send.
+    /// Hands out tickets as far as there are orders and actors with credit: each actor its first
+    /// before any its second, and none to an actor that spoils every episode while there are
+    /// others. Returns what to send.
     pub fn issue(&mut self, now: Instant) -> Vec<Message> {
         let mut messages = std::mem::take(&mut self.letters);
         self.is_wake_due |= !messages.is_empty();
         let credit = self.limits.tickets_per_actor;
         let any_trusted = self.actors.values().any(Actor::is_trusted);
         while !self.waiting.is_empty() {
-            let with_credit = self
-                .actors
-                .iter_mut()
-                .filter(|(_, actor)| actor.tickets.len() < credit && (actor.is_trusted() || !any_trusted));
-            let Some((&id, actor)) = with_credit.min_by_key(|(_, actor)| actor.tickets.len()) else {
+            let with_credit = self.actors.iter_mut().filter(|(_, actor)| {
+                actor.tickets.len() < credit && (actor.is_trusted() || !any_trusted)
+            });
+            let Some((&id, actor)) = with_credit.min_by_key(|(_, actor)| actor.tickets.len())
+            else {
                 break;
             };
             let Some(order) = self.waiting.pop_front() else {
@@ -365,7 +391,8 @@ impl Dispatcher {
             messages.push(Message::fly(&order.ticket, id, actor.incarnation));
             let begins = self.segment_end.filter(|end| end.is_before(&order));
             let longest = self.limits.max_records_per_episode;
-            let assembly = Assembly::new(order, begins, longest, self.latent, id, actor.incarnation);
+            let assembly =
+                Assembly::new(order, begins, longest, self.latent, id, actor.incarnation);
             self.is_wake_due |= actor.may_wait || actor.tickets.is_empty();
             actor.tickets.push_back(Issued {
                 since: now,
@@ -376,15 +403,20 @@ impl Dispatcher {
         messages
     }
 
-    /// Whether an actor may wait that was given something since this was last asked. One that flies looks by itself before each step, and to wake all actors
-    /// for every episode costs the more, the more of them there are.
+    /// Whether an actor may wait that was given something since this was last asked. One that flies
+    /// looks by itself before each step, and to wake all actors for every episode costs the more,
+    /// the more of them there are.
     pub fn take_wake(&mut self) -> bool {
         std::mem::take(&mut self.is_wake_due)
     }
 
     /// Forgets an actor; its tickets are issued again.
     fn dismiss(&mut self, id: ActorId, why: Reissue) {
-        while self.actors.get(&id).is_some_and(|actor| !actor.tickets.is_empty()) {
+        while self
+            .actors
+            .get(&id)
+            .is_some_and(|actor| !actor.tickets.is_empty())
+        {
             self.reissue_last(id, why);
         }
         if let Some(actor) = self.actors.remove(&id) {
@@ -403,19 +435,31 @@ impl Dispatcher {
 
     /// A ticket's time runs from when the actor could begin it.
     fn restart_clock(&mut self, id: ActorId, now: Instant) {
-        if let Some(next) = self.actors.get_mut(&id).and_then(|actor| actor.tickets.front_mut()) {
+        if let Some(next) = self
+            .actors
+            .get_mut(&id)
+            .and_then(|actor| actor.tickets.front_mut())
+        {
             next.since = now;
         }
     }
 
     fn reissue_first(&mut self, id: ActorId, why: Reissue) {
-        if let Some(issued) = self.actors.get_mut(&id).and_then(|actor| actor.tickets.pop_front()) {
+        if let Some(issued) = self
+            .actors
+            .get_mut(&id)
+            .and_then(|actor| actor.tickets.pop_front())
+        {
             self.reissue(issued, id, why);
         }
     }
 
     fn reissue_last(&mut self, id: ActorId, why: Reissue) {
-        if let Some(issued) = self.actors.get_mut(&id).and_then(|actor| actor.tickets.pop_back()) {
+        if let Some(issued) = self
+            .actors
+            .get_mut(&id)
+            .and_then(|actor| actor.tickets.pop_back())
+        {
             self.reissue(issued, id, why);
         }
     }

@@ -1,4 +1,5 @@
-//! Whatever happens to records and actors, every ordered episode is committed exactly once, whole, and as its ticket says.
+//! Whatever happens to records and actors, every ordered episode is committed exactly once, whole,
+//! and as its ticket says.
 
 use std::collections::BTreeMap;
 
@@ -48,7 +49,12 @@ pub(super) fn order(episode: u64) -> Order {
     }
 }
 
-pub(super) fn attach(dispatcher: &mut Dispatcher, actor: u32, incarnation: ActorIncarnation, now: Instant) {
+pub(super) fn attach(
+    dispatcher: &mut Dispatcher,
+    actor: u32,
+    incarnation: ActorIncarnation,
+    now: Instant,
+) {
     dispatcher.on_status(&status(actor, incarnation), now);
 }
 
@@ -77,12 +83,18 @@ fn flown(
         state,
         ..status(actor, incarnation)
     };
-    status.times.add(Stage::Physics, secs, Duration::from_secs(secs));
+    status
+        .times
+        .add(Stage::Physics, secs, Duration::from_secs(secs));
     dispatcher.on_status(&status, now);
 }
 
 /// Tickets handed out to `actor`.
-pub(super) fn tickets_for(messages: &[Message], actor: u32, incarnation: ActorIncarnation) -> Vec<Ticket> {
+pub(super) fn tickets_for(
+    messages: &[Message],
+    actor: u32,
+    incarnation: ActorIncarnation,
+) -> Vec<Ticket> {
     let own = messages
         .iter()
         .filter(|message| message.is_for(ActorId(actor), incarnation));
@@ -94,7 +106,11 @@ pub(super) fn tickets_for(messages: &[Message], actor: u32, incarnation: ActorIn
 }
 
 /// The records of an episode of `2 + episode % 3` steps.
-pub(super) fn records(ticket: &Ticket, actor: u32, incarnation: ActorIncarnation) -> Vec<TransitionRecord> {
+pub(super) fn records(
+    ticket: &Ticket,
+    actor: u32,
+    incarnation: ActorIncarnation,
+) -> Vec<TransitionRecord> {
     let steps = 2 + (ticket.episode.0 % 3) as u32;
     (0..=steps)
         .map(|step| {
@@ -130,7 +146,10 @@ pub(super) fn dispatcher(now: Instant) -> (Dispatcher, Vec<Ticket>) {
     attach(&mut dispatcher, 0, INCARNATION, now);
     let tickets = tickets_for(&dispatcher.issue(now), 0, INCARNATION);
     assert_eq!(
-        tickets.iter().map(|ticket| ticket.episode.0).collect::<Vec<_>>(),
+        tickets
+            .iter()
+            .map(|ticket| ticket.episode.0)
+            .collect::<Vec<_>>(),
         [0, 1]
     );
     (dispatcher, tickets)
@@ -160,7 +179,10 @@ fn every_actor_gets_its_first_ticket_before_any_its_second() {
     attach(&mut dispatcher, 1, INCARNATION, now);
     let messages = dispatcher.issue(now);
     assert_eq!(tickets_for(&messages, 0, INCARNATION).len(), 2);
-    assert_eq!(tickets_for(&messages, 1, INCARNATION)[0].episode, EpisodeId(1));
+    assert_eq!(
+        tickets_for(&messages, 1, INCARNATION)[0].episode,
+        EpisodeId(1)
+    );
 }
 
 #[test]
@@ -193,7 +215,13 @@ fn tickets_of_a_silent_actor_go_to_another_and_its_late_episode_is_not_taken() {
     dispatcher.on_time(late);
     assert_eq!(dispatcher.actors().count(), 1);
     let again = tickets_for(&dispatcher.issue(late), 1, INCARNATION);
-    assert_eq!(again.iter().map(|ticket| ticket.episode.0).collect::<Vec<_>>(), [0, 1]);
+    assert_eq!(
+        again
+            .iter()
+            .map(|ticket| ticket.episode.0)
+            .collect::<Vec<_>>(),
+        [0, 1]
+    );
     assert!(feed(&mut dispatcher, &records(&tickets[0], 0, INCARNATION), late).is_empty());
     attach(&mut dispatcher, 0, INCARNATION, late);
     assert!(
@@ -222,7 +250,10 @@ fn a_restarted_actor_owes_nothing_of_its_former_incarnation() {
         [(0, 1), (1, 1)]
     );
     assert!(feed(&mut dispatcher, &records(&tickets[0], 0, INCARNATION), now).is_empty());
-    assert_eq!(feed(&mut dispatcher, &records(&again[0], 0, next), now).len(), 1);
+    assert_eq!(
+        feed(&mut dispatcher, &records(&again[0], 0, next), now).len(),
+        1
+    );
 }
 
 #[test]
@@ -255,14 +286,16 @@ fn a_ticket_that_takes_too_long_is_issued_again_though_its_actor_lives() {
     assert!(
         letters
             .iter()
-            .any(|letter| letter.is_for(ActorId(0), INCARNATION) && letter.read(RUN) == Ok(Control::Rejoin)),
+            .any(|letter| letter.is_for(ActorId(0), INCARNATION)
+                && letter.read(RUN) == Ok(Control::Rejoin)),
         "nothing at all came of it: its line is broken"
     );
     assert_eq!(dispatcher.faults().reissued(), 1);
     assert!(feed(&mut dispatcher, &records(&tickets[0], 0, INCARNATION), now).is_empty());
 }
 
-/// Has an actor fail what is its first episode, again and again, by `damage` to its first record, until the dispatcher gives up; at most `most` times.
+/// Has an actor fail what is its first episode, again and again, by `damage` to its first record,
+/// until the dispatcher gives up; at most `most` times.
 fn fail_for_ever(
     dispatcher: &mut Dispatcher,
     actor: u32,
@@ -370,7 +403,10 @@ fn actors_beyond_the_limit_get_no_tickets_until_there_is_room() {
     attach(&mut dispatcher, 1, INCARNATION, later);
     dispatcher.on_time(later);
     attach(&mut dispatcher, 2, INCARNATION, later);
-    assert_eq!(dispatcher.actors().collect::<Vec<_>>(), [ActorId(1), ActorId(2)]);
+    assert_eq!(
+        dispatcher.actors().collect::<Vec<_>>(),
+        [ActorId(1), ActorId(2)]
+    );
 }
 
 /// What may happen next to one of three actors.
@@ -481,7 +517,14 @@ fn the_times_of_all_incarnations_of_all_actors_are_summed_up_and_none_twice() {
     let now = Instant::now();
     let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
     let flies = |dispatcher: &mut Dispatcher, actor, incarnation, secs| {
-        flown(dispatcher, actor, incarnation, ActorState::Serving, secs, now)
+        flown(
+            dispatcher,
+            actor,
+            incarnation,
+            ActorState::Serving,
+            secs,
+            now,
+        )
     };
     let physics = |dispatcher: &Dispatcher| dispatcher.actor_times().of(Stage::Physics);
     let next_incarnation = ActorIncarnation(INCARNATION.0 + 1);
@@ -497,14 +540,38 @@ fn the_times_of_all_incarnations_of_all_actors_are_summed_up_and_none_twice() {
     flies(&mut dispatcher, 0, INCARNATION, 7000);
     assert_eq!(physics(&dispatcher).count, 125);
     // What it says as it leaves is in.
-    flown(&mut dispatcher, 0, next_incarnation, ActorState::Leaving, 101, now);
+    flown(
+        &mut dispatcher,
+        0,
+        next_incarnation,
+        ActorState::Leaving,
+        101,
+        now,
+    );
     assert_eq!(physics(&dispatcher).count, 126);
     // Taken for dead, and heard again in the same incarnation.
     let later = now + 2 * Duration::from_secs_f64(limits().actor_silence_secs);
     dispatcher.on_time(later);
-    assert_eq!((dispatcher.actors().count(), physics(&dispatcher).count), (0, 126));
-    flown(&mut dispatcher, 1, INCARNATION, ActorState::Serving, 30, later);
-    flown(&mut dispatcher, 1, INCARNATION, ActorState::Serving, 31, later);
+    assert_eq!(
+        (dispatcher.actors().count(), physics(&dispatcher).count),
+        (0, 126)
+    );
+    flown(
+        &mut dispatcher,
+        1,
+        INCARNATION,
+        ActorState::Serving,
+        30,
+        later,
+    );
+    flown(
+        &mut dispatcher,
+        1,
+        INCARNATION,
+        ActorState::Serving,
+        31,
+        later,
+    );
     assert_eq!(physics(&dispatcher).count, 127);
     assert_eq!(physics(&dispatcher).nanos, 127_000_000_000);
 }

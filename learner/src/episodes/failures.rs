@@ -1,8 +1,10 @@
 //! Which episodes failed, by whose doing, and which of them nobody can fly.
 //!
-//! An episode is a function of its ticket, so one that fails because of what it is fails with every actor. But an actor may be broken, or lie: what it alone
-//! makes of an episode says nothing about the episode. So an episode is given up, and the run with it, only when two actors have failed it, or when the one
-//! that fails it is the only one there is and nobody is left who could tell otherwise.
+//! An episode is a function of its ticket, so one that fails because of what it is fails with every
+//! actor. But an actor may be broken, or lie: what it alone makes of an episode says nothing about
+//! the episode. So an episode is given up, and the run with it, only when two actors have failed
+//! it, or when the one that fails it is the only one there is and nobody is left who could tell
+//! otherwise.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -11,12 +13,15 @@ use skein_protocol::ids::{ActorId, EpisodeId};
 
 /// Times an episode may fail, in the simulator or by records that make no sense.
 pub(super) const MOST_FAILURES: usize = 3;
-/// An actor that was heard within this time may come back, and fly what another has failed. Longer than any pause before a dead actor is started again.
+/// An actor that was heard within this time may come back, and fly what another has failed. Longer
+/// than any pause before a dead actor is started again.
 const OTHERS_RETURN: Duration = Duration::from_secs(30);
 
 /// An episode that no actor can fly.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("episode {episode} failed {failures} times, at last because {why}; the logs of learner and actors say more")]
+#[error(
+    "episode {episode} failed {failures} times, at last because {why}; the logs of learner and actors say more"
+)]
 pub struct HopelessEpisode {
     /// The episode.
     pub episode: EpisodeId,
@@ -62,7 +67,12 @@ impl Failures {
     ///
     /// # Errors
     /// [`HopelessEpisode`] when there is nobody left to try.
-    pub(super) fn failed(&mut self, episode: EpisodeId, actor: ActorId, why: &str) -> Result<(), HopelessEpisode> {
+    pub(super) fn failed(
+        &mut self,
+        episode: EpisodeId,
+        actor: ActorId,
+        why: &str,
+    ) -> Result<(), HopelessEpisode> {
         let others_may_try = self.heard.keys().any(|other| *other != actor);
         let failure = self.by_episode.entry(episode).or_insert(Failure {
             times: 0,

@@ -1,4 +1,5 @@
-//! What went wrong on the way from ticket to committed episode and was made good, counted by reason.
+//! What went wrong on the way from ticket to committed episode and was made good, counted by
+//! reason.
 
 use std::collections::BTreeMap;
 
@@ -77,9 +78,9 @@ impl From<&RecordFault> for Refusal {
             RecordFault::Mismatch { .. } => Self::OutOfOrder,
             RecordFault::Code { .. } => Self::Impossible,
             RecordFault::NotFinite { .. } => Self::NotFinite,
-            RecordFault::TooLarge { .. } | RecordFault::TooLong { .. } | RecordFault::ActionOutOfRange { .. } => {
-                Self::TooLarge
-            }
+            RecordFault::TooLarge { .. }
+            | RecordFault::TooLong { .. }
+            | RecordFault::ActionOutOfRange { .. } => Self::TooLarge,
             RecordFault::Contradiction { .. } => Self::Contradiction,
         }
     }
@@ -125,8 +126,14 @@ impl Faults {
 
     /// A point of each curve.
     pub fn scalars(&self) -> Vec<(Scalar, f64)> {
-        let reissued = Reissue::ALL.iter().map(|why| why.scalar()).zip(self.reissued);
-        let refused = Refusal::ALL.iter().map(|why| why.scalar()).zip(self.refused);
+        let reissued = Reissue::ALL
+            .iter()
+            .map(|why| why.scalar())
+            .zip(self.reissued);
+        let refused = Refusal::ALL
+            .iter()
+            .map(|why| why.scalar())
+            .zip(self.refused);
         reissued
             .chain(refused)
             .map(|(scalar, count)| (scalar, count as f64))
@@ -156,8 +163,15 @@ mod tests {
         assert_eq!(by_reason["was skipped"], 1);
         assert_eq!(by_reason["left"], Reissue::ALL.len() as u64);
         assert_eq!(by_reason.values().sum::<u64>(), faults.reissued());
-        assert_eq!(faults.refused_by_reason(), [("status".to_owned(), 1)].into());
-        let mut tags: Vec<_> = faults.scalars().iter().map(|(scalar, _)| scalar.tag()).collect();
+        assert_eq!(
+            faults.refused_by_reason(),
+            [("status".to_owned(), 1)].into()
+        );
+        let mut tags: Vec<_> = faults
+            .scalars()
+            .iter()
+            .map(|(scalar, _)| scalar.tag())
+            .collect();
         assert_eq!(tags.len(), Reissue::ALL.len() + Refusal::ALL.len());
         tags.sort_unstable();
         tags.dedup();

@@ -1,7 +1,9 @@
-//! The receiving thread: owns the transport's ports, feeds the dispatcher, delivers episodes in the order they were ordered.
+//! The receiving thread: owns the transport's ports, feeds the dispatcher, delivers episodes in the
+//! order they were ordered.
 //!
-//! The training thread speaks to it through [`EpisodeReceiver`]: it orders batches of episodes, publishes snapshots, and takes episodes out of a [`Batch`] one by
-//! one. While the training thread updates the networks, records are taken in, tickets handed out and heartbeats given here.
+//! The training thread speaks to it through [`EpisodeReceiver`]: it orders batches of episodes,
+//! publishes snapshots, and takes episodes out of a [`Batch`] one by one. While the training thread
+//! updates the networks, records are taken in, tickets handed out and heartbeats given here.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
@@ -71,7 +73,8 @@ pub enum ReceiverError {
     /// An episode cannot be flown, by whomever and however often.
     #[error(transparent)]
     Hopeless(#[from] HopelessEpisode),
-    /// The transport does not work any more. Nothing that was computed is at fault: a new incarnation of the learner has a new transport.
+    /// The transport does not work any more. Nothing that was computed is at fault: a new
+    /// incarnation of the learner has a new transport.
     #[error("the transport failed: {0}")]
     Transport(String),
 }
@@ -97,7 +100,8 @@ pub(super) enum Command {
 }
 
 impl EpisodeReceiver {
-    /// Starts the receiving thread and returns once actors can attach to this `incarnation` of the learner.
+    /// Starts the receiving thread and returns once actors can attach to this `incarnation` of the
+    /// learner.
     ///
     /// # Errors
     /// [`ReceiverError::Transport`] when the services cannot be opened.
@@ -109,7 +113,8 @@ impl EpisodeReceiver {
         let (commands, inbox) = mpsc::channel();
         let (ready, is_ready) = mpsc::channel();
         let shared = Arc::new(Shared::default());
-        let (thread_identity, thread_config, thread_shared) = (identity.clone(), config.clone(), shared.clone());
+        let (thread_identity, thread_config, thread_shared) =
+            (identity.clone(), config.clone(), shared.clone());
         let thread = thread::Builder::new()
             .name("receiver".to_owned())
             .spawn(move || {
@@ -127,8 +132,8 @@ impl EpisodeReceiver {
             Ok(opened) => opened?,
             Err(error) => return Err(ReceiverError::transport(&error)),
         }
-        let waker =
-            LearnerWaker::open(identity, incarnation, config).map_err(|error| ReceiverError::transport(&error))?;
+        let waker = LearnerWaker::open(identity, incarnation, config)
+            .map_err(|error| ReceiverError::transport(&error))?;
         Ok(Self {
             commands,
             waker,
@@ -151,11 +156,17 @@ impl EpisodeReceiver {
         self.send(Command::Publish(snapshot))
     }
 
-    /// Orders episodes; they are flown after those ordered before, and delivered in the order of `tickets`.
+    /// Orders episodes; they are flown after those ordered before, and delivered in the order of
+    /// `tickets`.
     ///
     /// # Errors
     /// [`ReceiverError`] when the receiving thread has ended.
-    pub fn fly(&mut self, epoch: Epoch, keep: Keep, tickets: Vec<Ticket>) -> Result<Batch, ReceiverError> {
+    pub fn fly(
+        &mut self,
+        epoch: Epoch,
+        keep: Keep,
+        tickets: Vec<Ticket>,
+    ) -> Result<Batch, ReceiverError> {
         let (deliver, episodes) = mpsc::channel();
         let remaining = tickets.len();
         let batch = self.next_batch;
@@ -179,7 +190,9 @@ impl EpisodeReceiver {
         if self.send(Command::Finish).is_err() {
             return;
         }
-        let Some(thread) = self.thread.take() else { return };
+        let Some(thread) = self.thread.take() else {
+            return;
+        };
         let deadline = Instant::now() + ENDING_PATIENCE;
         while !thread.is_finished() && Instant::now() < deadline {
             thread::sleep(Duration::from_millis(5));
@@ -193,7 +206,9 @@ impl EpisodeReceiver {
     }
 
     fn send(&self, command: Command) -> Result<(), ReceiverError> {
-        self.commands.send(command).map_err(|_| self.shared.failed())?;
+        self.commands
+            .send(command)
+            .map_err(|_| self.shared.failed())?;
         if let Err(error) = self.waker.wake() {
             // It looks by itself at every heartbeat.
             tracing::debug!(%error, "receiving thread not woken");
@@ -205,7 +220,10 @@ impl EpisodeReceiver {
 impl Shared {
     /// The numbers of the actors that live, in ascending order.
     pub fn live_actors(&self) -> Vec<u32> {
-        self.live_actors.read().unwrap_or_else(PoisonError::into_inner).clone()
+        self.live_actors
+            .read()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
     }
 
     /// What went wrong since the learner's start, and was made good.
@@ -213,25 +231,31 @@ impl Shared {
         *self.faults.read().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What the time of the receiving thread and of all actors since the learner's start went into, as of the last word of any of them.
+    /// What the time of the receiving thread and of all actors since the learner's start went into,
+    /// as of the last word of any of them.
     pub fn times(&self) -> Times {
         *self.times.read().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Where the episodes are, as of the receiving thread's last heartbeat, and how long ago that was; `None` before the first.
+    /// Where the episodes are, as of the receiving thread's last heartbeat, and how long ago that
+    /// was; `None` before the first.
     pub fn situation(&self) -> Option<(Duration, Situation)> {
-        let situation = self.situation.read().unwrap_or_else(PoisonError::into_inner);
+        let situation = self
+            .situation
+            .read()
+            .unwrap_or_else(PoisonError::into_inner);
         situation
             .as_ref()
             .map(|(at, situation)| (at.elapsed(), situation.clone()))
     }
 
-    /// Why the receiving thread has ended. A panic leaves no word, and comes from a transport that is out of order: nothing else there may panic.
+    /// Why the receiving thread has ended. A panic leaves no word, and comes from a transport that
+    /// is out of order: nothing else there may panic.
     fn failed(&self) -> ReceiverError {
         let failure = self.failure.read().unwrap_or_else(PoisonError::into_inner);
-        failure
-            .clone()
-            .unwrap_or_else(|| ReceiverError::Transport("the receiving thread has ended".to_owned()))
+        failure.clone().unwrap_or_else(|| {
+            ReceiverError::Transport("the receiving thread has ended".to_owned())
+        })
     }
 
     fn fail(&self, error: ReceiverError) {
@@ -240,8 +264,15 @@ impl Shared {
     }
 
     pub(super) fn update(&self, dispatcher: &Dispatcher) {
-        let mut live = self.live_actors.write().unwrap_or_else(PoisonError::into_inner);
-        if !dispatcher.actors().map(|actor| actor.0).eq(live.iter().copied()) {
+        let mut live = self
+            .live_actors
+            .write()
+            .unwrap_or_else(PoisonError::into_inner);
+        if !dispatcher
+            .actors()
+            .map(|actor| actor.0)
+            .eq(live.iter().copied())
+        {
             *live = dispatcher.actors().map(|actor| actor.0).collect();
         }
         *self.faults.write().unwrap_or_else(PoisonError::into_inner) = dispatcher.faults();
@@ -252,7 +283,10 @@ impl Shared {
     }
 
     pub(super) fn update_situation(&self, situation: Situation, now: Instant) {
-        *self.situation.write().unwrap_or_else(PoisonError::into_inner) = Some((now, situation));
+        *self
+            .situation
+            .write()
+            .unwrap_or_else(PoisonError::into_inner) = Some((now, situation));
     }
 }
 

@@ -1,4 +1,5 @@
-//! An episode in segments goes on where it was, whoever flies the next one, or that segment is flown again.
+//! An episode in segments goes on where it was, whoever flies the next one, or that segment is
+//! flown again.
 
 use std::time::{Duration, Instant};
 
@@ -19,7 +20,8 @@ fn segment(flown: usize) -> Order {
     order
 }
 
-/// What an actor sends of `ticket`: a step from where the vehicle is at `x_m` to a metre behind, and the segment's end.
+/// What an actor sends of `ticket`: a step from where the vehicle is at `x_m` to a metre behind,
+/// and the segment's end.
 fn flown(ticket: &Ticket, actor: u32, x_m: f32) -> [TransitionRecord; 2] {
     let first = ticket.first_step();
     [0, 1].map(|offset| {
@@ -33,7 +35,8 @@ fn flown(ticket: &Ticket, actor: u32, x_m: f32) -> [TransitionRecord; 2] {
     })
 }
 
-/// A dispatcher whose first segment was flown by actor 0 of two, from 0 m to 1 m, and whose second is given to it.
+/// A dispatcher whose first segment was flown by actor 0 of two, from 0 m to 1 m, and whose second
+/// is given to it.
 fn dispatcher(now: Instant) -> (Dispatcher, Ticket) {
     let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
     attach(&mut dispatcher, 0, INCARNATION, now);
@@ -58,7 +61,10 @@ fn a_segment_of_an_actor_that_died_is_flown_by_another_with_all_that_was_flown_b
     assert_eq!((again.first_step(), again.attempt), (1, Attempt(1)));
     let committed = feed(&mut dispatcher, &flown(&again, 1, 1.0), later);
     let segment = &committed[0].1;
-    assert_eq!((segment.first_step, segment.steps(), segment.outcome), (1, 1, None));
+    assert_eq!(
+        (segment.first_step, segment.steps(), segment.outcome),
+        (1, 1, None)
+    );
 }
 
 #[test]
@@ -82,7 +88,8 @@ fn a_segment_that_no_actor_begins_where_it_must_is_given_up_with_the_reason() {
             break hopeless;
         }
         let messages = dispatcher.issue(now);
-        issued = (0..2).find_map(|actor| Some((actor, tickets_for(&messages, actor, INCARNATION).pop()?)));
+        issued = (0..2)
+            .find_map(|actor| Some((actor, tickets_for(&messages, actor, INCARNATION).pop()?)));
     };
     assert_eq!(hopeless.episode, EpisodeId(0));
     assert!(hopeless.why.contains("does not begin where"), "{hopeless}");

@@ -1,8 +1,10 @@
-//! What the receiving thread does: round after round, it takes in what actors send and hands out what the training thread orders.
+//! What the receiving thread does: round after round, it takes in what actors send and hands out
+//! what the training thread orders.
 //!
-//! Actors die at any moment, in the middle of whatever they do to shared memory. So no failure of a service ends a round, let alone the thread: what
-//! cannot be received is not there, what cannot be sent is tried again in the next round, and at every heartbeat the dead are cleaned up after. Only
-//! a transport that fails in every round for [`TRANSPORT_PATIENCE`] is given up.
+//! Actors die at any moment, in the middle of whatever they do to shared memory. So no failure of a
+//! service ends a round, let alone the thread: what cannot be received is not there, what cannot be
+//! sent is tried again in the next round, and at every heartbeat the dead are cleaned up after.
+//! Only a transport that fails in every round for [`TRANSPORT_PATIENCE`] is given up.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::mpsc::{Receiver, Sender, TryRecvError};
@@ -65,7 +67,8 @@ enum Wish {
     Serve,
     /// That it sends the actors home.
     Finish,
-    /// It is gone without a word: it panicked. The actors stay, for the learner's next incarnation needs them.
+    /// It is gone without a word: it panicked. The actors stay, for the learner's next incarnation
+    /// needs them.
     Vanish,
 }
 
@@ -98,7 +101,11 @@ impl Server {
     ///
     /// # Errors
     /// [`ReceiverError::Hopeless`] and [`ReceiverError::Transport`].
-    pub(super) fn run(&mut self, inbox: &Receiver<Command>, shared: &Shared) -> Result<(), ReceiverError> {
+    pub(super) fn run(
+        &mut self,
+        inbox: &Receiver<Command>,
+        shared: &Shared,
+    ) -> Result<(), ReceiverError> {
         loop {
             match self.take_commands(inbox) {
                 Wish::Serve => {}
@@ -132,7 +139,9 @@ impl Server {
     fn take_commands(&mut self, inbox: &Receiver<Command>) -> Wish {
         loop {
             match inbox.try_recv() {
-                Ok(Command::Publish(snapshot)) => self.outbox.push_back(Outgoing::Snapshot(snapshot)),
+                Ok(Command::Publish(snapshot)) => {
+                    self.outbox.push_back(Outgoing::Snapshot(snapshot))
+                }
                 Ok(Command::Fly {
                     batch,
                     epoch,
@@ -182,7 +191,8 @@ impl Server {
             self.tell_times(shared);
         }
         if anyone_empty_handed {
-            // Not only at the next heartbeat: an actor that has come cannot fly before it has a snapshot.
+            // Not only at the next heartbeat: an actor that has come cannot fly before it has a
+            // snapshot.
             self.trouble.unless(self.ports.connect());
             self.is_wake_due = true;
         }
@@ -197,14 +207,19 @@ impl Server {
         let mut unbooked = 0;
         let mut next = Next::AtOnce;
         for _ in 0..RECORDS_AT_ONCE {
-            let Some(record) = self.trouble.unless(self.ports.receive_transition()).flatten() else {
+            let Some(record) = self
+                .trouble
+                .unless(self.ports.receive_transition())
+                .flatten()
+            else {
                 next = Next::Wait;
                 break;
             };
             unbooked += 1;
             if let Some((place, episode)) = self.dispatcher.on_record(&record, now)? {
                 self.deliver(place, episode);
-                self.timer.lap(Stage::Assemble, std::mem::take(&mut unbooked));
+                self.timer
+                    .lap(Stage::Assemble, std::mem::take(&mut unbooked));
                 self.hand_out(now);
                 self.send_out();
                 self.timer.lap(Stage::HandOut, 0);
@@ -232,8 +247,12 @@ impl Server {
     }
 
     fn hand_out(&mut self, now: Instant) {
-        self.outbox
-            .extend(self.dispatcher.issue(now).into_iter().map(Outgoing::Message));
+        self.outbox.extend(
+            self.dispatcher
+                .issue(now)
+                .into_iter()
+                .map(Outgoing::Message),
+        );
     }
 
     /// Sends what is to be sent, as far as that works.

@@ -37,7 +37,12 @@ pub struct EpisodeOut {
 impl fmt::Display for Situation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match (self.actors, self.waiting) {
-            (0, waiting) => return write!(f, "no actor is attached; episodes that wait for one: {waiting}"),
+            (0, waiting) => {
+                return write!(
+                    f,
+                    "no actor is attached; episodes that wait for one: {waiting}"
+                );
+            }
             (actors, 0) => write!(f, "actors: {actors}; episodes out: {}", self.out.len())?,
             (actors, waiting) => write!(
                 f,

@@ -5,7 +5,9 @@ use std::time::Instant;
 
 use proptest::prelude::*;
 
-use super::tests::{INCARNATION, RUN, attach, dispatcher, feed, limits, order, records, tickets_for};
+use super::tests::{
+    INCARNATION, RUN, attach, dispatcher, feed, limits, order, records, tickets_for,
+};
 use super::*;
 
 #[test]
@@ -117,7 +119,8 @@ impl World {
         true
     }
 
-    /// A round of the learner, which takes in at most `most` records of each actor; whether there were any.
+    /// A round of the learner, which takes in at most `most` records of each actor; whether there
+    /// were any.
     fn learner_goes_on(&mut self, most: usize) -> bool {
         let mut has_heard = false;
         for (id, actor) in self.actors.iter_mut().enumerate() {
@@ -138,7 +141,9 @@ impl World {
         }
         self.hand_out();
         if self.dispatcher.take_wake() {
-            self.actors.iter_mut().for_each(|actor| actor.is_called = true);
+            self.actors
+                .iter_mut()
+                .for_each(|actor| actor.is_called = true);
         }
         has_heard
     }
@@ -146,7 +151,9 @@ impl World {
     fn hand_out(&mut self) {
         let messages = self.dispatcher.issue(self.now);
         for (id, actor) in self.actors.iter_mut().enumerate() {
-            actor.told.extend(tickets_for(&messages, id as u32, INCARNATION));
+            actor
+                .told
+                .extend(tickets_for(&messages, id as u32, INCARNATION));
         }
     }
 }

@@ -1,7 +1,8 @@
 //! `episodes.csv`: one row per committed training episode, in episode order.
 //!
-//! Row n is episode n, whoever flew it and whenever. A run that is resumed cuts the file back to the episodes its checkpoint knows of, so what is in the
-//! file never says more than what was learned from, and never twice.
+//! Row n is episode n, whoever flew it and whenever. A run that is resumed cuts the file back to
+//! the episodes its checkpoint knows of, so what is in the file never says more than what was
+//! learned from, and never twice.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -68,7 +69,8 @@ impl From<&CommittedEpisode> for EpisodeRow {
     }
 }
 
-/// The first bytes of `episodes.csv`, by which it is recognised as what was written; part of a checkpoint.
+/// The first bytes of `episodes.csv`, by which it is recognised as what was written; part of a
+/// checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EpisodesExtent {
     /// How many.
@@ -86,7 +88,8 @@ impl EpisodesExtent {
         }
     }
 
-    /// Checks that the file at `path` begins with them; nothing is written. `episodes` is how many rows they hold.
+    /// Checks that the file at `path` begins with them; nothing is written. `episodes` is how many
+    /// rows they hold.
     ///
     /// # Errors
     /// [`EpisodesError::Damaged`]; [`EpisodesError::Io`] when it cannot be read.
@@ -95,7 +98,9 @@ impl EpisodesExtent {
             return Ok(());
         }
         let found = match File::open(path).and_then(|file| summed(file, self.bytes)) {
-            Ok((bytes, _)) if bytes < self.bytes => Err(format!("ends after {bytes} bytes of {}", self.bytes)),
+            Ok((bytes, _)) if bytes < self.bytes => {
+                Err(format!("ends after {bytes} bytes of {}", self.bytes))
+            }
             Ok((_, sum)) if sum.digest() != self.xxh3 => Err(format!(
                 "was changed within its first {} bytes: their checksum is {:016x} where {:016x} is expected",
                 self.bytes,
@@ -119,7 +124,8 @@ impl EpisodesExtent {
     }
 }
 
-/// Reads at most `bytes` bytes of `file` from where it stands; how many there were, and their checksum.
+/// Reads at most `bytes` bytes of `file` from where it stands; how many there were, and their
+/// checksum.
 fn summed(file: impl Read, bytes: u64) -> io::Result<(u64, Xxh3Default)> {
     let mut sum = Xxh3Default::new();
     let read = io::copy(&mut file.take(bytes), &mut sum)?;
@@ -233,7 +239,8 @@ impl EpisodesCsv {
         })
     }
 
-    /// Continues after the first `episodes` rows; later rows, of episodes whose learning was lost, are cut off.
+    /// Continues after the first `episodes` rows; later rows, of episodes whose learning was lost,
+    /// are cut off.
     ///
     /// # Errors
     /// [`EpisodesError`] when the file does not hold episodes 0 to `episodes` - 1 in order.
@@ -245,7 +252,11 @@ impl EpisodesCsv {
             path: path.to_owned(),
             source,
         };
-        let mut file = OpenOptions::new().read(true).write(true).open(path).map_err(io)?;
+        let mut file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .open(path)
+            .map_err(io)?;
         let end = end_of_rows(path, &file, episodes)?;
         file.set_len(end).map_err(io)?;
         end_line(&mut file).map_err(io)?;
@@ -266,13 +277,16 @@ impl EpisodesCsv {
     /// # Errors
     /// [`EpisodesError::Row`].
     pub fn write(&mut self, row: &EpisodeRow) -> Result<(), EpisodesError> {
-        self.writer.serialize(row).map_err(|source| EpisodesError::Row {
-            path: self.path.clone(),
-            source,
-        })
+        self.writer
+            .serialize(row)
+            .map_err(|source| EpisodesError::Row {
+                path: self.path.clone(),
+                source,
+            })
     }
 
-    /// What is in the file: all that was written before it was last [flushed](EpisodesCsv::flush), and perhaps some of what was written since.
+    /// What is in the file: all that was written before it was last [flushed](EpisodesCsv::flush),
+    /// and perhaps some of what was written since.
     pub fn extent(&self) -> EpisodesExtent {
         self.writer.get_ref().extent()
     }
@@ -289,7 +303,8 @@ impl EpisodesCsv {
     }
 }
 
-/// Goes to the end of the file, and of its last line: a file that was cut there by other hands would have the next row on the same line.
+/// Goes to the end of the file, and of its last line: a file that was cut there by other hands
+/// would have the next row on the same line.
 fn end_line(file: &mut File) -> io::Result<()> {
     let mut last = [0];
     file.seek(SeekFrom::End(-1))?;
@@ -311,7 +326,8 @@ fn end_of_rows(path: &Path, file: &File, episodes: u64) -> Result<u64, EpisodesE
         path: path.to_owned(),
         source,
     };
-    // No row of ours is quoted, and a quote that is opened and never closed would swallow what is appended.
+    // No row of ours is quoted, and a quote that is opened and never closed would swallow what is
+    // appended.
     let mut reader = csv::ReaderBuilder::new().quoting(false).from_reader(file);
     let headers = reader.headers().map_err(row_error)?.clone();
     if headers != COLUMNS[..] {
@@ -324,7 +340,10 @@ fn end_of_rows(path: &Path, file: &File, episodes: u64) -> Result<u64, EpisodesE
         }
         let row: EpisodeRow = record.deserialize(Some(&headers)).map_err(row_error)?;
         if row.episode != expected {
-            return Err(content(format!("its row {expected} is episode {}", row.episode)));
+            return Err(content(format!(
+                "its row {expected} is episode {}",
+                row.episode
+            )));
         }
     }
     Ok(reader.position().byte())
@@ -381,7 +400,10 @@ mod tests {
     #[test]
     fn a_file_that_lost_the_end_of_its_last_line_is_continued_on_the_next() {
         let directory = tempfile::tempdir().unwrap();
-        let (whole, cut) = (directory.path().join("whole.csv"), directory.path().join("cut.csv"));
+        let (whole, cut) = (
+            directory.path().join("whole.csv"),
+            directory.path().join("cut.csv"),
+        );
         write(&mut EpisodesCsv::create(&whole, &disk()).unwrap(), 0..5);
         write(&mut EpisodesCsv::create(&cut, &disk()).unwrap(), 0..4);
         let text = fs::read_to_string(&cut).unwrap();
@@ -397,7 +419,9 @@ mod tests {
         write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..4);
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, text.replacen("episode,epoch", "epoch,episode", 1)).unwrap();
-        let error = EpisodesCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
+        let error = EpisodesCsv::resume(&path, 2, &disk())
+            .unwrap_err()
+            .to_string();
         assert!(
             error.contains("episodes.csv") && error.contains("its columns are"),
             "{error}"
@@ -407,7 +431,10 @@ mod tests {
     #[test]
     fn a_resumed_file_is_that_of_a_run_never_interrupted() {
         let directory = tempfile::tempdir().unwrap();
-        let (whole, resumed) = (directory.path().join("whole.csv"), directory.path().join("resumed.csv"));
+        let (whole, resumed) = (
+            directory.path().join("whole.csv"),
+            directory.path().join("resumed.csv"),
+        );
         write(&mut EpisodesCsv::create(&whole, &disk()).unwrap(), 0..30);
         for checkpoint in [0, 1, 20] {
             write(&mut EpisodesCsv::create(&resumed, &disk()).unwrap(), 0..25);
@@ -442,7 +469,9 @@ mod tests {
         let text = fs::read_to_string(&path).unwrap();
         let (whole, last) = text.trim_end().rsplit_once(',').unwrap();
         fs::write(&path, format!("{whole},\"{last}\n")).unwrap();
-        let refusal = EpisodesCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
+        let refusal = EpisodesCsv::resume(&path, 2, &disk())
+            .unwrap_err()
+            .to_string();
         assert!(refusal.contains("episodes.csv"), "{refusal}");
     }
 
@@ -486,13 +515,17 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("episodes.csv");
         write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..5);
-        let error = EpisodesCsv::resume(&path, 6, &disk()).unwrap_err().to_string();
+        let error = EpisodesCsv::resume(&path, 6, &disk())
+            .unwrap_err()
+            .to_string();
         assert!(
             error.contains("episodes.csv") && error.contains("ends after 5"),
             "{error}"
         );
         write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 3..9);
-        let error = EpisodesCsv::resume(&path, 2, &disk()).unwrap_err().to_string();
+        let error = EpisodesCsv::resume(&path, 2, &disk())
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("row 0 is episode 3"), "{error}");
     }
 }

@@ -1,9 +1,11 @@
 //! TensorBoard event files.
 //!
-//! An event file is a sequence of framed protocol buffer messages. The two crates that write them are built on protocol buffer libraries long
-//! superseded, so the few messages we need stand here. Field numbers are those of TensorFlow's `event.proto` and `summary.proto`; the frame is
-//! `length u64 | masked CRC of length u32 | message | masked CRC of message u32`, little-endian, where the CRC is CRC-32C and masking rotates
-//! it and adds a constant, so that the checksum of data that itself holds checksums stays a good one (TensorFlow's `record_writer.h`).
+//! An event file is a sequence of framed protocol buffer messages. The two crates that write them
+//! are built on protocol buffer libraries long superseded, so the few messages we need stand here.
+//! Field numbers are those of TensorFlow's `event.proto` and `summary.proto`; the frame is `length
+//! u64 | masked CRC of length u32 | message | masked CRC of message u32`, little-endian, where the
+//! CRC is CRC-32C and masking rotates it and adds a constant, so that the checksum of data that
+//! itself holds checksums stays a good one (TensorFlow's `record_writer.h`).
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
@@ -16,7 +18,8 @@ use serde::{Deserialize, Serialize};
 use crate::disk::{Disk, Patient};
 use crate::report::tell;
 
-/// How the names of our files begin, before the second of their start. TensorBoard takes files whose name has `tfevents` in it.
+/// How the names of our files begin, before the second of their start. TensorBoard takes files
+/// whose name has `tfevents` in it.
 const NAME: &str = "events.out.tfevents.";
 
 /// Appends scalars to an event file of its own.
@@ -49,17 +52,26 @@ pub struct EventError {
 }
 
 impl EventWriter {
-    /// Starts a new event file in `directory`, after cutting back those there are to `files`: what lies beyond is of episodes whose learning was lost.
-    /// TensorBoard reads all files of a directory as one; of earlier ones it drops what lies at `first_step` or later.
+    /// Starts a new event file in `directory`, after cutting back those there are to `files`: what
+    /// lies beyond is of episodes whose learning was lost. TensorBoard reads all files of a
+    /// directory as one; of earlier ones it drops what lies at `first_step` or later.
     ///
-    /// A file that has lost a part of `files`, or all of it, is named in a warning: its curves then have a hole, which is no reason not to train.
+    /// A file that has lost a part of `files`, or all of it, is named in a warning: its curves then
+    /// have a hole, which is no reason not to train.
     ///
     /// # Errors
     /// [`EventError`] when a file cannot be cut back or created.
-    pub fn resume(directory: &Path, files: Vec<EventFile>, first_step: u64, disk: &Disk) -> Result<Self, EventError> {
+    pub fn resume(
+        directory: &Path,
+        files: Vec<EventFile>,
+        first_step: u64,
+        disk: &Disk,
+    ) -> Result<Self, EventError> {
         let at = |path: PathBuf| move |source| EventError { path, source };
         fs::create_dir_all(directory).map_err(at(directory.to_owned()))?;
-        let (files, others): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| Begun::of(&file.name).is_some());
+        let (files, others): (Vec<_>, Vec<_>) = files
+            .into_iter()
+            .partition(|file| Begun::of(&file.name).is_some());
         // Whatever a damaged list names elsewhere is not for us to cut.
         for EventFile { name, .. } in others {
             tracing::warn!(name, "not the name of an event file of ours: left alone");
@@ -76,15 +88,21 @@ impl EventWriter {
                 .into_owned(),
             bytes: 0,
         });
-        writer.write(first_step, event::What::FileVersion("brain.Event:2".to_owned()))?;
         writer.write(
             first_step,
-            event::What::SessionLog(SessionLog { status: SESSION_START }),
+            event::What::FileVersion("brain.Event:2".to_owned()),
+        )?;
+        writer.write(
+            first_step,
+            event::What::SessionLog(SessionLog {
+                status: SESSION_START,
+            }),
         )?;
         Ok(writer)
     }
 
-    /// All files of the run, as far as they were written; what is not [flushed](EventWriter::flush) yet is counted in.
+    /// All files of the run, as far as they were written; what is not [flushed](EventWriter::flush)
+    /// yet is counted in.
     pub fn files(&self) -> &[EventFile] {
         &self.files
     }
@@ -121,10 +139,11 @@ impl EventWriter {
             step: step.cast_signed(),
             what: Some(what),
         };
-        let bytes = write_record(&mut self.file, &event.encode_to_vec()).map_err(|source| EventError {
-            path: self.path.clone(),
-            source,
-        })?;
+        let bytes =
+            write_record(&mut self.file, &event.encode_to_vec()).map_err(|source| EventError {
+                path: self.path.clone(),
+                source,
+            })?;
         if let Some(present) = self.files.last_mut() {
             present.bytes += bytes;
         }
@@ -132,8 +151,9 @@ impl EventWriter {
     }
 }
 
-/// Creates a file in `directory` that comes after the one begun `latest`, even if the clock has gone back since: TensorBoard takes files in alphabetical
-/// order. A second start within one second is told apart by the number.
+/// Creates a file in `directory` that comes after the one begun `latest`, even if the clock has
+/// gone back since: TensorBoard takes files in alphabetical order. A second start within one second
+/// is told apart by the number.
 fn begin(directory: &Path, latest: Option<Begun>) -> (PathBuf, io::Result<File>) {
     let now = now_secs() as u64;
     let first = match latest {
@@ -141,7 +161,10 @@ fn begin(directory: &Path, latest: Option<Begun>) -> (PathBuf, io::Result<File>)
             number: latest.number.saturating_add(1),
             ..latest
         },
-        _ => Begun { second: now, number: 0 },
+        _ => Begun {
+            second: now,
+            number: 0,
+        },
     };
     (first.number..first.number.saturating_add(1000))
         .map(|number| directory.join(Begun { number, ..first }.name()))
@@ -149,7 +172,12 @@ fn begin(directory: &Path, latest: Option<Begun>) -> (PathBuf, io::Result<File>)
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => None,
             result => Some((path, result)),
         })
-        .unwrap_or_else(|| (directory.to_owned(), Err(io::ErrorKind::AlreadyExists.into())))
+        .unwrap_or_else(|| {
+            (
+                directory.to_owned(),
+                Err(io::ErrorKind::AlreadyExists.into()),
+            )
+        })
 }
 
 /// When an event file of ours was begun; what its name says.
@@ -174,7 +202,8 @@ impl Begun {
     }
 }
 
-/// Cuts our files in `directory` back to `files` and removes all others of ours. Returns when the latest of `files` was begun.
+/// Cuts our files in `directory` back to `files` and removes all others of ours. Returns when the
+/// latest of `files` was begun.
 fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, EventError> {
     let at = |path: &Path| {
         let path = path.to_owned();
@@ -197,7 +226,10 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, Even
                 "{path} ends after {found} of {bytes} bytes: TensorBoard's curves have a hole"
             ));
         } else if found > *bytes {
-            let file = OpenOptions::new().write(true).open(&path).map_err(at(&path))?;
+            let file = OpenOptions::new()
+                .write(true)
+                .open(&path)
+                .map_err(at(&path))?;
             file.set_len(*bytes).map_err(at(&path))?;
         }
     }
@@ -221,7 +253,9 @@ fn write_record(into: &mut impl Write, message: &[u8]) -> io::Result<u64> {
 }
 
 fn masked_crc(bytes: &[u8]) -> u32 {
-    crc32c::crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
+    crc32c::crc32c(bytes)
+        .rotate_right(15)
+        .wrapping_add(0xa282_ead8)
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -321,7 +355,13 @@ mod tests {
     use super::*;
 
     fn create(directory: &Path, first_step: u64) -> EventWriter {
-        EventWriter::resume(directory, Vec::new(), first_step, &Disk::new(std::sync::Arc::default())).unwrap()
+        EventWriter::resume(
+            directory,
+            Vec::new(),
+            first_step,
+            &Disk::new(std::sync::Arc::default()),
+        )
+        .unwrap()
     }
 
     fn sample_file(first_step: u64) -> Vec<u8> {
@@ -337,15 +377,22 @@ mod tests {
 
     #[test]
     fn masking_agrees_with_the_published_vector() {
-        // CRC-32C of 32 zero bytes is 8a9136aa (RFC 3720, B.4); rotated right by 15 bits it is 6d551522.
+        // CRC-32C of 32 zero bytes is 8a9136aa (RFC 3720, B.4); rotated right by 15 bits it is
+        // 6d551522.
         assert_eq!(crc32c::crc32c(&[0; 32]), 0x8a91_36aa);
-        assert_eq!(masked_crc(&[0; 32]), 0x6d55_1522_u32.wrapping_add(0xa282_ead8));
+        assert_eq!(
+            masked_crc(&[0; 32]),
+            0x6d55_1522_u32.wrapping_add(0xa282_ead8)
+        );
     }
 
     #[test]
     fn what_was_written_reads_back() {
         let events = read_records(&sample_file(5)).unwrap();
-        let what: Vec<_> = events.iter().map(|event| event.what.clone().unwrap()).collect();
+        let what: Vec<_> = events
+            .iter()
+            .map(|event| event.what.clone().unwrap())
+            .collect();
         let value = |tag: &str, value| SummaryValue {
             tag: tag.to_owned(),
             simple_value: Some(value),
@@ -354,7 +401,9 @@ mod tests {
             what,
             [
                 event::What::FileVersion("brain.Event:2".to_owned()),
-                event::What::SessionLog(SessionLog { status: SESSION_START }),
+                event::What::SessionLog(SessionLog {
+                    status: SESSION_START
+                }),
                 event::What::Summary(Summary {
                     value: vec![value("episode/return", -1.5), value("episode/steps", 12.0)]
                 }),
@@ -363,7 +412,10 @@ mod tests {
                 }),
             ]
         );
-        assert_eq!(events.iter().map(|event| event.step).collect::<Vec<_>>(), [5, 5, 7, 8]);
+        assert_eq!(
+            events.iter().map(|event| event.step).collect::<Vec<_>>(),
+            [5, 5, 7, 8]
+        );
         assert!(events.iter().all(|event| event.wall_time > 1.7e9));
     }
 
@@ -388,7 +440,9 @@ mod tests {
         };
         assert_eq!(
             file.bytes,
-            fs::metadata(directory.path().join(&file.name)).unwrap().len()
+            fs::metadata(directory.path().join(&file.name))
+                .unwrap()
+                .len()
         );
     }
 
@@ -402,7 +456,9 @@ mod tests {
             bytes: 0,
         });
         let curves = directory.path().join("tensorboard");
-        let writer = EventWriter::resume(&curves, files.to_vec(), 0, &Disk::new(Default::default())).unwrap();
+        let writer =
+            EventWriter::resume(&curves, files.to_vec(), 0, &Disk::new(Default::default()))
+                .unwrap();
         assert_eq!(fs::read_to_string(outside).unwrap(), "untouched");
         assert_eq!(writer.files().len(), 1);
     }
@@ -416,7 +472,13 @@ mod tests {
             name: ahead.clone(),
             bytes: 4,
         }];
-        let writer = EventWriter::resume(directory.path(), known, 7, &Disk::new(std::sync::Arc::default())).unwrap();
+        let writer = EventWriter::resume(
+            directory.path(),
+            known,
+            7,
+            &Disk::new(std::sync::Arc::default()),
+        )
+        .unwrap();
         assert!(writer.files()[1].name > ahead, "{:?}", writer.files());
         assert_eq!(fs::read(directory.path().join(ahead)).unwrap(), b"0123");
     }

@@ -1,7 +1,9 @@
-//! What a training run tells about itself: `episodes.csv`, TensorBoard curves, averages over the latest episodes.
+//! What a training run tells about itself: `episodes.csv`, TensorBoard curves, averages over the
+//! latest episodes.
 //!
-//! All three are keyed by committed episode, not by time: two runs of one configuration have the same curves whatever machines flew them, and a
-//! resumed run continues where its checkpoint was taken.
+//! All three are keyed by committed episode, not by time: two runs of one configuration have the
+//! same curves whatever machines flew them, and a resumed run continues where its checkpoint was
+//! taken.
 
 mod episodes;
 mod events;
@@ -76,7 +78,9 @@ impl MetricsState {
     /// # Errors
     /// [`MetricsError::Episodes`] says what is wrong with it.
     pub fn check(&self, run: &RunDirectory) -> Result<(), MetricsError> {
-        Ok(self.episodes_extent.check(&run.episodes_csv(), self.episodes)?)
+        Ok(self
+            .episodes_extent
+            .check(&run.episodes_csv(), self.episodes)?)
     }
 }
 
@@ -102,11 +106,17 @@ pub enum MetricsError {
 }
 
 impl Metrics {
-    /// Continues where the metrics were in `state`. What was written since is dropped, so that nothing is told twice; of a new run that is everything.
+    /// Continues where the metrics were in `state`. What was written since is dropped, so that
+    /// nothing is told twice; of a new run that is everything.
     ///
     /// # Errors
-    /// [`MetricsError`] names the file; `episodes.csv` must be what was written when `state` was taken, or more.
-    pub fn resume(run: &RunDirectory, state: MetricsState, disk: &Disk) -> Result<Self, MetricsError> {
+    /// [`MetricsError`] names the file; `episodes.csv` must be what was written when `state` was
+    /// taken, or more.
+    pub fn resume(
+        run: &RunDirectory,
+        state: MetricsState,
+        disk: &Disk,
+    ) -> Result<Self, MetricsError> {
         state.check(run)?;
         let MetricsState {
             episodes,
@@ -136,10 +146,16 @@ impl Metrics {
     /// The files whose content a checkpoint of the [state](Metrics::state) counts on.
     pub fn files(&self) -> Vec<PathBuf> {
         let folder = self.run.tensorboard();
-        let events = self.events.files().iter().map(|file| folder.join(&file.name));
+        let events = self
+            .events
+            .files()
+            .iter()
+            .map(|file| folder.join(&file.name));
         // One that was lost can no longer be counted on.
         let events = events.filter(|path| path.exists());
-        std::iter::once(self.run.episodes_csv()).chain(events).collect()
+        std::iter::once(self.run.episodes_csv())
+            .chain(events)
+            .collect()
     }
 
     /// Takes in a committed training episode; called in episode order.
@@ -186,11 +202,15 @@ impl Metrics {
     /// # Errors
     /// [`MetricsError`] names the file.
     pub fn scalars(&mut self, episode: u64, values: &[(Scalar, f64)]) -> Result<(), MetricsError> {
-        let values: Vec<_> = values.iter().map(|&(scalar, value)| (scalar.tag(), value)).collect();
+        let values: Vec<_> = values
+            .iter()
+            .map(|&(scalar, value)| (scalar.tag(), value))
+            .collect();
         Ok(self.events.scalars(episode, &values)?)
     }
 
-    /// Hands everything written to the operating system; called once an epoch, and before a checkpoint that counts on it.
+    /// Hands everything written to the operating system; called once an epoch, and before a
+    /// checkpoint that counts on it.
     ///
     /// # Errors
     /// [`MetricsError`] names the file.
@@ -239,7 +259,9 @@ mod tests {
     fn points(run: &RunDirectory) -> Vec<(String, i64, u32)> {
         let mut points = Vec::new();
         for entry in std::fs::read_dir(run.tensorboard()).unwrap() {
-            points.extend(events::testing::points(&std::fs::read(entry.unwrap().path()).unwrap()));
+            points.extend(events::testing::points(
+                &std::fs::read(entry.unwrap().path()).unwrap(),
+            ));
         }
         points.sort();
         points

@@ -2,7 +2,8 @@
 
 macro_rules! scalars {
     ($($(#[$doc:meta])* $name:ident => $tag:literal),* $(,)?) => {
-        /// A curve in the TensorBoard event files. Every curve's horizontal axis is the number of committed training episodes.
+        /// A curve in the TensorBoard event files. Every curve's horizontal axis is the number of
+        /// committed training episodes.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         pub enum Scalar { $($(#[$doc])* $name),* }
 
@@ -37,21 +38,26 @@ scalars! {
     WindowReturn => "window/return",
     /// Walls passed, averaged over the window. The paper's Fig. 10.
     WindowWallsPassed => "window/walls_passed",
-    /// Half the squared distance of the two Q outputs from their target. It rises with the returns: watch it for explosions, not for progress.
+    /// Half the squared distance of the two Q outputs from their target. It rises with the returns:
+    /// watch it for explosions, not for progress.
     CriticLoss => "policy/critic_loss",
     /// SAC: what the policy minimises, temperature times log-probability minus Q.
     PolicyLoss => "policy/policy_loss",
     /// SAC: weight of the entropy against the reward, the price of certainty.
     Temperature => "policy/temperature",
-    /// SAC: the policy's entropy in nats, estimated on the minibatches. Steered towards the target entropy by the temperature.
+    /// SAC: the policy's entropy in nats, estimated on the minibatches. Steered towards the target
+    /// entropy by the temperature.
     Entropy => "policy/entropy",
-    /// The smaller Q output on the minibatches, on average: the discounted return that the critic expects, with SAC the entropy bonus included.
+    /// The smaller Q output on the minibatches, on average: the discounted return that the critic
+    /// expects, with SAC the entropy bonus included.
     MeanValue => "policy/mean_value",
-    /// What the VAE minimises: squared error summed over an image's pixels, plus the weighted divergence.
+    /// What the VAE minimises: squared error summed over an image's pixels, plus the weighted
+    /// divergence.
     VaeLoss => "vae/loss",
     /// Squared error of a reconstructed pixel, depth in [0, 1].
     VaePixelError => "vae/pixel_error",
-    /// Kullback-Leibler divergence of the code from the standard normal distribution in nats: how much the code tells of the image.
+    /// Kullback-Leibler divergence of the code from the standard normal distribution in nats: how
+    /// much the code tells of the image.
     VaeDivergence => "vae/divergence",
     /// Transitions in the replay buffer.
     ReplayTransitions => "replay/transitions",

@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 
 /// The mean of the latest values.
 ///
-/// It is summed anew at every call, oldest value first: a running sum would drift, and would depend on where a run was resumed.
+/// It is summed anew at every call, oldest value first: a running sum would drift, and would depend
+/// on where a run was resumed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MovingAverage {
     window: usize,
@@ -22,7 +23,8 @@ impl MovingAverage {
         }
     }
 
-    /// Whether it is over `window` values and holds no more: one that was read from a file may say anything.
+    /// Whether it is over `window` values and holds no more: one that was read from a file may say
+    /// anything.
     pub fn is_over(&self, window: usize) -> bool {
         self.window == window.max(1) && self.values.len() <= self.window
     }

@@ -5,8 +5,9 @@ use tch::Tensor;
 
 use super::{Layout, Linear, Parameters};
 
-/// Three fully connected layers with ReLU between. One network whose last layer gives two estimates of Q, of which the smaller one is used (paper, section 3.4), or two networks with an
-/// estimate each (arXiv:1812.05905), whose errors have less in common.
+/// Three fully connected layers with ReLU between. One network whose last layer gives two estimates
+/// of Q, of which the smaller one is used (paper, section 3.4), or two networks with an estimate
+/// each (arXiv:1812.05905), whose errors have less in common.
 #[derive(Debug, Clone)]
 pub struct Critic {
     networks: Vec<[Linear; 3]>,
@@ -14,7 +15,12 @@ pub struct Critic {
 
 impl Critic {
     /// Describes the layers of `networks`, one or two.
-    pub fn describe(layout: &mut Layout, observation: i64, hidden_width: i64, networks: usize) -> Self {
+    pub fn describe(
+        layout: &mut Layout,
+        observation: i64,
+        hidden_width: i64,
+        networks: usize,
+    ) -> Self {
         let mut network = |name: &str| {
             let mut layer = |number: u8, inputs, outputs| {
                 Linear::describe(layout, &format!("{name}.layer{number}"), inputs, outputs)
@@ -33,19 +39,32 @@ impl Critic {
     }
 
     /// Both estimates of Q, `[n, 2]`. `observations`: `[n, observation]`, `actions`: `[n, 2]`.
-    pub fn forward(&self, parameters: &Parameters, observations: &Tensor, actions: &Tensor) -> Tensor {
+    pub fn forward(
+        &self,
+        parameters: &Parameters,
+        observations: &Tensor,
+        actions: &Tensor,
+    ) -> Tensor {
         let joined = Tensor::cat(&[observations, actions], 1);
         let estimates = self.networks.iter().map(|[hidden @ .., last]| {
-            let features = hidden.iter().fold(joined.shallow_clone(), |features, layer| {
-                layer.forward(parameters, &features).relu()
-            });
+            let features = hidden
+                .iter()
+                .fold(joined.shallow_clone(), |features, layer| {
+                    layer.forward(parameters, &features).relu()
+                });
             last.forward(parameters, &features)
         });
         Tensor::cat(&estimates.collect::<Vec<_>>(), 1)
     }
 
     /// The smaller estimate, `[n]`.
-    pub fn smaller(&self, parameters: &Parameters, observations: &Tensor, actions: &Tensor) -> Tensor {
-        self.forward(parameters, observations, actions).amin(1, false)
+    pub fn smaller(
+        &self,
+        parameters: &Parameters,
+        observations: &Tensor,
+        actions: &Tensor,
+    ) -> Tensor {
+        self.forward(parameters, observations, actions)
+            .amin(1, false)
     }
 }

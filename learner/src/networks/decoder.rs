@@ -1,4 +1,5 @@
-//! The VAE's decoder: latent code to depth image, with or without a look at what the encoder saw on its way.
+//! The VAE's decoder: latent code to depth image, with or without a look at what the encoder saw on
+//! its way.
 
 use skein_protocol::config::DecoderName;
 
@@ -6,13 +7,17 @@ use tch::Tensor;
 
 use super::{Layout, Linear, Parameters, TransposedConvolution};
 
-/// A linear layer to 1024 × 1 × 3, then four transposed convolutions with stride 2, whose kernels give 72 × 128 exactly (paper, section 3.3; channels
-/// as in arXiv:1803.10122). ReLU between, a sigmoid at the end.
+/// A linear layer to 1024 × 1 × 3, then four transposed convolutions with stride 2, whose kernels
+/// give 72 × 128 exactly (paper, section 3.3; channels as in arXiv:1803.10122). ReLU between, a
+/// sigmoid at the end.
 ///
-/// As a U-Net (arXiv:1505.04597), its last three convolutions also see the encoder's feature maps, the middle of each, cut to the size of what they are laid beside. What
-/// is to be expected: through those maps nearly the whole image comes by without the code, so the reconstruction is far better than a plain decoder's and the code has
-/// little to tell. Only the divergence presses on it, at its usual weight, and presses it towards the prior: in the end it may hold nothing. The policy sees
-/// the code alone. Its convolutions are trained either way, but for a picture, not for a summary of one; what that costs is what the comparison is for.
+/// As a U-Net (arXiv:1505.04597), its last three convolutions also see the encoder's feature maps,
+/// the middle of each, cut to the size of what they are laid beside. What is to be expected:
+/// through those maps nearly the whole image comes by without the code, so the reconstruction is
+/// far better than a plain decoder's and the code has little to tell. Only the divergence presses
+/// on it, at its usual weight, and presses it towards the prior: in the end it may hold nothing.
+/// The policy sees the code alone. Its convolutions are trained either way, but for a picture, not
+/// for a summary of one; what that costs is what the comparison is for.
 #[derive(Debug, Clone, Copy)]
 pub struct Decoder {
     unfold: Linear,
@@ -25,7 +30,13 @@ impl Decoder {
     pub fn describe(layout: &mut Layout, latent: usize, name: DecoderName) -> Self {
         let unfold = Linear::describe(layout, "decoder.linear", latent as i64, 1024 * 3);
         let mut convolution = |number: usize, inputs: i64, outputs: i64, kernel: [i64; 2]| {
-            TransposedConvolution::describe(layout, &format!("decoder.conv{number}"), inputs, outputs, kernel)
+            TransposedConvolution::describe(
+                layout,
+                &format!("decoder.conv{number}"),
+                inputs,
+                outputs,
+                kernel,
+            )
         };
         // A map of the encoder's has as many channels as what it is laid beside.
         let sources = match name {
@@ -44,9 +55,14 @@ impl Decoder {
         }
     }
 
-    /// `[n, latent]` to `[n, 1, 72, 128]`, depth in [0, 1]. `maps`: what the encoder's first three convolutions gave, [`Encoded::maps`](super::Encoded::maps).
+    /// `[n, latent]` to `[n, 1, 72, 128]`, depth in [0, 1]. `maps`: what the encoder's first three
+    /// convolutions gave, [`Encoded::maps`](super::Encoded::maps).
     pub fn forward(&self, parameters: &Parameters, latents: &Tensor, maps: &[Tensor; 3]) -> Tensor {
-        let mut image = self.unfold.forward(parameters, latents).relu_().view([-1, 1024, 1, 3]);
+        let mut image = self
+            .unfold
+            .forward(parameters, latents)
+            .relu_()
+            .view([-1, 1024, 1, 3]);
         let [hidden @ .., last] = &self.convolutions;
         for (convolution, map) in hidden.iter().zip(maps.iter().rev()) {
             image = convolution.forward(parameters, &image).relu_();
@@ -60,9 +76,11 @@ impl Decoder {
 
 /// The middle of `map`, as high and wide as `beside`; both `[n, channels, h, w]`.
 fn middle(map: &Tensor, beside: &Tensor) -> Tensor {
-    [2, 3].into_iter().fold(map.shallow_clone(), |map, dimension| {
-        let wanted = beside.size()[dimension as usize];
-        let spare = map.size()[dimension as usize] - wanted;
-        map.narrow(dimension, spare / 2, wanted)
-    })
+    [2, 3]
+        .into_iter()
+        .fold(map.shallow_clone(), |map, dimension| {
+            let wanted = beside.size()[dimension as usize];
+            let spare = map.size()[dimension as usize] - wanted;
+            map.narrow(dimension, spare / 2, wanted)
+        })
 }

@@ -1,7 +1,8 @@
 //! All parameters of a network in one flat tensor, of which the layers' tensors are views.
 //!
-//! One vector makes everything around a network simple: the optimizer's state is two more vectors, a target network follows by one operation, a
-//! snapshot is a copy of bytes, and nothing can be forgotten in a checkpoint.
+//! One vector makes everything around a network simple: the optimizer's state is two more vectors,
+//! a target network follows by one operation, a snapshot is a copy of bytes, and nothing can be
+//! forgotten in a checkpoint.
 
 use std::ops::Range;
 
@@ -32,7 +33,8 @@ impl ParameterSpec {
     }
 }
 
-/// The tensors of a network in the order they lie in its flat vector; filled as the layers are described.
+/// The tensors of a network in the order they lie in its flat vector; filled as the layers are
+/// described.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Layout {
     tensors: Vec<ParameterSpec>,
@@ -71,7 +73,11 @@ impl Layout {
 
     /// Draws the weights described so far, biases apart, from a range that is wider by `factor`.
     pub(crate) fn widen_weights(&mut self, factor: f32) {
-        for tensor in self.tensors.iter_mut().filter(|tensor| tensor.shape.len() > 1) {
+        for tensor in self
+            .tensors
+            .iter_mut()
+            .filter(|tensor| tensor.shape.len() > 1)
+        {
             tensor.initial_bound *= factor;
         }
     }
@@ -116,7 +122,11 @@ impl Parameters {
                 view.set_requires_grad(true)
             })
             .collect();
-        Self { layout, flat, views }
+        Self {
+            layout,
+            flat,
+            views,
+        }
     }
 
     /// The same numbers in double precision, for checks against finite differences.
@@ -135,7 +145,8 @@ impl Parameters {
         &self.flat
     }
 
-    /// All numbers, to be changed in place; every view changes with them. Only with gradients switched off.
+    /// All numbers, to be changed in place; every view changes with them. Only with gradients
+    /// switched off.
     pub fn flat_mut(&mut self) -> &mut Tensor {
         &mut self.flat
     }
@@ -145,10 +156,14 @@ impl Parameters {
         &self.views[place]
     }
 
-    /// Gradient of the scalar `loss` with respect to all numbers, flat; the graph behind `loss` is consumed.
+    /// Gradient of the scalar `loss` with respect to all numbers, flat; the graph behind `loss` is
+    /// consumed.
     pub fn gradient(&self, loss: &Tensor) -> Tensor {
         let gradients = Tensor::run_backward(&[loss], &self.views, false, false);
-        let flattened: Vec<Tensor> = gradients.iter().map(|gradient| gradient.reshape([-1])).collect();
+        let flattened: Vec<Tensor> = gradients
+            .iter()
+            .map(|gradient| gradient.reshape([-1]))
+            .collect();
         Tensor::cat(&flattened, 0)
     }
 
@@ -207,8 +222,14 @@ mod tests {
         // d/da of the sum of squares of a is 2a; d/db of three times the sum of b is 3.
         let loss = parameters.tensor(0).square().sum(None) + 3.0 * parameters.tensor(1).sum(None);
         let gradient = parameters.gradient(&loss);
-        assert_eq!(gradient.narrow(0, 0, 6), 2.0 * parameters.flat().narrow(0, 0, 6));
-        assert_eq!(Vec::<f32>::try_from(gradient.narrow(0, 6, 4)).unwrap(), [3.0; 4]);
+        assert_eq!(
+            gradient.narrow(0, 0, 6),
+            2.0 * parameters.flat().narrow(0, 0, 6)
+        );
+        assert_eq!(
+            Vec::<f32>::try_from(gradient.narrow(0, 6, 4)).unwrap(),
+            [3.0; 4]
+        );
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! The three kinds of layer, each a description of its two tensors.
 //!
-//! Initial values follow PyTorch's defaults: weights and biases even in ±1/√fan_in (Kaiming uniform with a = √5, He et al. 2015).
+//! Initial values follow PyTorch's defaults: weights and biases even in ±1/√fan_in (Kaiming uniform
+//! with a = √5, He et al. 2015).
 
 use tch::Tensor;
 
@@ -15,7 +16,8 @@ struct Affine {
 
 impl Affine {
     fn describe(layout: &mut Layout, name: &str, weight_shape: &[i64], outputs: i64) -> Self {
-        // PyTorch takes the second dimension for the inputs, also where the weight of a transposed convolution has its outputs there.
+        // PyTorch takes the second dimension for the inputs, also where the weight of a transposed
+        // convolution has its outputs there.
         let fan_in: i64 = weight_shape[1..].iter().product();
         let bound = 1.0 / (fan_in as f32).sqrt();
         Self {
@@ -37,7 +39,10 @@ impl Linear {
 
     /// `[n, inputs]` to `[n, outputs]`.
     pub fn forward(&self, parameters: &Parameters, input: &Tensor) -> Tensor {
-        input.linear(parameters.tensor(self.0.weight), Some(parameters.tensor(self.0.bias)))
+        input.linear(
+            parameters.tensor(self.0.weight),
+            Some(parameters.tensor(self.0.bias)),
+        )
     }
 }
 
@@ -47,7 +52,13 @@ pub struct Convolution(Affine);
 
 impl Convolution {
     /// Describes a layer with weight `[outputs, inputs, height, width]`.
-    pub fn describe(layout: &mut Layout, name: &str, inputs: i64, outputs: i64, [height, width]: [i64; 2]) -> Self {
+    pub fn describe(
+        layout: &mut Layout,
+        name: &str,
+        inputs: i64,
+        outputs: i64,
+        [height, width]: [i64; 2],
+    ) -> Self {
         Self(Affine::describe(
             layout,
             name,
@@ -58,7 +69,10 @@ impl Convolution {
 
     /// `[n, inputs, h, w]` to `[n, outputs, (h - height) / 2 + 1, (w - width) / 2 + 1]`.
     pub fn forward(&self, parameters: &Parameters, input: &Tensor) -> Tensor {
-        let (weight, bias) = (parameters.tensor(self.0.weight), parameters.tensor(self.0.bias));
+        let (weight, bias) = (
+            parameters.tensor(self.0.weight),
+            parameters.tensor(self.0.bias),
+        );
         input.conv2d(weight, Some(bias), [2, 2], [0, 0], [1, 1], 1)
     }
 }
@@ -69,7 +83,13 @@ pub struct TransposedConvolution(Affine);
 
 impl TransposedConvolution {
     /// Describes a layer with weight `[inputs, outputs, height, width]`.
-    pub fn describe(layout: &mut Layout, name: &str, inputs: i64, outputs: i64, [height, width]: [i64; 2]) -> Self {
+    pub fn describe(
+        layout: &mut Layout,
+        name: &str,
+        inputs: i64,
+        outputs: i64,
+        [height, width]: [i64; 2],
+    ) -> Self {
         Self(Affine::describe(
             layout,
             name,
@@ -80,7 +100,10 @@ impl TransposedConvolution {
 
     /// `[n, inputs, h, w]` to `[n, outputs, 2 (h - 1) + height, 2 (w - 1) + width]`.
     pub fn forward(&self, parameters: &Parameters, input: &Tensor) -> Tensor {
-        let (weight, bias) = (parameters.tensor(self.0.weight), parameters.tensor(self.0.bias));
+        let (weight, bias) = (
+            parameters.tensor(self.0.weight),
+            parameters.tensor(self.0.bias),
+        );
         input.conv_transpose2d(weight, Some(bias), [2, 2], [0, 0], [0, 0], 1, [1, 1])
     }
 }

@@ -7,8 +7,9 @@ use tch::Tensor;
 
 use super::{Layout, Linear, Parameters};
 
-/// Four fully connected layers with ReLU between (paper, section 3.4); the last gives mean and log standard deviation of a Gaussian, which tanh squashes into
-/// the action (arXiv:1812.05905, appendix C).
+/// Four fully connected layers with ReLU between (paper, section 3.4); the last gives mean and log
+/// standard deviation of a Gaussian, which tanh squashes into the action (arXiv:1812.05905,
+/// appendix C).
 #[derive(Debug, Clone, Copy)]
 pub struct Policy {
     layers: [Linear; 4],
@@ -30,7 +31,12 @@ impl Policy {
     }
 
     /// Describes the layers of a policy that gives so many numbers: the action alone, say.
-    pub fn with_outputs(layout: &mut Layout, observation: i64, hidden_width: i64, outputs: i64) -> Self {
+    pub fn with_outputs(
+        layout: &mut Layout,
+        observation: i64,
+        hidden_width: i64,
+        outputs: i64,
+    ) -> Self {
         let mut layer = |number: usize, inputs: i64, outputs: i64| {
             Linear::describe(layout, &format!("policy.layer{number}"), inputs, outputs)
         };
@@ -61,7 +67,10 @@ impl Policy {
             output.narrow(1, 0, ACTION as i64),
             output.narrow(1, ACTION as i64, ACTION as i64),
         );
-        (mean, log_std.clamp(f64::from(LOG_STD.0), f64::from(LOG_STD.1)))
+        (
+            mean,
+            log_std.clamp(f64::from(LOG_STD.0), f64::from(LOG_STD.1)),
+        )
     }
 
     /// The action without noise, tanh of the mean, `[n, 2]`.
@@ -70,7 +79,12 @@ impl Policy {
     }
 
     /// Draws actions, differentiably in the parameters. `noise`: standard normal, `[n, 2]`.
-    pub fn sample(&self, parameters: &Parameters, observations: &Tensor, noise: &Tensor) -> PolicySample {
+    pub fn sample(
+        &self,
+        parameters: &Parameters,
+        observations: &Tensor,
+        noise: &Tensor,
+    ) -> PolicySample {
         let (mean, log_std) = self.distribution(parameters, observations);
         let before_tanh = mean + log_std.exp() * noise;
         PolicySample {
@@ -80,9 +94,11 @@ impl Policy {
     }
 }
 
-/// log π of tanh(x), x = mean + std · noise, summed over the action's dimensions, `[n]` (arXiv:1812.05905, eq. 26).
+/// log π of tanh(x), x = mean + std · noise, summed over the action's dimensions, `[n]`
+/// (arXiv:1812.05905, eq. 26).
 ///
-/// log(1 - tanh²x) is taken as 2 (ln 2 - x - softplus(-2x)): exact where 1 - tanh²x would have rounded to zero.
+/// log(1 - tanh²x) is taken as 2 (ln 2 - x - softplus(-2x)): exact where 1 - tanh²x would have
+/// rounded to zero.
 fn squashed_log_prob(before_tanh: &Tensor, log_std: &Tensor, noise: &Tensor) -> Tensor {
     let gaussian = noise.square() * -0.5 - log_std - 0.5 * (2.0 * PI).ln();
     let correction = (LN_2 - before_tanh - (before_tanh * -2.0).softplus()) * 2.0;
@@ -108,17 +124,27 @@ mod tests {
     fn log_prob_is_the_density_of_the_squashed_gaussian() {
         let (mean, log_std, noise) = ([0.3, -1.2], [-0.5, 0.4], [1.1, -0.7]);
         let before_tanh = row(mean) + row(log_std).exp() * row(noise);
-        let computed = squashed_log_prob(&before_tanh, &row(log_std), &row(noise)).double_value(&[0]);
-        let expected: f64 = (0..2).map(|i| by_definition(mean[i], log_std[i], noise[i])).sum();
-        assert!((computed - expected).abs() < 1e-5, "{computed} is not {expected}");
+        let computed =
+            squashed_log_prob(&before_tanh, &row(log_std), &row(noise)).double_value(&[0]);
+        let expected: f64 = (0..2)
+            .map(|i| by_definition(mean[i], log_std[i], noise[i]))
+            .sum();
+        assert!(
+            (computed - expected).abs() < 1e-5,
+            "{computed} is not {expected}"
+        );
     }
 
     #[test]
     fn log_prob_stays_exact_where_tanh_saturates() {
-        // At x = 20 the action is 1.0 to the last bit of f32; log(1 - tanh²x) is 2 ln 2 - 2x up to e^-40.
+        // At x = 20 the action is 1.0 to the last bit of f32; log(1 - tanh²x) is 2 ln 2 - 2x up to
+        // e^-40.
         let (x, log_std, noise) = (row([20.0, -20.0]), row([0.0, 0.0]), row([0.0, 0.0]));
         let computed = squashed_log_prob(&x, &log_std, &noise).double_value(&[0]);
         let expected = 2.0 * (-0.5 * (2.0 * PI).ln() - (2.0 * LN_2 - 40.0));
-        assert!((computed - expected).abs() < 1e-4, "{computed} is not {expected}");
+        assert!(
+            (computed - expected).abs() < 1e-4,
+            "{computed} is not {expected}"
+        );
     }
 }

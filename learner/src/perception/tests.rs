@@ -37,14 +37,24 @@ fn new(config: &Config) -> Box<dyn Algorithm> {
     algorithm::new(config, Device::Cpu)
 }
 
-fn update(algorithm: &mut dyn Algorithm, seen: &Transitions, noise: &mut Noise) -> Result<(), UpdateError> {
-    algorithm.update(&mut Team::new(1), seen.columns(), noise).map(|_| ())
+fn update(
+    algorithm: &mut dyn Algorithm,
+    seen: &Transitions,
+    noise: &mut Noise,
+) -> Result<(), UpdateError> {
+    algorithm
+        .update(&mut Team::new(1), seen.columns(), noise)
+        .map(|_| ())
 }
 
 /// Transitions that go on, so that what comes after counts.
 fn random(rows: usize, seed: u64) -> Transitions {
     let mut noise = Noise::new(seed);
-    let mut draw = || (0..rows * IMAGE_PIXELS).map(|_| shade(noise.uniform(1.0))).collect();
+    let mut draw = || {
+        (0..rows * IMAGE_PIXELS)
+            .map(|_| shade(noise.uniform(1.0)))
+            .collect()
+    };
     let images = Some([draw(), draw()]);
     Transitions {
         images,
@@ -82,14 +92,25 @@ fn the_critics_loss_moves_every_tensor_of_the_encoder_and_its_target_follows() {
             encoder_of(&*algorithm, &config),
             part(&mut *algorithm, target)[encoder.clone()].to_vec(),
         );
-        assert_eq!(before, target_before, "the target begins where the critic does");
+        assert_eq!(
+            before, target_before,
+            "the target begins where the critic does"
+        );
         update(&mut *algorithm, &random(6, 1), &mut Noise::new(2)).unwrap();
         let after = encoder_of(&*algorithm, &config);
         let target_after = &part(&mut *algorithm, target)[encoder.clone()];
-        for tensor in layout.tensors().iter().filter(|tensor| tensor.range.end <= encoder.end) {
+        for tensor in layout
+            .tensors()
+            .iter()
+            .filter(|tensor| tensor.range.end <= encoder.end)
+        {
             let moved = |before: &[f32], after: &[f32]| {
-                let pairs = before[tensor.range.clone()].iter().zip(&after[tensor.range.clone()]);
-                pairs.map(|(before, after)| (after - before).abs()).fold(0.0, f32::max)
+                let pairs = before[tensor.range.clone()]
+                    .iter()
+                    .zip(&after[tensor.range.clone()]);
+                pairs
+                    .map(|(before, after)| (after - before).abs())
+                    .fold(0.0, f32::max)
             };
             let (learned, followed) = (moved(&before, &after), moved(&target_before, target_after));
             // Adam's first step is as long as its rate, and the target goes a small share of that.
@@ -126,13 +147,27 @@ fn the_policys_loss_moves_the_policy_and_leaves_the_encoder_alone() {
             [before.0 != after.0, before.1 != after.1]
         };
         let without_critic = |config: &mut Config, rate| {
-            (config.sac.critic_learning_rate, config.td3.critic_learning_rate) = (rate, rate);
+            (
+                config.sac.critic_learning_rate,
+                config.td3.critic_learning_rate,
+            ) = (rate, rate);
         };
         let without_policy = |config: &mut Config, rate| {
-            (config.sac.policy_learning_rate, config.td3.policy_learning_rate) = (rate, rate);
+            (
+                config.sac.policy_learning_rate,
+                config.td3.policy_learning_rate,
+            ) = (rate, rate);
         };
-        assert_eq!(after(without_critic, none), [false, true], "{name}: the policy's loss");
-        assert_eq!(after(without_policy, none), [true, false], "{name}: the critic's loss");
+        assert_eq!(
+            after(without_critic, none),
+            [false, true],
+            "{name}: the policy's loss"
+        );
+        assert_eq!(
+            after(without_policy, none),
+            [true, false],
+            "{name}: the critic's loss"
+        );
     }
 }
 
@@ -158,14 +193,24 @@ fn what_the_policy_sees_carries_no_gradient_and_what_the_critic_judges_does() {
             &batch.next_states,
             &batch.next_observations,
         ];
-        assert_eq!(carry.map(Tensor::requires_grad), [true, false, false, false]);
-        assert_eq!(batch.observations, batch.states.detach(), "both see the same");
+        assert_eq!(
+            carry.map(Tensor::requires_grad),
+            [true, false, false, false]
+        );
+        assert_eq!(
+            batch.observations,
+            batch.states.detach(),
+            "both see the same"
+        );
         assert_eq!(
             batch.next_observations == batch.next_states,
             ahead == LooksAhead::Target,
             "two encoders see two things"
         );
-        for (seen, flown) in [(&batch.observations, &now), (&batch.next_observations, &next)] {
+        for (seen, flown) in [
+            (&batch.observations, &now),
+            (&batch.next_observations, &next),
+        ] {
             let beside = |all: &Tensor| all.narrow(1, LATENT as i64, 2);
             assert_eq!(beside(seen), beside(flown), "the velocity is as it was");
             assert_ne!(
@@ -208,8 +253,14 @@ fn a_restored_algorithm_goes_on_bit_for_bit() {
         for algorithm in [&mut algorithm, &mut resumed] {
             update(&mut **algorithm, &random(4, 2), &mut Noise::new(2)).unwrap();
         }
-        assert!(algorithm.named_tensors() == resumed.named_tensors(), "{name}");
-        assert_eq!(encoder_of(&*algorithm, &config), encoder_of(&*resumed, &config));
+        assert!(
+            algorithm.named_tensors() == resumed.named_tensors(),
+            "{name}"
+        );
+        assert_eq!(
+            encoder_of(&*algorithm, &config),
+            encoder_of(&*resumed, &config)
+        );
         let mut fresh = new(&other);
         update(&mut *fresh, &random(4, 2), &mut Noise::new(2)).unwrap();
         assert!(
@@ -226,7 +277,8 @@ fn an_update_that_is_not_finite_changes_nothing() {
         let mut seen = random(4, 1);
         seen.rewards[2] = f32::NAN;
         let before = algorithm.named_tensors();
-        let UpdateError::NonFinite { tensor, update } = update(&mut *algorithm, &seen, &mut Noise::new(1)).unwrap_err();
+        let UpdateError::NonFinite { tensor, update } =
+            update(&mut *algorithm, &seen, &mut Noise::new(1)).unwrap_err();
         assert_eq!((tensor, update), ("critic loss", 1), "{name}");
         assert!(algorithm.named_tensors() == before, "{name}");
     }
@@ -236,21 +288,32 @@ fn an_update_that_is_not_finite_changes_nothing() {
 #[should_panic(expected = "two images for each transition")]
 fn a_minibatch_without_images_is_a_mistake() {
     let seen = Transitions::random(OBSERVATION, 3, &mut Noise::new(1));
-    let _ = update(&mut *new(&config(AlgorithmName::Sac)), &seen, &mut Noise::new(1));
+    let _ = update(
+        &mut *new(&config(AlgorithmName::Sac)),
+        &seen,
+        &mut Noise::new(1),
+    );
 }
 
 #[test]
 fn what_can_only_be_seen_in_the_image_is_learned() {
     for name in ALGORITHMS {
         let mut config = config(name);
-        (config.sac.critic_learning_rate, config.td3.critic_learning_rate) = (1e-3, 1e-3);
+        (
+            config.sac.critic_learning_rate,
+            config.td3.critic_learning_rate,
+        ) = (1e-3, 1e-3);
         let mut algorithm = new(&config);
         let (mut data, mut noise) = (Noise::new(1), Noise::new(2));
         let losses: Vec<f32> = (0..120)
             .map(|_| {
                 let seen = Transitions::looking(OBSERVATION, 8, &mut data);
-                let metrics = algorithm.update(&mut Team::new(1), seen.columns(), &mut noise).unwrap();
-                let loss = metrics.iter().find(|(scalar, _)| *scalar == Scalar::CriticLoss);
+                let metrics = algorithm
+                    .update(&mut Team::new(1), seen.columns(), &mut noise)
+                    .unwrap();
+                let loss = metrics
+                    .iter()
+                    .find(|(scalar, _)| *scalar == Scalar::CriticLoss);
                 loss.unwrap().1
             })
             .collect();
@@ -263,7 +326,8 @@ fn what_can_only_be_seen_in_the_image_is_learned() {
     }
 }
 
-/// Prints what an update takes of a processor: `cargo test --release -p skein-learner -- --ignored --nocapture update_from_64_images`.
+/// Prints what an update takes of a processor: `cargo test --release -p skein-learner -- --ignored
+/// --nocapture update_from_64_images`.
 #[test]
 #[ignore = "a measurement, not a claim"]
 fn time_of_an_update_from_64_images() {
@@ -281,6 +345,9 @@ fn time_of_an_update_from_64_images() {
         for _ in 0..UPDATES {
             update(&mut *algorithm, &seen, &mut noise).unwrap();
         }
-        println!("{name}: {:.0} ms", (spent() - before) / UPDATES as f64 * 1e3);
+        println!(
+            "{name}: {:.0} ms",
+            (spent() - before) / UPDATES as f64 * 1e3
+        );
     }
 }

@@ -1,10 +1,13 @@
-//! Depth images of stored transitions, kept while the VAE is trained, or for ever where the policy learns from them.
+//! Depth images of stored transitions, kept while the VAE is trained, or for ever where the policy
+//! learns from them.
 //!
-//! An episode's images are taken over in the block the episode brought them in, not copied. Images are numbered in order of arrival, so the image of a step's
-//! next observation is the following number, the closing image included. For the VAE nothing is dropped before the end: a transition that the ring overwrites
-//! leaves its images behind as training material, and no row can ever point at an image of another episode; what bounds the store is that the VAE is frozen
-//! after a configured number of steps. For a policy, images that no row needs are [swept out](ImageStore::keep_only) now and then, and the others numbered anew, in the
-//! same order.
+//! An episode's images are taken over in the block the episode brought them in, not copied. Images
+//! are numbered in order of arrival, so the image of a step's next observation is the following
+//! number, the closing image included. For the VAE nothing is dropped before the end: a transition
+//! that the ring overwrites leaves its images behind as training material, and no row can ever
+//! point at an image of another episode; what bounds the store is that the VAE is frozen after a
+//! configured number of steps. For a policy, images that no row needs are [swept
+//! out](ImageStore::keep_only) now and then, and the others numbered anew, in the same order.
 
 use std::sync::Arc;
 
@@ -49,7 +52,8 @@ impl ImageStore {
         self.len + images <= self.limit
     }
 
-    /// Takes over an episode's images; returns the number of the first. The caller made sure of [`ImageStore::has_room`].
+    /// Takes over an episode's images; returns the number of the first. The caller made sure of
+    /// [`ImageStore::has_room`].
     pub(super) fn push(&mut self, images: Arc<Vec<u8>>) -> u32 {
         let first = self.len as u32;
         self.len += images.len() / IMAGE_PIXELS;
@@ -58,8 +62,8 @@ impl ImageStore {
         first
     }
 
-    /// Appends images to the last episode's block; returns the number of the image before the first of them. The caller made sure of [`ImageStore::has_room`], and
-    /// that there is a block.
+    /// Appends images to the last episode's block; returns the number of the image before the first
+    /// of them. The caller made sure of [`ImageStore::has_room`], and that there is a block.
     pub(super) fn extend(&mut self, images: &[u8]) -> u32 {
         let before = self.len as u32 - 1;
         self.len += images.len() / IMAGE_PIXELS;
@@ -71,12 +75,17 @@ impl ImageStore {
         before
     }
 
-    /// Gives up all images but those `needed`, `[len]`; returns the new number of each image, one that means nothing of those that are gone.
+    /// Gives up all images but those `needed`, `[len]`; returns the new number of each image, one
+    /// that means nothing of those that are gone.
     ///
-    /// Of an episode that is needed in part, the needed images are copied into a block of their own. Two neighbours that are kept remain neighbours.
+    /// Of an episode that is needed in part, the needed images are copied into a block of their
+    /// own. Two neighbours that are kept remain neighbours.
     pub(super) fn keep_only(&mut self, needed: &[bool]) -> Vec<u32> {
         let mut numbers = Vec::with_capacity(needed.len());
-        let (episodes, first) = (std::mem::take(&mut self.episodes), std::mem::take(&mut self.first));
+        let (episodes, first) = (
+            std::mem::take(&mut self.episodes),
+            std::mem::take(&mut self.first),
+        );
         self.len = 0;
         for (block, first) in episodes.into_iter().zip(first) {
             let needed = &needed[first as usize..][..block.len() / IMAGE_PIXELS];
@@ -90,7 +99,10 @@ impl ImageStore {
                 self.push(block);
             } else if needed.contains(&true) {
                 let images = block.chunks_exact(IMAGE_PIXELS).zip(needed);
-                let kept: Vec<_> = images.filter(|(_, needed)| **needed).map(|(image, _)| image).collect();
+                let kept: Vec<_> = images
+                    .filter(|(_, needed)| **needed)
+                    .map(|(image, _)| image)
+                    .collect();
                 self.push(Arc::new(kept.concat()));
             }
         }
@@ -110,8 +122,9 @@ impl ImageStore {
         }
     }
 
-    /// The latent code of every image, by number. `encode` sees `chunk` images at a time, the last time what remains, whatever the episodes' lengths:
-    /// a store restored from a checkpoint is encoded in the same pieces.
+    /// The latent code of every image, by number. `encode` sees `chunk` images at a time, the last
+    /// time what remains, whatever the episodes' lengths: a store restored from a checkpoint is
+    /// encoded in the same pieces.
     pub(super) fn encode<E>(
         &self,
         chunk: usize,

@@ -1,12 +1,17 @@
 //! The split replay buffer (paper, section 3.5).
 //!
-//! Successful avoidance is rare in the beginning and would drown among everything else, so it has a part of its own with a fixed share of every
-//! minibatch. (With a share of zero there is one part for all, the ordinary buffer.) Each part is a [`ring`] of self-contained rows. Whole episodes go in, in episode order, or their segments, and nothing here is random but what the
-//! caller's seeded generator draws: the content is a function of the episodes, and a minibatch one of content and seed.
+//! Successful avoidance is rare in the beginning and would drown among everything else, so it has a
+//! part of its own with a fixed share of every minibatch. (With a share of zero there is one part
+//! for all, the ordinary buffer.) Each part is a [`ring`] of self-contained rows. Whole episodes go
+//! in, in episode order, or their segments, and nothing here is random but what the caller's seeded
+//! generator draws: the content is a function of the episodes, and a minibatch one of content and
+//! seed.
 //!
-//! While the VAE is trained, the depth [`images`] of stored transitions are kept: the VAE learns from them, and when it is frozen the latent codes of all
-//! rows, each made by the encoder of its day, are made anew with the final one. Then the images go. Where the encoder is trained end to end they stay: a minibatch
-//! then holds the images of its transitions, as long as the transitions are stored.
+//! While the VAE is trained, the depth [`images`] of stored transitions are kept: the VAE learns
+//! from them, and when it is frozen the latent codes of all rows, each made by the encoder of its
+//! day, are made anew with the final one. Then the images go. Where the encoder is trained end to
+//! end they stay: a minibatch then holds the images of its transitions, as long as the transitions
+//! are stored.
 
 mod images;
 mod ring;
@@ -41,9 +46,11 @@ pub struct Replay {
     images: Option<ImageStore>,
     /// What learns from the images.
     encoder: EncoderTraining,
-    /// Images from which on those that no transition needs are looked for, where a policy learns from them.
+    /// Images from which on those that no transition needs are looked for, where a policy learns
+    /// from them.
     sweep_above: usize,
-    /// The episode that was stored last, and how many steps of it: what a later segment must follow. In no checkpoint, as those lie between episodes.
+    /// The episode that was stored last, and how many steps of it: what a later segment must
+    /// follow. In no checkpoint, as those lie between episodes.
     last: Option<(EpisodeId, usize)>,
 }
 
@@ -62,13 +69,16 @@ pub struct Minibatch {
     pub true_states: Vec<f32>,
     /// The same after the action.
     pub next_true_states: Vec<f32>,
-    /// `[batch]`: 1 where the episode ended in a state without a future, else 0. An episode's last step before the time limit is 0: it bootstraps.
+    /// `[batch]`: 1 where the episode ended in a state without a future, else 0. An episode's last
+    /// step before the time limit is 0: it bootstraps.
     pub terminated: Vec<f32>,
-    /// Depth images of the observations, `[batch, 72, 128]`, where the encoder is trained end to end; else empty.
+    /// Depth images of the observations, `[batch, 72, 128]`, where the encoder is trained end to
+    /// end; else empty.
     pub images: Vec<u8>,
     /// Those of the next observations.
     pub next_images: Vec<u8>,
-    /// Slots drawn, before any row is touched: the loads of many rows are then under way at one time.
+    /// Slots drawn, before any row is touched: the loads of many rows are then under way at one
+    /// time.
     slots: Vec<usize>,
 }
 
@@ -79,7 +89,9 @@ pub enum InsertError {
     #[error(transparent)]
     Fault(#[from] EpisodeFault),
     /// It is a segment, and what was stored last is not what was flown before it.
-    #[error("a segment of episode {episode} from its step {first_step} on cannot follow what was stored before it")]
+    #[error(
+        "a segment of episode {episode} from its step {first_step} on cannot follow what was stored before it"
+    )]
     OutOfPlace {
         /// The episode.
         episode: EpisodeId,
@@ -93,7 +105,9 @@ pub enum InsertError {
         episode: EpisodeId,
     },
     /// The images have no room.
-    #[error("{found} depth images of episode {episode} exceed the {limit} that can be needed, {held} of them held")]
+    #[error(
+        "{found} depth images of episode {episode} exceed the {limit} that can be needed, {held} of them held"
+    )]
     TooManyImages {
         /// The episode.
         episode: EpisodeId,
@@ -144,8 +158,9 @@ impl Replay {
         self.images.as_ref().map(ImageStore::len)
     }
 
-    /// Stores all transitions of `episode`, in order, each in the part the success rule says. Its depth images are taken over while they are learned from, and
-    /// dropped after. Of a later segment the first image is the last one of the segment before, and is not stored twice.
+    /// Stores all transitions of `episode`, in order, each in the part the success rule says. Its
+    /// depth images are taken over while they are learned from, and dropped after. Of a later
+    /// segment the first image is the last one of the segment before, and is not stored twice.
     ///
     /// # Errors
     /// [`InsertError`]; the buffer is as before.
@@ -156,7 +171,11 @@ impl Replay {
         let success = success_steps(&episode.level_up, &self.section);
         let last = episode.steps() - 1;
         for (step, &success) in success.iter().enumerate() {
-            let ring = if success { &mut self.success } else { &mut self.regular };
+            let ring = if success {
+                &mut self.success
+            } else {
+                &mut self.regular
+            };
             let row = ring.claim(first_image.map(|first| first + step as u32));
             episode.write_observation(step, &self.view, row.observation);
             episode.write_observation(step + 1, &self.view, row.next_observation);
@@ -173,20 +192,29 @@ impl Replay {
     /// Whether a later segment follows the one before it.
     fn check_place(&self, episode: &CommittedEpisode) -> Result<(), InsertError> {
         let CommittedEpisode {
-            episode, first_step, ..
+            episode,
+            first_step,
+            ..
         } = *episode;
         match first_step == 0 || self.last == Some((episode, first_step)) {
             true => Ok(()),
-            false => Err(InsertError::OutOfPlace { episode, first_step }),
+            false => Err(InsertError::OutOfPlace {
+                episode,
+                first_step,
+            }),
         }
     }
 
-    /// Draws `count` transitions uniformly with replacement from each part in the configured ratio; all from the other part while one is empty.
+    /// Draws `count` transitions uniformly with replacement from each part in the configured ratio;
+    /// all from the other part while one is empty.
     ///
     /// # Panics
     /// When the buffer [is empty](Replay::is_empty): the warm-up is over before anything is drawn.
     pub fn sample(&self, rng: &mut impl Rng, count: usize, into: &mut Minibatch) {
-        assert!(!self.is_empty(), "nothing can be drawn from an empty replay buffer");
+        assert!(
+            !self.is_empty(),
+            "nothing can be drawn from an empty replay buffer"
+        );
         let from_success = match (self.success.len(), self.regular.len()) {
             (0, _) => 0,
             (_, 0) => count,
@@ -201,7 +229,8 @@ impl Replay {
         into.gather(&self.regular, images, rng, count - from_success);
     }
 
-    /// Draws `count` depth images uniformly with replacement, `[count, 72, 128]`, for a step of the VAE.
+    /// Draws `count` depth images uniformly with replacement, `[count, 72, 128]`, for a step of the
+    /// VAE.
     ///
     /// # Panics
     /// When there are none: none were inserted yet, or the VAE is frozen.
@@ -219,8 +248,8 @@ impl Replay {
         self.regular.forget_images();
     }
 
-    /// Makes every stored latent code anew by `encode`, which turns up to `chunk` images, `[n, 72, 128]`, into as many codes. Does nothing if the VAE is frozen
-    /// already.
+    /// Makes every stored latent code anew by `encode`, which turns up to `chunk` images, `[n, 72,
+    /// 128]`, into as many codes. Does nothing if the VAE is frozen already.
     ///
     /// # Errors
     /// The first that `encode` returns; the buffer is as before.
@@ -244,7 +273,10 @@ impl Replay {
             return Ok(None);
         }
         let id = episode.episode;
-        let images = episode.depth.take().ok_or(InsertError::NoImages { episode: id })?;
+        let images = episode
+            .depth
+            .take()
+            .ok_or(InsertError::NoImages { episode: id })?;
         let is_later_segment = episode.first_step > 0;
         let found = episode.steps() + usize::from(!is_later_segment);
         self.sweep_images(found);
@@ -266,10 +298,14 @@ impl Replay {
         }))
     }
 
-    /// Gives up the images of transitions that are overwritten, if a policy learns from images and there would be too many with so many more. When that is follows from
-    /// how many are held, so that a buffer restored from a checkpoint does the same. The newest transition's images stay: a segment may follow it.
+    /// Gives up the images of transitions that are overwritten, if a policy learns from images and
+    /// there would be too many with so many more. When that is follows from how many are held, so
+    /// that a buffer restored from a checkpoint does the same. The newest transition's images stay:
+    /// a segment may follow it.
     fn sweep_images(&mut self, more: usize) {
-        let Some(store) = &mut self.images else { return };
+        let Some(store) = &mut self.images else {
+            return;
+        };
         if self.encoder == EncoderTraining::Vae || store.len() + more <= self.sweep_above {
             return;
         }
@@ -296,15 +332,24 @@ impl Minibatch {
         self.next_images.clear();
     }
 
-    /// Appends `count` rows drawn from `ring`, with their `images` if there are any to be learned from.
-    fn gather(&mut self, ring: &Ring, images: Option<&ImageStore>, rng: &mut impl Rng, count: usize) {
+    /// Appends `count` rows drawn from `ring`, with their `images` if there are any to be learned
+    /// from.
+    fn gather(
+        &mut self,
+        ring: &Ring,
+        images: Option<&ImageStore>,
+        rng: &mut impl Rng,
+        count: usize,
+    ) {
         self.slots.clear();
-        self.slots.extend((0..count).map(|_| rng.random_range(0..ring.len())));
+        self.slots
+            .extend((0..count).map(|_| rng.random_range(0..ring.len())));
         self.actions.reserve(count * ACTION);
         for &slot in &self.slots {
             let row = ring.row(slot);
             self.observations.extend_from_slice(row.observation);
-            self.next_observations.extend_from_slice(row.next_observation);
+            self.next_observations
+                .extend_from_slice(row.next_observation);
             self.true_states.extend_from_slice(row.true_state);
             self.next_true_states.extend_from_slice(row.next_true_state);
             self.actions.extend_from_slice(row.action);
@@ -319,7 +364,8 @@ impl Minibatch {
     }
 }
 
-/// Capacities of the success and the regular part; each has room for one transition at least, unless there is to be no success part.
+/// Capacities of the success and the regular part; each has room for one transition at least,
+/// unless there is to be no success part.
 fn capacities(section: &ReplaySection) -> (usize, usize) {
     if section.success_share == 0.0 {
         return (0, section.capacity);
@@ -329,8 +375,10 @@ fn capacities(section: &ReplaySection) -> (usize, usize) {
     (success, section.capacity - success)
 }
 
-/// Images that can be needed. The VAE's training can leave behind: before the epoch in which it is frozen, fewer than `vae.train_steps` steps were flown, with at
-/// most as many closing images; then come the episodes of one epoch. Their mirror images come on top. A policy needs those of the transitions held, two each at most, and of the episode that comes in.
+/// Images that can be needed. The VAE's training can leave behind: before the epoch in which it is
+/// frozen, fewer than `vae.train_steps` steps were flown, with at most as many closing images; then
+/// come the episodes of one epoch. Their mirror images come on top. A policy needs those of the
+/// transitions held, two each at most, and of the episode that comes in.
 fn image_limit(config: &Config) -> usize {
     let steps = match config.learning.encoder {
         EncoderTraining::Vae => config.vae.train_steps,

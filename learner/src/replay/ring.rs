@@ -1,12 +1,14 @@
 //! One part of the replay: a ring of transition rows.
 //!
-//! A row holds everything an update needs of one transition, observation and next observation both, contiguous in memory: a minibatch of random rows
-//! is bound by cache misses, and a row costs one run of neighbouring cache lines where a table per quantity would cost one miss each.
+//! A row holds everything an update needs of one transition, observation and next observation both,
+//! contiguous in memory: a minibatch of random rows is bound by cache misses, and a row costs one
+//! run of neighbouring cache lines where a table per quantity would cost one miss each.
 
 use skein_protocol::config::{Config, CriticInput, View};
 use skein_protocol::{ACTION, LatentCode, TRUE_STATE};
 
-/// Where the parts of a row lie: `[observation | next observation | true state | next true state | action | reward | terminated]`, all `f32`.
+/// Where the parts of a row lie: `[observation | next observation | true state | next true state |
+/// action | reward | terminated]`, all `f32`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RowLayout {
     /// Length of an observation vector.
@@ -91,7 +93,8 @@ impl RowLayout {
     }
 }
 
-/// More transitions than a run can commit; they are counted up from here without a look at where numbers end.
+/// More transitions than a run can commit; they are counted up from here without a look at where
+/// numbers end.
 const MOST_INSERTED: u64 = 1 << 62;
 
 /// A ring of rows; the oldest is overwritten when it is full.
@@ -103,12 +106,14 @@ pub(super) struct Ring {
     inserted: u64,
     /// `[filled, width]`.
     rows: Vec<f32>,
-    /// The depth image of each row's observation, the next observation's follows it; `[filled]`, or empty once the images are gone.
+    /// The depth image of each row's observation, the next observation's follows it; `[filled]`, or
+    /// empty once the images are gone.
     images: Vec<u32>,
 }
 
 impl Ring {
-    /// An empty ring. The memory of all rows is set aside at once, and touched only as they fill: growth never copies them.
+    /// An empty ring. The memory of all rows is set aside at once, and touched only as they fill:
+    /// growth never copies them.
     pub(super) fn new(capacity: usize, layout: RowLayout) -> Self {
         let rows = Vec::with_capacity(capacity * layout.width());
         Self {
@@ -121,10 +126,20 @@ impl Ring {
     }
 
     /// A ring as it was, or what is wrong with the parts.
-    pub(super) fn restore(capacity: usize, layout: RowLayout, state: RingState) -> Result<Self, String> {
-        let RingState { inserted, rows, images } = state;
+    pub(super) fn restore(
+        capacity: usize,
+        layout: RowLayout,
+        state: RingState,
+    ) -> Result<Self, String> {
+        let RingState {
+            inserted,
+            rows,
+            images,
+        } = state;
         if inserted > MOST_INSERTED {
-            return Err(format!("{inserted} transitions are more than any run commits"));
+            return Err(format!(
+                "{inserted} transitions are more than any run commits"
+            ));
         }
         let mut ring = Self::new(capacity, layout);
         ring.inserted = inserted;
@@ -151,10 +166,13 @@ impl Ring {
 
     /// Rows filled.
     pub(super) fn len(&self) -> usize {
-        usize::try_from(self.inserted).unwrap_or(usize::MAX).min(self.capacity)
+        usize::try_from(self.inserted)
+            .unwrap_or(usize::MAX)
+            .min(self.capacity)
     }
 
-    /// Claims the next slot, the oldest row's if the ring is full. `image` is the number of the observation's depth image while images are stored.
+    /// Claims the next slot, the oldest row's if the ring is full. `image` is the number of the
+    /// observation's depth image while images are stored.
     pub(super) fn claim(&mut self, image: Option<u32>) -> RowMut<'_> {
         let width = self.layout.width();
         let slot = (self.inserted % self.capacity as u64) as usize;
@@ -165,13 +183,15 @@ impl Ring {
             self.images[slot] = image;
         }
         self.inserted += 1;
-        self.layout.row_mut(&mut self.rows[slot * width..(slot + 1) * width])
+        self.layout
+            .row_mut(&mut self.rows[slot * width..(slot + 1) * width])
     }
 
     /// The row in `slot`, below [`Ring::len`].
     pub(super) fn row(&self, slot: usize) -> Row<'_> {
         let width = self.layout.width();
-        self.layout.row(&self.rows[slot * width..(slot + 1) * width])
+        self.layout
+            .row(&self.rows[slot * width..(slot + 1) * width])
     }
 
     /// The image number of every row, `[filled]`; empty once the images are gone.
@@ -191,15 +211,19 @@ impl Ring {
         self.images = Vec::new();
     }
 
-    /// Rewrites the latent parts of both observations of every row from `latents`, one per image. `first_of_episode` says which image of an image's episode was the
-    /// first.
+    /// Rewrites the latent parts of both observations of every row from `latents`, one per image.
+    /// `first_of_episode` says which image of an image's episode was the first.
     pub(super) fn replace_latents(
         &mut self,
         view: &View,
         latents: &[LatentCode],
         first_of_episode: impl Fn(u32) -> u32,
     ) {
-        for (values, &image) in self.rows.chunks_exact_mut(self.layout.width()).zip(&self.images) {
+        for (values, &image) in self
+            .rows
+            .chunks_exact_mut(self.layout.width())
+            .zip(&self.images)
+        {
             let row = self.layout.row_mut(values);
             let first = first_of_episode(image);
             let (episode, step) = (&latents[first as usize..], (image - first) as usize);
@@ -218,8 +242,10 @@ impl Ring {
 pub struct RingState {
     /// Transitions ever inserted.
     pub inserted: u64,
-    /// Rows in slot order, `[filled, width]`: `[observation | next observation | true state | next true state | action | reward | terminated]`.
+    /// Rows in slot order, `[filled, width]`: `[observation | next observation | true state | next
+    /// true state | action | reward | terminated]`.
     pub rows: Vec<f32>,
-    /// Number of the depth image of each row's observation, `[filled]`; empty once no images are kept.
+    /// Number of the depth image of each row's observation, `[filled]`; empty once no images are
+    /// kept.
     pub images: Vec<u32>,
 }

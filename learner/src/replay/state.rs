@@ -16,7 +16,8 @@ pub struct ReplayState {
     pub success: RingState,
     /// The regular part.
     pub regular: RingState,
-    /// Depth images, one block an episode, `[images, 72, 128]`; `None` once the VAE is frozen. Shared with the buffer, not copied.
+    /// Depth images, one block an episode, `[images, 72, 128]`; `None` once the VAE is frozen.
+    /// Shared with the buffer, not copied.
     pub images: Option<Vec<Arc<Vec<u8>>>>,
 }
 
@@ -36,7 +37,10 @@ impl Replay {
         ReplayState {
             success: self.success.state(),
             regular: self.regular.state(),
-            images: self.images.as_ref().map(|images| images.episodes().to_vec()),
+            images: self
+                .images
+                .as_ref()
+                .map(|images| images.episodes().to_vec()),
         }
     }
 
@@ -49,11 +53,18 @@ impl Replay {
         let layout = super::RowLayout::of(config);
         let (success, regular) = capacities(&config.replay);
         let fail = |part| move |problem| RestoreError { part, problem };
-        replay.success = Ring::restore(success, layout, state.success).map_err(fail("success part"))?;
-        replay.regular = Ring::restore(regular, layout, state.regular).map_err(fail("regular part"))?;
+        replay.success =
+            Ring::restore(success, layout, state.success).map_err(fail("success part"))?;
+        replay.regular =
+            Ring::restore(regular, layout, state.regular).map_err(fail("regular part"))?;
         match state.images {
-            Some(blocks) => replay.images.iter_mut().try_for_each(|store| fill(store, &blocks)),
-            None if config.learning.end_to_end() => Err("there are none, and the policy learns from them".to_owned()),
+            Some(blocks) => replay
+                .images
+                .iter_mut()
+                .try_for_each(|store| fill(store, &blocks)),
+            None if config.learning.end_to_end() => {
+                Err("there are none, and the policy learns from them".to_owned())
+            }
             None => {
                 replay.images = None;
                 Ok(())

@@ -1,7 +1,7 @@
 //! Soft actor-critic with learned temperature (Haarnoja et al. 2018, arXiv:1812.05905).
 //!
-//! Two engines do the same update: one on kernels of our own, one on libtorch. Parameters, noise, metrics and what a checkpoint holds are the same of both; sums round
-//! differently.
+//! Two engines do the same update: one on kernels of our own, one on libtorch. Parameters, noise,
+//! metrics and what a checkpoint holds are the same of both; sums round differently.
 
 pub mod losses;
 mod native;

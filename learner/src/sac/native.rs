@@ -1,7 +1,9 @@
 //! One SAC update on the kernels, forward and backward written out, in reading order.
 //!
-//! The same update as that of [`super::TorchSac`], which stays beside it as the reference: same parameters in the same order, same noise, same metrics. Every sum has one
-//! order, so the bits depend neither on the processor nor on how many threads there are. Memory is set aside once for a batch size and used again.
+//! The same update as that of [`super::TorchSac`], which stays beside it as the reference: same
+//! parameters in the same order, same noise, same metrics. Every sum has one order, so the bits
+//! depend neither on the processor nor on how many threads there are. Memory is set aside once for
+//! a batch size and used again.
 
 mod sample;
 
@@ -16,8 +18,8 @@ use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::error::{UpdateError, must_be_finite};
 use crate::metrics::Scalar;
 use crate::networks::native::{
-    CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output, output_mut, pair, smaller,
-    squared_norm,
+    CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output,
+    output_mut, pair, smaller, squared_norm,
 };
 use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
@@ -76,10 +78,17 @@ impl NativeSac {
         let width = section.hidden_width as i64;
         let mut policy_layout = Layout::default();
         Policy::describe(&mut policy_layout, inputs.policy as i64, width);
-        let policy_values = policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
+        let policy_values =
+            policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         let mut critic_layout = Layout::default();
-        Critic::describe(&mut critic_layout, inputs.critic as i64, width, section.critic_networks);
-        let critic_values = critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
+        Critic::describe(
+            &mut critic_layout,
+            inputs.critic as i64,
+            width,
+            section.critic_networks,
+        );
+        let critic_values =
+            critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
         let log_temperature = vec![section.initial_temperature.ln() as f32];
         Self {
             isa,
@@ -98,7 +107,8 @@ impl NativeSac {
         }
     }
 
-    /// Actions drawn from the present policy: in the states after the replayed actions, and in the states themselves.
+    /// Actions drawn from the present policy: in the states after the replayed actions, and in the
+    /// states themselves.
     fn draw(&mut self, team: &mut Team, columns: Columns<'_>, noise: &mut Noise) {
         let policy = &self.policy_parameters.values;
         let Work {
@@ -111,15 +121,22 @@ impl NativeSac {
         let (next_outputs, state_outputs) = outputs.split_at_mut(*rows * 2 * ACTION);
         self.policy
             .forward_through(team, policy, columns.next_observations, next_outputs);
-        self.policy.forward(team, policy, columns.observations, given);
+        self.policy
+            .forward(team, policy, columns.observations, given);
         state_outputs.copy_from_slice(output(given));
         noise.fill_normal(&mut sample.noise);
         sample.draw(self.isa, outputs);
     }
 
-    /// The critic's gradient: what the state after the action is worth says the slow critic (eq. 3), and both estimates are drawn towards
-    /// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')) (eq. 5). Returns the loss and the mean of the smaller estimate.
-    fn critic_gradient(&mut self, team: &mut Team, columns: Columns<'_>, temperature: f32) -> [f32; 2] {
+    /// The critic's gradient: what the state after the action is worth says the slow critic (eq.
+    /// 3), and both estimates are drawn towards r + γ (1 - terminated) (min Q̄(s', a') - α log π(a'
+    /// | s')) (eq. 5). Returns the loss and the mean of the smaller estimate.
+    fn critic_gradient(
+        &mut self,
+        team: &mut Team,
+        columns: Columns<'_>,
+        temperature: f32,
+    ) -> [f32; 2] {
         let Work {
             rows,
             sample,
@@ -129,7 +146,8 @@ impl NativeSac {
             critic_grad,
             ..
         } = &mut self.work;
-        let (next_actions, next_log_prob) = (&sample.actions[..*rows * ACTION], &sample.log_prob[..*rows]);
+        let (next_actions, next_log_prob) =
+            (&sample.actions[..*rows * ACTION], &sample.log_prob[..*rows]);
         join(columns.next_states, next_actions, joined);
         self.critic
             .forward_through(team, &self.target_parameters, joined, target_values);
@@ -142,7 +160,8 @@ impl NativeSac {
         let grad = &mut critic_grad.values;
         for row in 0..*rows {
             let soft_value = smaller(pair(target_values, row)) - temperature * next_log_prob[row];
-            let target = columns.rewards[row] + (1.0 - columns.terminated[row]) * soft_value * self.discount;
+            let target =
+                columns.rewards[row] + (1.0 - columns.terminated[row]) * soft_value * self.discount;
             let values = pair(&given.values, row);
             for (value, grad) in values.iter().zip(&mut grad[row * ESTIMATES..]) {
                 let error = value - target;
@@ -152,13 +171,20 @@ impl NativeSac {
             value += f64::from(smaller(values));
         }
         let into = &mut self.critic_parameters.gradient;
-        self.critic.gradient(team, critic, joined, given, critic_grad, into);
+        self.critic
+            .gradient(team, critic, joined, given, critic_grad, into);
         [loss, value].map(|sum| (sum / *rows as f64) as f32)
     }
 
-    /// The policy's gradient: it moves towards actions of higher value, as far as its entropy is worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7). Returns the mean of
-    /// that, and of log π.
-    fn policy_gradient(&mut self, team: &mut Team, columns: Columns<'_>, temperature: f32) -> [f32; 2] {
+    /// The policy's gradient: it moves towards actions of higher value, as far as its entropy is
+    /// worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7). Returns the mean of that, and
+    /// of log π.
+    fn policy_gradient(
+        &mut self,
+        team: &mut Team,
+        columns: Columns<'_>,
+        temperature: f32,
+    ) -> [f32; 2] {
         let Work {
             rows,
             sample,
@@ -170,7 +196,10 @@ impl NativeSac {
             policy_grad,
             ..
         } = &mut self.work;
-        let (policy, critic) = (&self.policy_parameters.values, &self.critic_parameters.values);
+        let (policy, critic) = (
+            &self.policy_parameters.values,
+            &self.critic_parameters.values,
+        );
         let (actions, log_prob) = (&sample.actions[*rows * ACTION..], &sample.log_prob[*rows..]);
         join(columns.states, actions, joined);
         self.critic.forward(team, critic, joined, given);
@@ -187,8 +216,14 @@ impl NativeSac {
         self.critic
             .backward_through(team, critic, given, drawn_grad, action, action_gradient);
         // Back through the drawing and the policy.
-        sample.backward(*rows, temperature * share, action_gradient, output_mut(policy_grad));
-        self.policy.backward(team, policy, policy_given, policy_grad);
+        sample.backward(
+            *rows,
+            temperature * share,
+            action_gradient,
+            output_mut(policy_grad),
+        );
+        self.policy
+            .backward(team, policy, policy_given, policy_grad);
         let into = &mut self.policy_parameters.gradient;
         self.policy
             .gradient(team, columns.observations, policy_given, policy_grad, into);
@@ -213,7 +248,8 @@ impl NativeSac {
         }
     }
 
-    /// Looks whether what an update reports and the gradients it took are numbers. Of a gradient, the square of its length has to be.
+    /// Looks whether what an update reports and the gradients it took are numbers. Of a gradient,
+    /// the square of its length has to be.
     fn check(&self, reported: [f32; 5]) -> Result<(), UpdateError> {
         let [critic_loss, policy_loss, temperature, entropy, mean_value] = reported;
         let norm = |learned: &Learned| squared_norm(self.isa, &learned.gradient);
@@ -236,14 +272,17 @@ impl NativeSac {
         let policy = &self.policy_parameters.values;
         self.policy
             .forward_through(&mut Team::new(1), policy, observations, &mut outputs);
-        let means = outputs.chunks_exact(2 * ACTION).flat_map(|row| &row[..ACTION]);
+        let means = outputs
+            .chunks_exact(2 * ACTION)
+            .flat_map(|row| &row[..ACTION]);
         means.map(|mean| mean.tanh()).collect()
     }
 }
 
 impl Algorithm for NativeSac {
-    /// One step of critic, policy and temperature, and of the target behind them. All three gradients are taken at the same parameters before any of them moves: an update is done
-    /// whole or not at all.
+    /// One step of critic, policy and temperature, and of the target behind them. All three
+    /// gradients are taken at the same parameters before any of them moves: an update is done whole
+    /// or not at all.
     ///
     /// Source: arXiv:1812.05905, algorithm 1.
     fn update(
@@ -260,7 +299,8 @@ impl Algorithm for NativeSac {
         self.draw(team, columns, noise);
         let [critic_loss, mean_value] = self.critic_gradient(team, columns, temperature);
         let [policy_loss, log_prob] = self.policy_gradient(team, columns, temperature);
-        // The temperature rises while the policy is more certain than asked for, and falls otherwise: the gradient of -α (log π + H̄) by log α is itself (eq. 18).
+        // The temperature rises while the policy is more certain than asked for, and falls
+        // otherwise: the gradient of -α (log π + H̄) by log α is itself (eq. 18).
         self.log_temperature.gradient[0] = -temperature * (log_prob + self.target_entropy);
 
         let metrics = [critic_loss, policy_loss, temperature, -log_prob, mean_value];
@@ -291,8 +331,13 @@ impl Algorithm for NativeSac {
 
 impl Stateful for NativeSac {
     fn parts(&mut self) -> Vec<(String, Part<'_>)> {
-        let mut parts = self.policy_parameters.parts("sac.policy.parameters", "sac.policy.adam");
-        parts.extend(self.critic_parameters.parts("sac.critic.parameters", "sac.critic.adam"));
+        let mut parts = self
+            .policy_parameters
+            .parts("sac.policy.parameters", "sac.policy.adam");
+        parts.extend(
+            self.critic_parameters
+                .parts("sac.critic.parameters", "sac.critic.adam"),
+        );
         parts.extend(
             self.log_temperature
                 .parts("sac.log_temperature", "sac.temperature.adam"),

@@ -20,9 +20,11 @@ pub(crate) struct Transitions {
 }
 
 impl Transitions {
-    /// Numbers without a meaning, observations of `width`; every third transition is the last of its task.
+    /// Numbers without a meaning, observations of `width`; every third transition is the last of
+    /// its task.
     pub(crate) fn random(width: usize, rows: usize, noise: &mut Noise) -> Self {
-        let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(1.0)).collect() };
+        let mut draw =
+            |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(1.0)).collect() };
         Self {
             observations: draw(rows * width),
             actions: draw(rows * 2),
@@ -36,14 +38,20 @@ impl Transitions {
 
     /// The same, and the critic is told `width` numbers of each state.
     pub(crate) fn telling(mut self, width: usize, noise: &mut Noise) -> Self {
-        let mut draw = || (0..self.rewards.len() * width).map(|_| noise.uniform(1.0)).collect();
+        let mut draw = || {
+            (0..self.rewards.len() * width)
+                .map(|_| noise.uniform(1.0))
+                .collect()
+        };
         self.told = Some([draw(), draw()]);
         self
     }
 
-    /// A one-step task: the observation's first two numbers are the action that would have been right.
+    /// A one-step task: the observation's first two numbers are the action that would have been
+    /// right.
     pub(crate) fn guessing(width: usize, rows: usize, noise: &mut Noise) -> Self {
-        let mut draw = |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(0.8)).collect() };
+        let mut draw =
+            |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(0.8)).collect() };
         let (observations, actions) = (draw(rows * width), draw(rows * 2));
         let rewards = (0..rows).map(|row| {
             let (wanted, done) = (&observations[row * width..][..2], &actions[row * 2..][..2]);
@@ -60,13 +68,17 @@ impl Transitions {
         }
     }
 
-    /// A one-step task that only the image tells: a bright one is worth 1, a dark one -1, whatever is done.
+    /// A one-step task that only the image tells: a bright one is worth 1, a dark one -1, whatever
+    /// is done.
     pub(crate) fn looking(width: usize, rows: usize, noise: &mut Noise) -> Self {
         let mut asked = Self::guessing(width, rows, noise);
         let ways: Vec<f32> = (0..rows)
             .map(|_| if noise.uniform(1.0) < 0.0 { -1.0 } else { 1.0 })
             .collect();
-        let images: Vec<u8> = ways.iter().flat_map(|&way| [shade(0.6 * way); IMAGE_PIXELS]).collect();
+        let images: Vec<u8> = ways
+            .iter()
+            .flat_map(|&way| [shade(0.6 * way); IMAGE_PIXELS])
+            .collect();
         asked.rewards = ways;
         for observations in [&mut asked.observations, &mut asked.next_observations] {
             observations.fill(0.0);
@@ -88,7 +100,10 @@ impl Transitions {
             rewards: &self.rewards,
             next_observations: &self.next_observations,
             terminated: &self.terminated,
-            images: self.images.as_ref().map(|images| images.each_ref().map(Vec::as_slice)),
+            images: self
+                .images
+                .as_ref()
+                .map(|images| images.each_ref().map(Vec::as_slice)),
         }
     }
 }

@@ -37,14 +37,25 @@ fn sac(engine: Engine, section: &SacSection, seed: u64) -> Box<dyn Algorithm> {
 
 type Metrics = Vec<(Scalar, f32)>;
 
-fn update(sac: &mut dyn Algorithm, transitions: &Transitions, noise: &mut Noise) -> Result<Metrics, UpdateError> {
+fn update(
+    sac: &mut dyn Algorithm,
+    transitions: &Transitions,
+    noise: &mut Noise,
+) -> Result<Metrics, UpdateError> {
     sac.update(&mut Team::new(1), transitions.columns(), noise)
 }
 
 fn train(sac: &mut dyn Algorithm, updates: usize, seed: u64) -> Vec<Metrics> {
     let (mut data, mut noise) = (Noise::new(seed), Noise::new(seed + 1));
     (0..updates)
-        .map(|_| update(sac, &Transitions::guessing(OBSERVATION, 32, &mut data), &mut noise).unwrap())
+        .map(|_| {
+            update(
+                sac,
+                &Transitions::guessing(OBSERVATION, 32, &mut data),
+                &mut noise,
+            )
+            .unwrap()
+        })
         .collect()
 }
 
@@ -64,7 +75,9 @@ fn mode(sac: &dyn Algorithm, section: &SacSection, observations: &[f32]) -> Vec<
     let policy = Policy::describe(&mut layout, OBSERVATION as i64, section.hidden_width as i64);
     let mut parameters = Parameters::initialise(layout, 0, Device::Cpu);
     let _guard = no_grad_guard();
-    parameters.flat_mut().copy_(&Tensor::from_slice(&published(sac)));
+    parameters
+        .flat_mut()
+        .copy_(&Tensor::from_slice(&published(sac)));
     let observations = Tensor::from_slice(observations).view([-1, OBSERVATION as i64]);
     Vec::try_from(policy.mode(&parameters, &observations).reshape([-1])).unwrap()
 }
@@ -121,9 +134,18 @@ fn an_update_that_is_not_finite_changes_nothing() {
             error
         };
         let of = |tensor| UpdateError::NonFinite { tensor, update: 4 };
-        assert_eq!(refused(|batch| batch.rewards[4] = f32::NAN), of("critic loss"));
-        assert_eq!(refused(|batch| batch.rewards[31] = f32::INFINITY), of("critic loss"));
-        assert_eq!(refused(|batch| batch.observations[7] = f32::NAN), of("critic loss"));
+        assert_eq!(
+            refused(|batch| batch.rewards[4] = f32::NAN),
+            of("critic loss")
+        );
+        assert_eq!(
+            refused(|batch| batch.rewards[31] = f32::INFINITY),
+            of("critic loss")
+        );
+        assert_eq!(
+            refused(|batch| batch.observations[7] = f32::NAN),
+            of("critic loss")
+        );
         // Squared, they are still numbers; the square of a gradient's length no longer is.
         let UpdateError::NonFinite { tensor, .. } = refused(|batch| batch.rewards.fill(1.5e19));
         assert!(tensor.starts_with("critic"), "{engine}: {tensor}");
@@ -133,7 +155,8 @@ fn an_update_that_is_not_finite_changes_nothing() {
 #[test]
 fn truncated_episode_still_bootstraps() {
     for engine in ENGINES {
-        // What the critic learns of one transition, the last of its episode, when the state after it is another.
+        // What the critic learns of one transition, the last of its episode, when the state after
+        // it is another.
         let learned = |terminated: f32, next: f32| {
             let mut sac = sac(engine, &small(), 1);
             let mut last = Transitions::guessing(OBSERVATION, 1, &mut Noise::new(1));
@@ -143,7 +166,11 @@ fn truncated_episode_still_bootstraps() {
             metrics[0]
         };
         let (crashed, truncated) = (1.0, 0.0);
-        assert_eq!(learned(crashed, 0.1), learned(crashed, -0.7), "a crash has no future");
+        assert_eq!(
+            learned(crashed, 0.1),
+            learned(crashed, -0.7),
+            "a crash has no future"
+        );
         assert_ne!(
             learned(truncated, 0.1),
             learned(truncated, -0.7),
@@ -196,7 +223,9 @@ fn the_right_action_is_learned_in_a_one_step_task() {
             let observations = test.observations.chunks_exact(OBSERVATION);
             let squared = observations
                 .zip(actions.chunks_exact(2))
-                .map(|(wanted, done)| (wanted[0] - done[0]).powi(2) + (wanted[1] - done[1]).powi(2));
+                .map(|(wanted, done)| {
+                    (wanted[0] - done[0]).powi(2) + (wanted[1] - done[1]).powi(2)
+                });
             let error = squared.sum::<f32>() / actions.len() as f32;
             // Always answering zero has a mean squared error of 0.8² / 3 = 0.21.
             assert!(error < 0.03, "{engine}, seed {seed}: {error}");

@@ -1,4 +1,5 @@
-//! One SAC update with libtorch's automatic gradients, in reading order: the reference, and the way to a CUDA device.
+//! One SAC update with libtorch's automatic gradients, in reading order: the reference, and the way
+//! to a CUDA device.
 
 use skein_kernels::Team;
 use skein_protocol::ACTION;
@@ -46,13 +47,26 @@ impl TorchSac {
         let width = section.hidden_width as i64;
         let mut layout = Layout::default();
         let policy = Policy::describe(&mut layout, inputs.policy as i64, width);
-        let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 0), device);
+        let policy_parameters = Parameters::initialise(
+            layout,
+            derive(run_seed, Purpose::PolicyParameters, 0),
+            device,
+        );
         let mut layout = Layout::default();
         let perception = inputs
             .from_image
             .map(|latent| Perception::describe(&mut layout, latent));
-        let critic = Critic::describe(&mut layout, inputs.critic as i64, width, section.critic_networks);
-        let critic_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 1), device);
+        let critic = Critic::describe(
+            &mut layout,
+            inputs.critic as i64,
+            width,
+            section.critic_networks,
+        );
+        let critic_parameters = Parameters::initialise(
+            layout,
+            derive(run_seed, Purpose::PolicyParameters, 1),
+            device,
+        );
         let log_temperature = Tensor::from_slice(&[section.initial_temperature.ln() as f32])
             .to_device(device)
             .set_requires_grad(true);
@@ -76,17 +90,22 @@ impl TorchSac {
 
     /// Actions drawn from the present policy, and how likely they were.
     fn draw(&self, observations: &Tensor, noise: &mut Noise) -> PolicySample {
-        let noise = noise.normal(&[observations.size()[0], ACTION as i64], self.log_temperature.device());
-        self.policy.sample(&self.policy_parameters, observations, &noise)
+        let noise = noise.normal(
+            &[observations.size()[0], ACTION as i64],
+            self.log_temperature.device(),
+        );
+        self.policy
+            .sample(&self.policy_parameters, observations, &noise)
     }
 
-    /// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')): what the state after the action is worth, by the slow critic and under the present policy (eq. 3), `[n]`.
+    /// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')): what the state after the action
+    /// is worth, by the slow critic and under the present policy (eq. 3), `[n]`.
     fn targets(&self, batch: &Batch, temperature: &Tensor, noise: &mut Noise) -> Tensor {
         let _guard = no_grad_guard();
         let next = self.draw(&batch.next_observations, noise);
-        let next_values = self
-            .critic
-            .smaller(&self.target_parameters, &batch.next_states, &next.actions);
+        let next_values =
+            self.critic
+                .smaller(&self.target_parameters, &batch.next_states, &next.actions);
         soft_targets(
             &batch.rewards,
             &batch.terminated,
@@ -132,19 +151,25 @@ impl Algorithm for TorchSac {
         let critic_loss = critic_loss(&values, &targets);
         let critic_gradient = self.critic_parameters.gradient(&critic_loss);
 
-        // The policy moves towards actions of higher value, as far as its entropy is worth less (eq. 7).
+        // The policy moves towards actions of higher value, as far as its entropy is worth less
+        // (eq. 7).
         let drawn = self.draw(&batch.observations, noise);
-        let drawn_values = self
-            .critic
-            .smaller(&self.critic_parameters, &batch.states.detach(), &drawn.actions);
+        let drawn_values = self.critic.smaller(
+            &self.critic_parameters,
+            &batch.states.detach(),
+            &drawn.actions,
+        );
         let policy_loss = policy_loss(&drawn.log_prob, &drawn_values, &temperature);
         let policy_gradient = self.policy_parameters.gradient(&policy_loss);
 
-        // The temperature rises while the policy is more certain than asked for, and falls otherwise (eq. 18).
+        // The temperature rises while the policy is more certain than asked for, and falls
+        // otherwise (eq. 18).
         let log_prob = drawn.log_prob.detach();
-        let temperature_loss = temperature_loss(&self.log_temperature, &log_prob, self.target_entropy);
+        let temperature_loss =
+            temperature_loss(&self.log_temperature, &log_prob, self.target_entropy);
         let temperature_gradient =
-            Tensor::run_backward(&[&temperature_loss], &[&self.log_temperature], false, false).remove(0);
+            Tensor::run_backward(&[&temperature_loss], &[&self.log_temperature], false, false)
+                .remove(0);
 
         let metrics = finite(
             self.updates() + 1,
@@ -167,7 +192,8 @@ impl Algorithm for TorchSac {
             .step(self.policy_parameters.flat_mut(), &policy_gradient);
         self.temperature_optimizer
             .step(&mut self.log_temperature, &temperature_gradient);
-        self.target_parameters.follow(&self.critic_parameters, self.target_rate);
+        self.target_parameters
+            .follow(&self.critic_parameters, self.target_rate);
         Ok(reported(metrics))
     }
 
@@ -180,7 +206,8 @@ impl Algorithm for TorchSac {
     }
 
     fn publish(&self, into: &mut [f32]) {
-        self.policy_parameters.copy_range(0..self.policy_layout().len(), into);
+        self.policy_parameters
+            .copy_range(0..self.policy_layout().len(), into);
     }
 
     fn publish_encoder(&self, into: &mut [f32]) {
@@ -193,9 +220,18 @@ impl Algorithm for TorchSac {
 impl Stateful for TorchSac {
     fn parts(&mut self) -> Vec<(String, Part<'_>)> {
         let own = [
-            ("sac.policy.parameters", self.policy_parameters.flat().shallow_clone()),
-            ("sac.critic.parameters", self.critic_parameters.flat().shallow_clone()),
-            ("sac.target.parameters", self.target_parameters.flat().shallow_clone()),
+            (
+                "sac.policy.parameters",
+                self.policy_parameters.flat().shallow_clone(),
+            ),
+            (
+                "sac.critic.parameters",
+                self.critic_parameters.flat().shallow_clone(),
+            ),
+            (
+                "sac.target.parameters",
+                self.target_parameters.flat().shallow_clone(),
+            ),
             ("sac.log_temperature", self.log_temperature.detach()),
         ];
         let own = own.map(|(name, tensor)| (name.to_owned(), Part::Tensor(tensor)));

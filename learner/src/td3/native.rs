@@ -1,4 +1,6 @@
-//! One TD3 update on the kernels, forward and backward written out; [`super::TorchTd3`] is the same on libtorch. tanh is the C library's, as in actors: bits are equal on any processor with the same one.
+//! One TD3 update on the kernels, forward and backward written out; [`super::TorchTd3`] is the same
+//! on libtorch. tanh is the C library's, as in actors: bits are equal on any processor with the
+//! same one.
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::ACTION;
@@ -9,8 +11,8 @@ use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::error::{UpdateError, must_be_finite};
 use crate::metrics::Scalar;
 use crate::networks::native::{
-    CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output, output_mut, pair, smaller,
-    squared_norm,
+    CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output,
+    output_mut, pair, smaller, squared_norm,
 };
 use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
@@ -57,10 +59,20 @@ impl NativeTd3 {
     pub fn new(section: &Td3Section, inputs: Inputs, run_seed: u64, isa: Isa) -> Self {
         let width = section.hidden_width as i64;
         let mut policy_layout = Layout::default();
-        Policy::with_outputs(&mut policy_layout, inputs.policy as i64, width, ACTION as i64);
+        Policy::with_outputs(
+            &mut policy_layout,
+            inputs.policy as i64,
+            width,
+            ACTION as i64,
+        );
         let policy = policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         let mut critic_layout = Layout::default();
-        Critic::describe(&mut critic_layout, inputs.critic as i64, width, section.critic_networks);
+        Critic::describe(
+            &mut critic_layout,
+            inputs.critic as i64,
+            width,
+            section.critic_networks,
+        );
         let critic = critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
         Self {
             isa,
@@ -77,9 +89,15 @@ impl NativeTd3 {
         }
     }
 
-    /// The critic's gradient: both estimates are drawn towards r + γ (1 - terminated) min Q̄(s', a'), where a' is what the target policy would do, give or take some noise (eq. 14 and 15).
+    /// The critic's gradient: both estimates are drawn towards r + γ (1 - terminated) min Q̄(s',
+    /// a'), where a' is what the target policy would do, give or take some noise (eq. 14 and 15).
     /// Returns the loss and the mean of the smaller estimate.
-    fn critic_gradient(&mut self, team: &mut Team, columns: Columns<'_>, noise: &mut Noise) -> [f32; 2] {
+    fn critic_gradient(
+        &mut self,
+        team: &mut Team,
+        columns: Columns<'_>,
+        noise: &mut Noise,
+    ) -> [f32; 2] {
         let Td3Section {
             discount,
             target_noise,
@@ -97,8 +115,12 @@ impl NativeTd3 {
             critic_grad,
             ..
         } = &mut self.work;
-        self.policy
-            .forward_through(team, &self.target_policy, columns.next_observations, actions);
+        self.policy.forward_through(
+            team,
+            &self.target_policy,
+            columns.next_observations,
+            actions,
+        );
         noise.fill_normal(drawn);
         for (action, noise) in actions.iter_mut().zip(drawn) {
             *action = (action.tanh() + (std * *noise).clamp(-bound, bound)).clamp(-1.0, 1.0);
@@ -125,11 +147,13 @@ impl NativeTd3 {
             value += f64::from(smaller(values));
         }
         let into = &mut self.critic_parameters.gradient;
-        self.critic.gradient(team, critic, joined, given, critic_grad, into);
+        self.critic
+            .gradient(team, critic, joined, given, critic_grad, into);
         [loss, value].map(|sum| (sum / *rows as f64) as f32)
     }
 
-    /// The policy's gradient: it moves towards actions of which the first estimate thinks more (the deterministic policy gradient, eq. 1). Returns its loss, -Q₁.
+    /// The policy's gradient: it moves towards actions of which the first estimate thinks more (the
+    /// deterministic policy gradient, eq. 1). Returns its loss, -Q₁.
     fn policy_gradient(&mut self, team: &mut Team, columns: Columns<'_>) -> f32 {
         let Work {
             rows,
@@ -141,8 +165,12 @@ impl NativeTd3 {
             policy_grad,
             ..
         } = &mut self.work;
-        let (policy, critic) = (&self.policy_parameters.values, &self.critic_parameters.values);
-        self.policy.forward(team, policy, columns.observations, policy_given);
+        let (policy, critic) = (
+            &self.policy_parameters.values,
+            &self.critic_parameters.values,
+        );
+        self.policy
+            .forward(team, policy, columns.observations, policy_given);
         for (action, given) in actions.iter_mut().zip(output(policy_given)) {
             *action = given.tanh();
         }
@@ -154,13 +182,17 @@ impl NativeTd3 {
             loss -= f64::from(pair(&given.values, row)[0]);
             grad.copy_from_slice(&[-share, 0.0]);
         }
-        let (action, grad) = (self.inputs.critic..self.inputs.critic + ACTION, output_mut(policy_grad));
+        let (action, grad) = (
+            self.inputs.critic..self.inputs.critic + ACTION,
+            output_mut(policy_grad),
+        );
         self.critic
             .backward_through(team, critic, given, value_grad, action, grad);
         for (grad, action) in grad.iter_mut().zip(actions) {
             *grad *= 1.0 - *action * *action;
         }
-        self.policy.backward(team, policy, policy_given, policy_grad);
+        self.policy
+            .backward(team, policy, policy_given, policy_grad);
         let into = &mut self.policy_parameters.gradient;
         self.policy
             .gradient(team, columns.observations, policy_given, policy_grad, into);
@@ -191,9 +223,11 @@ impl NativeTd3 {
 }
 
 impl Algorithm for NativeTd3 {
-    /// One step of the critic, and each `td3.policy_period` of them one of the policy and of both targets. Both gradients are taken before anything moves.
+    /// One step of the critic, and each `td3.policy_period` of them one of the policy and of both
+    /// targets. Both gradients are taken before anything moves.
     ///
-    /// Source: arXiv:1802.09477, algorithm 1, which moves the critic before it takes the policy's gradient.
+    /// Source: arXiv:1802.09477, algorithm 1, which moves the critic before it takes the policy's
+    /// gradient.
     fn update(
         &mut self,
         team: &mut Team,
@@ -220,10 +254,25 @@ impl Algorithm for NativeTd3 {
         self.critic_parameters.step(team, isa);
         if improves {
             self.policy_parameters.step(team, isa);
-            follow(team, isa, &mut self.target_policy, &self.policy_parameters.values, rate);
-            follow(team, isa, &mut self.target_critic, &self.critic_parameters.values, rate);
+            follow(
+                team,
+                isa,
+                &mut self.target_policy,
+                &self.policy_parameters.values,
+                rate,
+            );
+            follow(
+                team,
+                isa,
+                &mut self.target_critic,
+                &self.critic_parameters.values,
+                rate,
+            );
         }
-        Ok(vec![(Scalar::CriticLoss, critic_loss), (Scalar::MeanValue, value)])
+        Ok(vec![
+            (Scalar::CriticLoss, critic_loss),
+            (Scalar::MeanValue, value),
+        ])
     }
 
     fn updates(&self) -> u64 {
@@ -243,8 +292,13 @@ impl Algorithm for NativeTd3 {
 
 impl Stateful for NativeTd3 {
     fn parts(&mut self) -> Vec<(String, Part<'_>)> {
-        let mut parts = self.policy_parameters.parts("td3.policy.parameters", "td3.policy.adam");
-        parts.extend(self.critic_parameters.parts("td3.critic.parameters", "td3.critic.adam"));
+        let mut parts = self
+            .policy_parameters
+            .parts("td3.policy.parameters", "td3.policy.adam");
+        parts.extend(
+            self.critic_parameters
+                .parts("td3.critic.parameters", "td3.critic.adam"),
+        );
         let targets = [
             ("td3.target_policy.parameters", &mut self.target_policy),
             ("td3.target_critic.parameters", &mut self.target_critic),

@@ -1,4 +1,5 @@
-//! One TD3 update with libtorch's automatic gradients, in reading order: the reference, the way to a CUDA device, and to policies that learn from images.
+//! One TD3 update with libtorch's automatic gradients, in reading order: the reference, the way to
+//! a CUDA device, and to policies that learn from images.
 
 use skein_kernels::Team;
 use skein_protocol::ACTION;
@@ -41,13 +42,26 @@ impl TorchTd3 {
         let width = section.hidden_width as i64;
         let mut layout = Layout::default();
         let policy = Policy::with_outputs(&mut layout, inputs.policy as i64, width, ACTION as i64);
-        let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 0), device);
+        let policy_parameters = Parameters::initialise(
+            layout,
+            derive(run_seed, Purpose::PolicyParameters, 0),
+            device,
+        );
         let mut layout = Layout::default();
         let perception = inputs
             .from_image
             .map(|latent| Perception::describe(&mut layout, latent));
-        let critic = Critic::describe(&mut layout, inputs.critic as i64, width, section.critic_networks);
-        let critic_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 1), device);
+        let critic = Critic::describe(
+            &mut layout,
+            inputs.critic as i64,
+            width,
+            section.critic_networks,
+        );
+        let critic_parameters = Parameters::initialise(
+            layout,
+            derive(run_seed, Purpose::PolicyParameters, 1),
+            device,
+        );
         Self {
             inputs,
             settings: section.clone(),
@@ -64,7 +78,8 @@ impl TorchTd3 {
         }
     }
 
-    /// r + γ (1 - terminated) min Q̄(s', a'), where a' is what the target policy would do, give or take some noise (eq. 14 and 15), `[n]`.
+    /// r + γ (1 - terminated) min Q̄(s', a'), where a' is what the target policy would do, give or
+    /// take some noise (eq. 14 and 15), `[n]`.
     fn targets(&self, batch: &Batch, noise: &mut Noise) -> Tensor {
         let Td3Section {
             discount,
@@ -73,19 +88,29 @@ impl TorchTd3 {
             ..
         } = self.settings;
         let _guard = no_grad_guard();
-        let actions = self.policy.output(&self.target_policy, &batch.next_observations).tanh();
+        let actions = self
+            .policy
+            .output(&self.target_policy, &batch.next_observations)
+            .tanh();
         let drawn = noise.normal(&[batch.rows(), ACTION as i64], self.device);
         let actions = (actions + (drawn * target_noise).clamp(-bound, bound)).clamp(-1.0, 1.0);
-        let values = self.critic.smaller(&self.target_critic, &batch.next_states, &actions);
+        let values = self
+            .critic
+            .smaller(&self.target_critic, &batch.next_states, &actions);
         let continues: Tensor = 1.0 - &batch.terminated;
         &batch.rewards + continues * values * discount
     }
 
     /// -Q₁ of what the policy would do (eq. 1), a scalar.
     fn policy_loss(&self, batch: &Batch) -> Tensor {
-        let actions = self.policy.output(&self.policy_parameters, &batch.observations).tanh();
+        let actions = self
+            .policy
+            .output(&self.policy_parameters, &batch.observations)
+            .tanh();
         let states = batch.states.detach();
-        let values = self.critic.forward(&self.critic_parameters, &states, &actions);
+        let values = self
+            .critic
+            .forward(&self.critic_parameters, &states, &actions);
         -values.select(1, 0).mean(None)
     }
 }
@@ -124,7 +149,11 @@ impl Algorithm for TorchTd3 {
         if number.is_multiple_of(self.settings.policy_period) {
             let loss = self.policy_loss(&batch);
             let gradient = self.policy_parameters.gradient(&loss);
-            finite(number, [("policy loss", &loss)], [("policy gradient", &gradient)])?;
+            finite(
+                number,
+                [("policy loss", &loss)],
+                [("policy gradient", &gradient)],
+            )?;
             policy_gradient = Some(gradient);
         }
 
@@ -132,11 +161,15 @@ impl Algorithm for TorchTd3 {
             .step(self.critic_parameters.flat_mut(), &critic_gradient);
         if let Some(gradient) = policy_gradient {
             let rate = self.settings.target_rate;
-            self.policy_optimizer.step(self.policy_parameters.flat_mut(), &gradient);
+            self.policy_optimizer
+                .step(self.policy_parameters.flat_mut(), &gradient);
             self.target_policy.follow(&self.policy_parameters, rate);
             self.target_critic.follow(&self.critic_parameters, rate);
         }
-        Ok(vec![(Scalar::CriticLoss, critic_loss), (Scalar::MeanValue, mean_value)])
+        Ok(vec![
+            (Scalar::CriticLoss, critic_loss),
+            (Scalar::MeanValue, mean_value),
+        ])
     }
 
     fn updates(&self) -> u64 {
@@ -148,7 +181,8 @@ impl Algorithm for TorchTd3 {
     }
 
     fn publish(&self, into: &mut [f32]) {
-        self.policy_parameters.copy_range(0..self.policy_layout().len(), into);
+        self.policy_parameters
+            .copy_range(0..self.policy_layout().len(), into);
     }
 
     fn publish_encoder(&self, into: &mut [f32]) {
@@ -166,7 +200,12 @@ impl Stateful for TorchTd3 {
             ("td3.target_policy.parameters", &self.target_policy),
             ("td3.target_critic.parameters", &self.target_critic),
         ];
-        let own = own.map(|(name, parameters)| (name.to_owned(), Part::Tensor(parameters.flat().shallow_clone())));
+        let own = own.map(|(name, parameters)| {
+            (
+                name.to_owned(),
+                Part::Tensor(parameters.flat().shallow_clone()),
+            )
+        });
         let mut parts = Vec::from(own);
         parts.extend(self.policy_optimizer.parts("td3.policy.adam"));
         parts.extend(self.critic_optimizer.parts("td3.critic.adam"));

@@ -31,34 +31,50 @@ fn config() -> Config {
     config
 }
 
-/// One epoch as the training loop does it. With a lag, `keep` is what was needed when its episodes were ordered.
+/// One epoch as the training loop does it. With a lag, `keep` is what was needed when its episodes
+/// were ordered.
 fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
     for number in epoch * EPISODES..(epoch + 1) * EPISODES {
         let mut flown = episode(number, STEPS / EPISODES as usize, Outcome::Collided);
         flown.level_up[4] = true;
         // Rewards that a critic of such few updates does not run away from.
-        flown.rewards.iter_mut().for_each(|reward| *reward = reward.sin());
+        flown
+            .rewards
+            .iter_mut()
+            .for_each(|reward| *reward = reward.sin());
         if keep == Keep::Depth {
             flown = with_images(flown);
         }
         trainer.take_in(flown).unwrap();
     }
-    let (mut timer, before) = (LapTimer::start(), (trainer.vae_updates(), trainer.updates()));
+    let (mut timer, before) = (
+        LapTimer::start(),
+        (trainer.vae_updates(), trainer.updates()),
+    );
     trainer
-        .train_vae(PolicyVersion(epoch), &mut timer, |_| Ok::<_, UpdateError>(()))
-        .unwrap();
-    trainer
-        .train_policy(PolicyVersion(epoch), &mut timer, &mut Means::default(), |_| {
+        .train_vae(PolicyVersion(epoch), &mut timer, |_| {
             Ok::<_, UpdateError>(())
         })
         .unwrap();
-    let done = (trainer.vae_updates() - before.0, trainer.updates() - before.1);
+    trainer
+        .train_policy(
+            PolicyVersion(epoch),
+            &mut timer,
+            &mut Means::default(),
+            |_| Ok::<_, UpdateError>(()),
+        )
+        .unwrap();
+    let done = (
+        trainer.vae_updates() - before.0,
+        trainer.updates() - before.1,
+    );
     let booked = |stage| timer.times().of(stage).count;
     assert_eq!((booked(Stage::SampleImages), booked(Stage::Sample)), done);
     assert_eq!((booked(Stage::VaeStep), booked(Stage::PolicyUpdate)), done);
 }
 
-/// Without a VAE, and with so little room for images that those of overwritten transitions are given up.
+/// Without a VAE, and with so little room for images that those of overwritten transitions are
+/// given up.
 fn end_to_end(algorithm: AlgorithmName) -> Config {
     let mut config = config();
     config.learning.encoder = EncoderTraining::EndToEnd;
@@ -121,7 +137,10 @@ fn a_resumed_trainer_goes_on_bit_for_bit_whenever_it_is_resumed() {
     for lag in [0, 1] {
         let undisturbed = train(&config(), lag, &[]);
         assert!(undisturbed.progress.vae_steps > 3 && undisturbed.progress.policy_updates > 10);
-        assert!(undisturbed.replay.images.is_none(), "the VAE was never frozen");
+        assert!(
+            undisturbed.replay.images.is_none(),
+            "the VAE was never frozen"
+        );
         // While the VAE is trained, as it is frozen after the third epoch, and later.
         for after in [&[2][..], &[1, 2, 3, 4, 5]] {
             let resumed = train(&config(), lag, after);
@@ -151,10 +170,16 @@ fn what_learns_end_to_end_goes_on_bit_for_bit_too_and_keeps_its_images_to_the_en
             .map(|block| block.len())
             .sum();
         let flown = (environment_steps + 6 * EPISODES) as usize * IMAGE_PIXELS;
-        assert!(0 < images && images < flown, "{images} bytes of {flown} flown are held");
+        assert!(
+            0 < images && images < flown,
+            "{images} bytes of {flown} flown are held"
+        );
         for after in [&[2][..], &[1, 2, 3, 4, 5]] {
             let resumed = train(&config, 1, after);
-            assert!(resumed == undisturbed, "{algorithm}, resumed after {after:?}");
+            assert!(
+                resumed == undisturbed,
+                "{algorithm}, resumed after {after:?}"
+            );
         }
     }
 }
@@ -162,7 +187,9 @@ fn what_learns_end_to_end_goes_on_bit_for_bit_too_and_keeps_its_images_to_the_en
 #[test]
 fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
     let mut trainer = Trainer::new(&end_to_end(AlgorithmName::Sac)).unwrap();
-    let encoder = |trainer: &Trainer| trainer.snapshot(PolicyVersion(0)).values[trainer.layout.encoder()].to_vec();
+    let encoder = |trainer: &Trainer| {
+        trainer.snapshot(PolicyVersion(0)).values[trainer.layout.encoder()].to_vec()
+    };
     let before = encoder(&trainer);
     assert!(
         before.iter().filter(|value| **value == 0.0).count() < 10,
@@ -174,12 +201,21 @@ fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
         .zip(&before)
         .filter(|(after, before)| after != before)
         .count();
-    assert!(moved > before.len() / 2, "{moved} of {} numbers moved", before.len());
+    assert!(
+        moved > before.len() / 2,
+        "{moved} of {} numbers moved",
+        before.len()
+    );
     assert_eq!(
         (trainer.keep(), trainer.reconstruct(&[0; IMAGE_PIXELS])),
         (Keep::Depth, None)
     );
-    assert!(trainer.tensors().iter().all(|tensor| !tensor.name.starts_with("vae")));
+    assert!(
+        trainer
+            .tensors()
+            .iter()
+            .all(|tensor| !tensor.name.starts_with("vae"))
+    );
 }
 
 #[test]
@@ -201,7 +237,10 @@ fn what_flies_is_the_average_of_the_policy_where_that_is_asked_for_and_learns_li
     let ((latest, learned), (of_one, _), (of_many, same)) = (after(0), after(1), after(1000));
     assert!(learned == same);
     let distance = |policy: &[f32]| -> f32 {
-        let apart = policy.iter().zip(&latest).map(|(one, other)| (one - other).abs());
+        let apart = policy
+            .iter()
+            .zip(&latest)
+            .map(|(one, other)| (one - other).abs());
         apart.fold(0.0, f32::max)
     };
     assert!(
@@ -228,7 +267,10 @@ fn a_u_net_is_on_libtorch_and_the_policy_where_it_was() {
         parts
     };
     let mut plain = Trainer::new(&self::config()).unwrap();
-    assert!(policy(&mut trainer) == policy(&mut plain), "both begin alike");
+    assert!(
+        policy(&mut trainer) == policy(&mut plain),
+        "both begin alike"
+    );
     (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
     assert_eq!(trainer.keep(), Keep::Latents, "the VAE was never frozen");
 }
@@ -244,7 +286,11 @@ fn a_state_that_lacks_a_tensor_or_miscounts_is_refused_by_name() {
         let restored = other.restore(&state.progress, &state.tensors, state.replay);
         restored.unwrap_err().to_string()
     };
-    let missing = refusal(|state| state.tensors.retain(|tensor| tensor.name != "sac.target.parameters"));
+    let missing = refusal(|state| {
+        state
+            .tensors
+            .retain(|tensor| tensor.name != "sac.target.parameters")
+    });
     assert!(missing.contains("sac.target.parameters"), "{missing}");
     let miscounted = refusal(|state| state.progress.vae_steps += 1);
     assert!(
@@ -285,13 +331,19 @@ fn episodes_are_stored_a_second_time_as_seen_in_a_mirror() {
     config.replay.capacity = 1000;
     let mut trainer = Trainer::new(&config).unwrap();
     (0..3).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
-    assert_eq!((trainer.steps(), trainer.replay().len()), (3 * STEPS as u64, 6 * STEPS));
+    assert_eq!(
+        (trainer.steps(), trainer.replay().len()),
+        (3 * STEPS as u64, 6 * STEPS)
+    );
     assert_eq!(
         trainer.keep(),
         Keep::Depth,
         "mirror images are encoded after the VAE is frozen, too"
     );
-    assert!(trainer.replay().image_count().is_none(), "the VAE was never frozen");
+    assert!(
+        trainer.replay().image_count().is_none(),
+        "the VAE was never frozen"
+    );
     assert!(
         all_codes_are_the_encoders(&trainer, 3),
         "images are of one shade, and look the same in a mirror"
@@ -300,10 +352,15 @@ fn episodes_are_stored_a_second_time_as_seen_in_a_mirror() {
     let mut rng = rng(&trainer.config, Purpose::PolicyBatches, PolicyVersion(9));
     trainer.replay().sample(&mut rng, 400, &mut drawn);
     let observations = drawn.observations.chunks(drawn.observations.len() / 400);
-    let to_the_left = observations.zip(drawn.actions.chunks(2)).filter(|(seen, action)| {
-        assert!(seen[32] * action[0] >= 0.0, "velocity and action are mirrored together");
-        seen[32] > 0.0
-    });
+    let to_the_left = observations
+        .zip(drawn.actions.chunks(2))
+        .filter(|(seen, action)| {
+            assert!(
+                seen[32] * action[0] >= 0.0,
+                "velocity and action are mirrored together"
+            );
+            seen[32] > 0.0
+        });
     let count = to_the_left.count();
     assert!(
         (150..=250).contains(&count),
@@ -322,11 +379,21 @@ fn while_the_vae_is_trained_stored_codes_are_made_anew_as_often_as_asked_for() {
     assert_eq!(renewed, [false, true, true]);
 }
 
-/// Whether what is stored of the first epochs are the codes that actors would make with the encoder as it is.
+/// Whether what is stored of the first epochs are the codes that actors would make with the encoder
+/// as it is.
 fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
     let precision = trainer.config.vae.encoder_precision;
-    let network = Network::new(&trainer.snapshot(PolicyVersion(epochs)), &trainer.layout, precision);
-    let code = |(episode, step)| network.encode(&[shade(episode, step); IMAGE_PIXELS], &mut Scratch::default());
+    let network = Network::new(
+        &trainer.snapshot(PolicyVersion(epochs)),
+        &trainer.layout,
+        precision,
+    );
+    let code = |(episode, step)| {
+        network.encode(
+            &[shade(episode, step); IMAGE_PIXELS],
+            &mut Scratch::default(),
+        )
+    };
     let codes: Vec<_> = (0..epochs * EPISODES)
         .flat_map(|episode| (0..=STEPS / EPISODES as usize).map(move |step| (episode, step)))
         .map(code)
@@ -336,5 +403,9 @@ fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
     trainer.replay().sample(&mut rng, 200, &mut drawn);
     let mut rows = drawn.observations.chunks(drawn.observations.len() / 200);
     let latent = trainer.config.vae.latent;
-    rows.all(|observation| codes.iter().any(|code| code[..latent] == observation[..latent]))
+    rows.all(|observation| {
+        codes
+            .iter()
+            .any(|code| code[..latent] == observation[..latent])
+    })
 }

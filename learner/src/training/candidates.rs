@@ -1,4 +1,5 @@
-//! Evaluation episodes in a run: those that confirm a candidate for the best snapshot, and those that show in the end what it can do.
+//! Evaluation episodes in a run: those that confirm a candidate for the best snapshot, and those
+//! that show in the end what it can do.
 
 use std::ops::Range;
 
@@ -19,9 +20,11 @@ use crate::evaluation;
 use crate::metrics::Scalar;
 
 impl Training<'_> {
-    /// Confirms the newest snapshot by evaluation episodes if it is a candidate; keeps it if it is the best. The last one always is a candidate.
+    /// Confirms the newest snapshot by evaluation episodes if it is a candidate; keeps it if it is
+    /// the best. The last one always is a candidate.
     ///
-    /// It depends on the state alone and does nothing the second time: a run that was stopped here looks again when it is resumed.
+    /// It depends on the state alone and does nothing the second time: a run that was stopped here
+    /// looks again when it is resumed.
     pub(super) fn look_for_best(&mut self) -> Result<(), TrainingError> {
         if !self.is_candidate() {
             return Ok(());
@@ -32,16 +35,27 @@ impl Training<'_> {
         let flown = self.evaluate(tickets, Keep::Latents)?;
         pass(FaultPoint::LearnerCandidateFlown);
         self.note_trained(&flown);
-        let passed: f64 = flown.iter().map(|episode| f64::from(episode.walls_passed)).sum();
+        let passed: f64 = flown
+            .iter()
+            .map(|episode| f64::from(episode.walls_passed))
+            .sum();
         let candidate = BestSnapshot {
             policy_version: version.0,
             episodes: self.progress.episodes,
-            window_walls_passed: self.metrics.windows().walls_passed.mean().unwrap_or_default(),
+            window_walls_passed: self
+                .metrics
+                .windows()
+                .walls_passed
+                .mean()
+                .unwrap_or_default(),
             confirmed_walls_passed: passed / flown.len() as f64,
         };
         self.metrics.scalars(
             self.last_episode(),
-            &[(Scalar::EvaluationWallsPassed, candidate.confirmed_walls_passed)],
+            &[(
+                Scalar::EvaluationWallsPassed,
+                candidate.confirmed_walls_passed,
+            )],
         )?;
         let best = self.progress.best.as_ref();
         tracing::info!(
@@ -62,9 +76,15 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Writes down what it took, the first time that `flown` show a policy that does what it was trained for.
+    /// Writes down what it took, the first time that `flown` show a policy that does what it was
+    /// trained for.
     fn note_trained(&mut self, flown: &[CommittedEpisode]) {
-        let sum = |of: fn(&CommittedEpisode) -> u8| flown.iter().map(|episode| f64::from(of(episode))).sum::<f64>();
+        let sum = |of: fn(&CommittedEpisode) -> u8| {
+            flown
+                .iter()
+                .map(|episode| f64::from(of(episode)))
+                .sum::<f64>()
+        };
         let rate = sum(|episode| episode.walls_passed) / sum(|episode| episode.course_walls);
         if self.progress.trained.is_some() || rate < self.config.evaluation.trained_rate {
             return;
@@ -88,8 +108,8 @@ impl Training<'_> {
 
     fn is_candidate(&self) -> bool {
         let progress = &self.progress;
-        let last =
-            progress.episodes == self.config.run.episodes && progress.latest_candidate != Some(progress.episodes);
+        let last = progress.episodes == self.config.run.episodes
+            && progress.latest_candidate != Some(progress.episodes);
         last || is_candidate(
             &self.config.evaluation,
             progress.episodes,
@@ -113,17 +133,24 @@ impl Training<'_> {
     }
 
     /// Flies `tickets` of the next evaluation, whose snapshot is published.
-    fn evaluate(&mut self, tickets: Vec<Ticket>, keep: Keep) -> Result<Vec<CommittedEpisode>, TrainingError> {
+    fn evaluate(
+        &mut self,
+        tickets: Vec<Ticket>,
+        keep: Keep,
+    ) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         let total = tickets.len() as u64;
         self.reporter.update(|progress| {
             progress.phase = Phase::Evaluating;
             progress.evaluation_episodes = (0, total);
         });
-        let mut batch = self.receiver.fly(Epoch(self.progress.epochs), keep, tickets)?;
+        let mut batch = self
+            .receiver
+            .fly(Epoch(self.progress.epochs), keep, tickets)?;
         let mut flown = Vec::with_capacity(batch.remaining());
         while let Some(episode) = batch.next(self.stop)? {
-            self.reporter.update(|progress| progress.evaluation_episodes.0 += 1);
+            self.reporter
+                .update(|progress| progress.evaluation_episodes.0 += 1);
             flown.push(episode);
         }
         self.progress.evaluations += 1;
@@ -147,7 +174,12 @@ impl Training<'_> {
         let sha256 = best.sha256();
         self.receiver.publish(best)?;
         let courses = self.config.courses.evaluation.len() as u32;
-        let flown = self.evaluate_on(version, 0..courses, self.config.evaluation.episodes, Keep::Latents)?;
+        let flown = self.evaluate_on(
+            version,
+            0..courses,
+            self.config.evaluation.episodes,
+            Keep::Latents,
+        )?;
         let pictured = self.evaluate_on(version, 0..1, 1, Keep::Depth)?;
         pass(FaultPoint::LearnerEvaluated);
         Ok(self.disk.with_room(self.directory.root(), || {

@@ -24,7 +24,12 @@ pub(super) struct EpochCurves {
 
 impl EpochCurves {
     /// The points of an epoch that took so `long`.
-    pub(super) fn points(self, long: Duration, replay: &Replay, receiver: &Shared) -> Vec<(Scalar, f64)> {
+    pub(super) fn points(
+        self,
+        long: Duration,
+        replay: &Replay,
+        receiver: &Shared,
+    ) -> Vec<(Scalar, f64)> {
         let mut points = vec![
             (Scalar::ReplayTransitions, replay.len() as f64),
             (Scalar::ReplaySuccess, replay.success_len() as f64),
@@ -40,7 +45,10 @@ impl EpochCurves {
         }
         if self.updates > 0 {
             points.extend(self.policy.finish());
-            points.push((Scalar::UpdatesPerSec, self.updates as f64 / self.updating.as_secs_f64()));
+            points.push((
+                Scalar::UpdatesPerSec,
+                self.updates as f64 / self.updating.as_secs_f64(),
+            ));
         }
         points
     }

@@ -50,7 +50,9 @@ pub enum TrainingError {
         source: TrainerRestoreError,
     },
     /// A checkpoint lacks what it should hold.
-    #[error("the checkpoint of episode {episodes} cannot be resumed: its snapshot {version} {problem}")]
+    #[error(
+        "the checkpoint of episode {episodes} cannot be resumed: its snapshot {version} {problem}"
+    )]
     RestoredSnapshot {
         episodes: u64,
         version: u64,
@@ -66,13 +68,15 @@ pub enum TrainingError {
         checkpoints: PathBuf,
         first_after: u64,
     },
-    /// It was told to stop and did not wait for the end of an epoch's updates, or of the episode that it was learning from.
+    /// It was told to stop and did not wait for the end of an epoch's updates, or of the episode
+    /// that it was learning from.
     #[error("stopped amid an epoch")]
     Abandoned,
 }
 
 impl TrainingError {
-    /// Whether a new incarnation of the learner may get further: the transport failed, and nothing that was computed is at fault. Anything else would come again.
+    /// Whether a new incarnation of the learner may get further: the transport failed, and nothing
+    /// that was computed is at fault. Anything else would come again.
     pub fn is_of_the_transport(&self) -> bool {
         matches!(self, Self::EpisodeReceiver(ReceiverError::Transport(_)))
     }

@@ -1,4 +1,5 @@
-//! How a run outlives its learner: what goes into a checkpoint, how a learner goes on from one, and how it ends.
+//! How a run outlives its learner: what goes into a checkpoint, how a learner goes on from one, and
+//! how it ends.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -17,7 +18,9 @@ use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{Ending, Summary};
 
 use super::{EpochCurves, StopWatch, Training, TrainingError};
-use crate::checkpoint::{CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, Progress};
+use crate::checkpoint::{
+    CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, Progress,
+};
 use crate::disk::Disk;
 use crate::episodes::receiver::EpisodeReceiver;
 use crate::incarnations::begin_incarnation;
@@ -27,7 +30,8 @@ use crate::threads;
 use crate::trainer::Trainer;
 
 impl<'a> Training<'a> {
-    /// A training at its newest undamaged checkpoint, or at its start if it has none. The episodes that were in the air are ordered again.
+    /// A training at its newest undamaged checkpoint, or at its start if it has none. The episodes
+    /// that were in the air are ordered again.
     pub(super) fn begin(
         directory: &'a RunDirectory,
         identity: &'a RunIdentity,
@@ -41,20 +45,26 @@ impl<'a> Training<'a> {
         let store = CheckpointStore::new(&directory.checkpoints(), config);
         let fits = |state: &CheckpointState| {
             let metrics = &state.progress.metrics;
-            metrics.check(directory).map_err(|problem| CheckpointError::Unfit {
-                episodes: state.progress.episodes,
-                problem: problem.to_string(),
-            })
+            metrics
+                .check(directory)
+                .map_err(|problem| CheckpointError::Unfit {
+                    episodes: state.progress.episodes,
+                    problem: problem.to_string(),
+                })
         };
         let newest = store.load_newest(fits, |error| {
             tell(&format!("a checkpoint is not used: {error}"));
         })?;
         let (saved, snapshots) = match newest {
             Some(checkpoint) => {
-                tell(&format!("going on after episode {}", checkpoint.progress.episodes));
+                tell(&format!(
+                    "going on after episode {}",
+                    checkpoint.progress.episodes
+                ));
                 restore(&mut trainer, checkpoint)?
             }
-            // An incarnation that died before its first checkpoint may have left files: they are dropped as if they came after episode 0.
+            // An incarnation that died before its first checkpoint may have left files: they are
+            // dropped as if they came after episode 0.
             None => {
                 refuse_lost_checkpoints(directory, config)?;
                 (start(config, &trainer), BTreeMap::new())
@@ -66,7 +76,9 @@ impl<'a> Training<'a> {
             .map_err(TrainingError::Thread)?;
         let incarnations = directory.incarnations_csv();
         let resumes = disk
-            .with_room(&incarnations, || begin_incarnation(&incarnations, saved.episodes))
+            .with_room(&incarnations, || {
+                begin_incarnation(&incarnations, saved.episodes)
+            })
             .map_err(file_error(&incarnations))?;
         if resumes > 0 && saved.episodes == 0 {
             tell("there is no checkpoint yet: beginning from the first episode");
@@ -126,7 +138,8 @@ impl<'a> Training<'a> {
         self.publish()
     }
 
-    /// Takes back what an earlier incarnation has written since the checkpoint: it was of a future that is to be flown again.
+    /// Takes back what an earlier incarnation has written since the checkpoint: it was of a future
+    /// that is to be flown again.
     fn remove_later_results(&mut self) -> Result<(), TrainingError> {
         let best = self
             .progress
@@ -158,7 +171,11 @@ impl<'a> Training<'a> {
     }
 
     /// Writes a snapshot that is kept to a file.
-    pub(super) fn save_snapshot(&self, version: PolicyVersion, path: &Path) -> Result<(), TrainingError> {
+    pub(super) fn save_snapshot(
+        &self,
+        version: PolicyVersion,
+        path: &Path,
+    ) -> Result<(), TrainingError> {
         let snapshot = self.kept_snapshot(version)?;
         Ok(self
             .disk
@@ -172,10 +189,12 @@ impl<'a> Training<'a> {
         Ok(())
     }
 
-    /// Hands the state to the writing thread, unless it is that of the newest checkpoint; and keeps the newest snapshot as a file.
+    /// Hands the state to the writing thread, unless it is that of the newest checkpoint; and keeps
+    /// the newest snapshot as a file.
     ///
-    /// Only between epochs, and so between episodes: then the state follows from the epochs done, whether a candidate was looked at, and what had been ordered
-    /// earlier. What lies in the middle of an episode is in none.
+    /// Only between epochs, and so between episodes: then the state follows from the epochs done,
+    /// whether a candidate was looked at, and what had been ordered earlier. What lies in the
+    /// middle of an episode is in none.
     pub(super) fn checkpoint(&mut self) -> Result<(), TrainingError> {
         let (now, saved) = (&self.progress, &self.saved);
         if (now.epochs, now.latest_candidate) == (saved.epochs, saved.latest_candidate) {
@@ -208,31 +227,35 @@ impl<'a> Training<'a> {
             policy_updates: self.trainer.updates(),
             in_the_air: self.in_the_air.iter().map(|epoch| epoch.order).collect(),
             metrics: self.metrics.state(),
-            spent: self
-                .progress
-                .spent
-                .with_this_incarnation(self.started, self.timer.times(), &self.receiver.shared()),
+            spent: self.progress.spent.with_this_incarnation(
+                self.started,
+                self.timer.times(),
+                &self.receiver.shared(),
+            ),
             ..self.progress.clone()
         }
     }
 
     /// Has everything saved; returns how far the run is.
     pub(super) fn save(&mut self) -> Result<Progress, TrainingError> {
-        self.reporter.update(|progress| progress.phase = Phase::Finishing);
+        self.reporter
+            .update(|progress| progress.phase = Phase::Finishing);
         self.metrics.flush()?;
         self.checkpoint()?;
         self.timer.lap(Stage::OtherTraining, 0);
         Ok(self.counted())
     }
 
-    /// Gives up an epoch half done: the files tell what the next incarnation will go on from. Returns how far that is.
+    /// Gives up an epoch half done: the files tell what the next incarnation will go on from.
+    /// Returns how far that is.
     pub(super) fn go_back(&mut self) -> Result<Progress, TrainingError> {
         tracing::warn!(
             episodes = self.progress.episodes,
             checkpoint = self.saved.episodes,
             "told to stop, and the end of the epoch takes too long: back to the newest checkpoint"
         );
-        self.reporter.update(|progress| progress.phase = Phase::Finishing);
+        self.reporter
+            .update(|progress| progress.phase = Phase::Finishing);
         // What is flushed now cannot follow what is cut.
         self.metrics.flush()?;
         self.metrics = resume_metrics(self.directory, &self.saved, &self.disk)?;
@@ -240,10 +263,15 @@ impl<'a> Training<'a> {
         Ok(self.saved.clone())
     }
 
-    /// Finishes the checkpoint being written, sums up how the run ended and how far it came, and lets the actors go.
+    /// Finishes the checkpoint being written, sums up how the run ended and how far it came, and
+    /// lets the actors go.
     ///
-    /// In this order: a learner that dies before all is written is started again, and needs its actors still.
-    pub(super) fn conclude(self, end: Result<(Ending, Progress), TrainingError>) -> Result<Summary, TrainingError> {
+    /// In this order: a learner that dies before all is written is started again, and needs its
+    /// actors still.
+    pub(super) fn conclude(
+        self,
+        end: Result<(Ending, Progress), TrainingError>,
+    ) -> Result<Summary, TrainingError> {
         // A thread that has ended can no longer be asked.
         let thread_cpu_secs = threads::cpu_secs();
         let written = self.checkpoints.finish();
@@ -267,21 +295,31 @@ impl<'a> Training<'a> {
     }
 }
 
-fn save_summary(directory: &RunDirectory, disk: &Disk, summary: &Summary) -> Result<(), TrainingError> {
+fn save_summary(
+    directory: &RunDirectory,
+    disk: &Disk,
+    summary: &Summary,
+) -> Result<(), TrainingError> {
     pass(FaultPoint::LearnerBeforeSummary);
     let path = directory.summary_json();
-    disk.with_room(&path, || summary.save(&path)).map_err(file_error(&path))
+    disk.with_room(&path, || summary.save(&path))
+        .map_err(file_error(&path))
 }
 
 /// The metrics as they were when `saved` was.
-fn resume_metrics(directory: &RunDirectory, saved: &Progress, disk: &Disk) -> Result<Metrics, MetricsError> {
+fn resume_metrics(
+    directory: &RunDirectory,
+    saved: &Progress,
+    disk: &Disk,
+) -> Result<Metrics, MetricsError> {
     disk.with_room(directory.root(), || {
         Metrics::resume(directory, saved.metrics.clone(), disk)
     })
 }
 
-/// A run without checkpoints is not begun anew without a word when it has had some: their folder is gone, or `episodes.csv` shows more episodes than can be
-/// flown before the first. What was flown before any is flown again.
+/// A run without checkpoints is not begun anew without a word when it has had some: their folder is
+/// gone, or `episodes.csv` shows more episodes than can be flown before the first. What was flown
+/// before any is flown again.
 fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<(), TrainingError> {
     let episodes_csv = directory.episodes_csv();
     let content = match fs::read(&episodes_csv) {
@@ -291,9 +329,11 @@ fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<
     let lines = content.iter().filter(|&&byte| byte == b'\n').count() as u64;
     let rows = lines.saturating_sub(1);
     let (checkpoints, first_after) = (directory.checkpoints(), config.checkpoints.every_episodes);
-    // A checkpoint is taken at the end of an epoch, and training goes on while it is written: until the next one is to be handed over. Their folder was
-    // made with the run's.
-    if rows > 2 * (first_after + config.learning.episodes_per_epoch) || rows > 0 && !checkpoints.is_dir() {
+    // A checkpoint is taken at the end of an epoch, and training goes on while it is written: until
+    // the next one is to be handed over. Their folder was made with the run's.
+    if rows > 2 * (first_after + config.learning.episodes_per_epoch)
+        || rows > 0 && !checkpoints.is_dir()
+    {
         return Err(TrainingError::CheckpointsLost {
             episodes_csv,
             rows,
@@ -328,7 +368,8 @@ fn restore(
         .restore(&progress, &tensors, replay)
         .map_err(|source| TrainingError::Restore { episodes, source })?;
     let version = progress.version();
-    // The parameters are there twice, in the tensors and in the snapshot: a restored trainer that would publish another snapshot is not the one stored.
+    // The parameters are there twice, in the tensors and in the snapshot: a restored trainer that
+    // would publish another snapshot is not the one stored.
     if trainer.snapshot(version).sha256() != progress.policy_sha256 {
         return Err(TrainingError::RestoredSnapshot {
             episodes,
@@ -358,7 +399,13 @@ fn first_line(config: &Config, saved: &Progress) -> progress::Progress {
     }
 }
 
-fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &Progress, resumes: u64) -> Summary {
+fn summary(
+    identity: &RunIdentity,
+    config: &Config,
+    ending: Ending,
+    progress: &Progress,
+    resumes: u64,
+) -> Summary {
     let best = progress.best.as_ref();
     Summary {
         skein_version: env!("SKEIN_VERSION").to_owned(),
@@ -418,7 +465,8 @@ mod tests {
             )
             .unwrap()
         };
-        // The second checkpoint waits until the first is in place, so that many can be flown without one.
+        // The second checkpoint waits until the first is in place, so that many can be flown
+        // without one.
         flown(50);
         refuse_lost_checkpoints(&directory, &config).unwrap();
         fs::remove_dir(directory.checkpoints()).unwrap();
@@ -434,8 +482,14 @@ mod tests {
         fs::remove_file(directory.checkpoints()).unwrap();
         fs::create_dir(directory.checkpoints()).unwrap();
         flown(51);
-        let error = refuse_lost_checkpoints(&directory, &config).unwrap_err().to_string();
-        for part in ["episodes.csv has 51 episodes", "checkpoints", "remove episodes.csv"] {
+        let error = refuse_lost_checkpoints(&directory, &config)
+            .unwrap_err()
+            .to_string();
+        for part in [
+            "episodes.csv has 51 episodes",
+            "checkpoints",
+            "remove episodes.csv",
+        ] {
             assert!(error.contains(part), "`{error}` does not mention `{part}`");
         }
     }

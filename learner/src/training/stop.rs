@@ -6,8 +6,10 @@ use std::time::{Duration, Instant};
 use super::TrainingError;
 use crate::episodes::receiver::Shared;
 
-/// Time for the rest of an epoch's updates once the run is told to stop, and of an episode in segments that is learned from already. Longer than those of any configuration here take, so that everything learned is
-/// saved as a rule; and shorter than the 90 seconds after which the supervisor ends a learner that does not.
+/// Time for the rest of an epoch's updates once the run is told to stop, and of an episode in
+/// segments that is learned from already. Longer than those of any configuration here take, so that
+/// everything learned is saved as a rule; and shorter than the 90 seconds after which the
+/// supervisor ends a learner that does not.
 const GRACE: Duration = Duration::from_secs(60);
 
 /// Looks at the stop between updates.
@@ -27,7 +29,8 @@ impl<'a> StopWatch<'a> {
         }
     }
 
-    /// To be asked while the next segment of an episode is waited for: the episode is flown to its end, so that what was learned from it can be saved.
+    /// To be asked while the next segment of an episode is waited for: the episode is flown to its
+    /// end, so that what was learned from it can be saved.
     ///
     /// # Errors
     /// [`TrainingError::Abandoned`] when that takes too long, or nobody is there to fly it.
@@ -39,8 +42,9 @@ impl<'a> StopWatch<'a> {
     }
 
     /// # Errors
-    /// [`TrainingError::Abandoned`] when the epoch's updates have taken too long since the stop: they are given up half done, and nothing of them is
-    /// kept. The run goes on from the checkpoint before, and will do the same updates.
+    /// [`TrainingError::Abandoned`] when the epoch's updates have taken too long since the stop:
+    /// they are given up half done, and nothing of them is kept. The run goes on from the
+    /// checkpoint before, and will do the same updates.
     pub(super) fn after_update(&mut self) -> Result<(), TrainingError> {
         if !self.stop.load(Ordering::Relaxed) {
             return Ok(());
@@ -70,6 +74,9 @@ mod tests {
         stop.store(true, Ordering::Relaxed);
         watch.after_update().unwrap();
         std::thread::sleep(Duration::from_millis(30));
-        assert!(matches!(watch.after_update(), Err(TrainingError::Abandoned)));
+        assert!(matches!(
+            watch.after_update(),
+            Err(TrainingError::Abandoned)
+        ));
     }
 }

@@ -1,8 +1,10 @@
 //! The variational auto-encoder: gives the policy its eyes.
 //!
-//! It learns to reproduce depth images through a short code, during the first steps of a run, and is then frozen (paper, section 3.3). The
-//! policy sees the code's mean. Two engines compute it, which begin with the same parameters and are held to each other by tests; with a U-Net for a decoder
-//! (`Decoder` in `networks/decoder.rs` says what is to be expected of one) it is on libtorch in any case.
+//! It learns to reproduce depth images through a short code, during the first steps of a run, and
+//! is then frozen (paper, section 3.3). The policy sees the code's mean. Two engines compute it,
+//! which begin with the same parameters and are held to each other by tests; with a U-Net for a
+//! decoder (`Decoder` in `networks/decoder.rs` says what is to be expected of one) it is on
+//! libtorch in any case.
 
 mod native;
 mod torch;
@@ -19,7 +21,10 @@ pub use torch::{TorchVae, images_from_bytes};
 
 /// Encoder, decoder and their optimizer, computed by the configured engine.
 #[derive(Debug)]
-#[expect(clippy::large_enum_variant, reason = "there is one of them in a process")]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there is one of them in a process"
+)]
 pub enum Vae {
     /// Kernels of our own, on the processor.
     Native(NativeVae),
@@ -30,16 +35,19 @@ pub enum Vae {
 /// What one VAE step reports.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VaeMetrics {
-    /// What was minimised: squared error summed over an image's pixels plus weighted divergence, mean over the batch.
+    /// What was minimised: squared error summed over an image's pixels plus weighted divergence,
+    /// mean over the batch.
     pub loss: f32,
     /// Mean squared error of a pixel, depth in [0, 1].
     pub pixel_error: f32,
-    /// Kullback-Leibler divergence of the code's distribution from the standard normal, in nats, mean over the batch: how much the code tells.
+    /// Kullback-Leibler divergence of the code's distribution from the standard normal, in nats,
+    /// mean over the batch: how much the code tells.
     pub divergence: f32,
 }
 
 impl Vae {
-    /// An untrained VAE whose parameters depend on the run's seed alone. `device` is libtorch's; the native engine has the processor.
+    /// An untrained VAE whose parameters depend on the run's seed alone. `device` is libtorch's;
+    /// the native engine has the processor.
     pub fn new(section: &VaeSection, run: &RunSection, device: Device) -> Self {
         match section.engine(run) {
             Engine::Native => Self::Native(NativeVae::new(section, run.seed, run.learner_threads)),
@@ -50,7 +58,8 @@ impl Vae {
     /// One step of Adam on a minibatch of depth images, `[n, 72, 128]`.
     ///
     /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was changed then.
+    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was
+    /// changed then.
     pub fn update(&mut self, images: &[u8], noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
         match self {
             Self::Native(vae) => vae.update(images, noise),
@@ -58,7 +67,8 @@ impl Vae {
         }
     }
 
-    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1]. `images`: `[n, 72, 128]`.
+    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1].
+    /// `images`: `[n, 72, 128]`.
     pub fn reconstruct(&mut self, images: &[u8]) -> Vec<f32> {
         match self {
             Self::Native(vae) => vae.reconstruct(images),
@@ -78,7 +88,8 @@ impl Vae {
         }
     }
 
-    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot layout's order.
+    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot
+    /// layout's order.
     ///
     /// # Panics
     /// When `into` is not [`Vae::published_len`] long.
@@ -108,7 +119,10 @@ impl Stateful for Vae {
 }
 
 fn copy(tensor: &Tensor, into: &mut [f32]) {
-    tensor.to_device(Device::Cpu).contiguous().copy_data(into, into.len());
+    tensor
+        .to_device(Device::Cpu)
+        .contiguous()
+        .copy_data(into, into.len());
 }
 
 #[cfg(test)]

@@ -1,8 +1,9 @@
 //! The engine of our own: forward, backward and Adam over [`skein_kernels`].
 //!
-//! Images lie channels-last from the first byte to the last gradient, so that what a kernel sees are runs of memory, read where they lie. The gradients are written
-//! out by hand, layer by layer; what autograd computes is what they are tested against. All results are the same bits for any number of threads and on every
-//! processor.
+//! Images lie channels-last from the first byte to the last gradient, so that what a kernel sees
+//! are runs of memory, read where they lie. The gradients are written out by hand, layer by layer;
+//! what autograd computes is what they are tested against. All results are the same bits for any
+//! number of threads and on every processor.
 
 mod batch;
 mod buffer;
@@ -64,7 +65,8 @@ pub struct NativeVae {
 }
 
 impl NativeVae {
-    /// An untrained VAE whose parameters depend on the run's seed alone; the same as [`super::TorchVae`]'s.
+    /// An untrained VAE whose parameters depend on the run's seed alone; the same as
+    /// [`super::TorchVae`]'s.
     pub fn new(section: &VaeSection, run_seed: u64, threads: usize) -> Self {
         Self::with_isa(section, run_seed, threads, Isa::best())
     }
@@ -102,7 +104,8 @@ impl NativeVae {
     /// One step of Adam on a minibatch of depth images, `[n, 72, 128]`.
     ///
     /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was changed then.
+    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was
+    /// changed then.
     pub fn update(&mut self, images: &[u8], noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
         let count = images.len() / IMAGE_PIXELS;
         self.noise.resize(count * self.network.latent(), 0.0);
@@ -133,15 +136,18 @@ impl NativeVae {
         step.objective(images, &self.noise, &mut self.gradient)
     }
 
-    /// Whether all that a step would use is finite. A gradient counts as not finite when its squared norm, or for the decoder's first convolution a bound of it,
-    /// overflows.
+    /// Whether all that a step would use is finite. A gradient counts as not finite when its
+    /// squared norm, or for the decoder's first convolution a bound of it, overflows.
     fn check(&mut self, objective: &Objective) -> Result<(), UpdateError> {
         let watch = &mut self.members[0].watch;
         watch.start();
         let blocks = self.network.unfold.place.weight.clone();
         let norm = squares(self.isa, &self.gradient[..blocks.start])
             + squares(self.isa, &self.gradient[blocks.end..])
-            + self.network.unfold.gradient_bound(self.isa, &self.batch.unfolded);
+            + self
+                .network
+                .unfold
+                .gradient_bound(self.isa, &self.batch.unfolded);
         watch.rest();
         for (tensor, value) in [
             ("vae loss", objective.loss),
@@ -161,19 +167,27 @@ impl NativeVae {
     fn step(&mut self) {
         self.steps += 1;
         let (isa, learning_rate, number) = (self.isa, self.learning_rate, self.steps);
-        let adam = AdamStep { learning_rate, number };
+        let adam = AdamStep {
+            learning_rate,
+            number,
+        };
         let [first, second] = &mut self.moments;
         let input = &*self.batch.unfolded;
         let mut blocks = self
             .network
             .unfold
             .blocks(&mut self.parameters, [&mut *first, &mut *second]);
-        share(&mut self.team, &mut self.members, &mut blocks, |_, block, member| {
-            let _ = block.gradient(isa, input, &mut member.unfold);
-            member.watch.layer(network::UNFOLD, LayerPass::Gradient);
-            block.step(isa, adam, &mut member.unfold);
-            member.watch.adam_and_packing();
-        });
+        share(
+            &mut self.team,
+            &mut self.members,
+            &mut blocks,
+            |_, block, member| {
+                let _ = block.gradient(isa, input, &mut member.unfold);
+                member.watch.layer(network::UNFOLD, LayerPass::Gradient);
+                block.step(isa, adam, &mut member.unfold);
+                member.watch.adam_and_packing();
+            },
+        );
         drop(blocks);
         let watch = &mut self.members[0].watch;
         watch.start();
@@ -202,30 +216,41 @@ impl NativeVae {
         let (network, parameters) = (&self.network, &*self.parameters);
         let mut codes = vec![0.0; images.len() / IMAGE_PIXELS * network.latent()];
         let mut parts: Vec<_> = codes.chunks_exact_mut(network.latent()).collect();
-        share(&mut self.team, &mut self.members, &mut parts, |index, code, member| {
-            let depth = &images[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
-            for (image, len) in member.images.iter_mut().zip(network.seen_lens()) {
-                image.resize(len);
-            }
-            let images = member.images.each_mut().map(|image| &mut **image);
-            network.see(parameters, depth, images, &mut member.watch);
-            network.mean(parameters, &member.images[4], code);
-        });
+        share(
+            &mut self.team,
+            &mut self.members,
+            &mut parts,
+            |index, code, member| {
+                let depth = &images[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
+                for (image, len) in member.images.iter_mut().zip(network.seen_lens()) {
+                    image.resize(len);
+                }
+                let images = member.images.each_mut().map(|image| &mut **image);
+                network.see(parameters, depth, images, &mut member.watch);
+                network.mean(parameters, &member.images[4], code);
+            },
+        );
         codes
     }
 
-    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1]. `images`: `[n, 72, 128]`.
+    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1].
+    /// `images`: `[n, 72, 128]`.
     pub fn reconstruct(&mut self, images: &[u8]) -> Vec<f32> {
         let mut seen = Vec::with_capacity(images.len());
         for images in images.chunks(CHUNK * IMAGE_PIXELS) {
             let codes = self.encode(images);
             let (isa, count) = (self.isa, images.len() / IMAGE_PIXELS);
-            let (network, parameters, batch) = (&mut self.network, &*self.parameters, &mut self.batch);
+            let (network, parameters, batch) =
+                (&mut self.network, &*self.parameters, &mut self.batch);
             batch.resize(network, count);
             let finish = skein_kernels::Finish::Rectified;
-            network
-                .linear
-                .forward(&mut self.team, parameters, &codes, finish, &mut batch.unfolded);
+            network.linear.forward(
+                &mut self.team,
+                parameters,
+                &codes,
+                finish,
+                &mut batch.unfolded,
+            );
             network.unfold.multiply(&mut self.team, &batch.unfolded);
             let network = &*network;
             let mut drawn = by_image(batch.drawn.each_mut().map(|buffer| &mut **buffer), count);
@@ -235,7 +260,13 @@ impl NativeVae {
                 &mut drawn,
                 |index, images, member| {
                     let images = images.each_mut().map(|image| &mut **image);
-                    network.draw(parameters, index, images, &mut member.columns, &mut member.watch);
+                    network.draw(
+                        parameters,
+                        index,
+                        images,
+                        &mut member.columns,
+                        &mut member.watch,
+                    );
                 },
             );
             drop(drawn);
@@ -250,7 +281,8 @@ impl NativeVae {
         self.published_len
     }
 
-    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot layout's order.
+    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot
+    /// layout's order.
     ///
     /// # Panics
     /// When `into` is not [`NativeVae::published_len`] long.
@@ -273,7 +305,8 @@ impl NativeVae {
         spent
     }
 
-    /// Floating-point operations of the passes of each layer for an image, in the order of [`LAYERS`] and [`Pass::ALL`]. Pixels have no gradient.
+    /// Floating-point operations of the passes of each layer for an image, in the order of
+    /// [`LAYERS`] and [`Pass::ALL`]. Pixels have no gradient.
     pub fn operations(&self) -> [[f64; 3]; 10] {
         let mut operations = self.network.operations().map(|pass| [pass; 3]);
         operations[0][Pass::Backward as usize] = 0.0;
@@ -290,17 +323,28 @@ impl NativeVae {
         self.packed = false;
     }
 
-    /// Loss, squared error and divergence, and the whole gradient in PyTorch's order. `noise`: standard normal, `[n, latent]`.
-    pub(super) fn loss_and_gradient(&mut self, images: &[u8], noise: &[f32]) -> ([f32; 3], Vec<f32>) {
+    /// Loss, squared error and divergence, and the whole gradient in PyTorch's order. `noise`:
+    /// standard normal, `[n, latent]`.
+    pub(super) fn loss_and_gradient(
+        &mut self,
+        images: &[u8],
+        noise: &[f32],
+    ) -> ([f32; 3], Vec<f32>) {
         self.noise = noise.to_vec();
         let Objective {
             loss,
             error,
             divergence,
         } = self.objective(images);
-        let (mut whole, place) = (self.gradient.to_vec(), self.network.unfold.place.weight.clone());
+        let (mut whole, place) = (
+            self.gradient.to_vec(),
+            self.network.unfold.place.weight.clone(),
+        );
         let [first, second] = &mut self.moments;
-        let blocks = self.network.unfold.blocks(&mut self.parameters, [first, second]);
+        let blocks = self
+            .network
+            .unfold
+            .blocks(&mut self.parameters, [first, second]);
         let len = place.len() / blocks.len();
         for (block, into) in blocks.iter().zip(whole[place].chunks_exact_mut(len)) {
             let scratch = &mut self.members[0].unfold;

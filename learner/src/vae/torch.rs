@@ -1,7 +1,7 @@
 //! The variational auto-encoder: gives the policy its eyes.
 //!
-//! It learns to reproduce depth images through a short code, during the first steps of a run, and is then frozen (paper, section 3.3). The
-//! policy sees the code's mean.
+//! It learns to reproduce depth images through a short code, during the first steps of a run, and
+//! is then frozen (paper, section 3.3). The policy sees the code's mean.
 
 use skein_protocol::config::VaeSection;
 use skein_protocol::seeds::{Purpose, derive};
@@ -15,7 +15,8 @@ use crate::noise::Noise;
 use crate::optimizer::Adam;
 use crate::state::{Part, Stateful};
 
-/// Images encoded or reconstructed at once outside of training: bounds memory at some 50 MB, and loses no speed.
+/// Images encoded or reconstructed at once outside of training: bounds memory at some 50 MB, and
+/// loses no speed.
 const CHUNK: i64 = 64;
 
 /// Encoder, decoder and their optimizer.
@@ -44,7 +45,8 @@ impl TorchVae {
         let mut layout = Layout::default();
         let encoder = Encoder::describe(&mut layout, section.latent);
         let decoder = Decoder::describe(&mut layout, section.latent, section.decoder);
-        let parameters = Parameters::initialise(layout, derive(run_seed, Purpose::VaeParameters, 0), device);
+        let parameters =
+            Parameters::initialise(layout, derive(run_seed, Purpose::VaeParameters, 0), device);
         let optimizer = Adam::new(parameters.flat(), section.learning_rate);
         Self {
             latent: section.latent as i64,
@@ -59,8 +61,13 @@ impl TorchVae {
     /// One step of Adam on a minibatch of depth images, `[n, 72, 128]` u8.
     ///
     /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was changed then.
-    pub fn update(&mut self, images: &Tensor, noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
+    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was
+    /// changed then.
+    pub fn update(
+        &mut self,
+        images: &Tensor,
+        noise: &mut Noise,
+    ) -> Result<VaeMetrics, UpdateError> {
         let pixels = pixels(&images.to_device(self.device()));
 
         let code_noise = noise.normal(&[pixels.size()[0], self.latent], pixels.device());
@@ -88,9 +95,11 @@ impl TorchVae {
         })
     }
 
-    /// The loss and its two parts for these pixels, `[n, 1, 72, 128]`, and standard normal noise, `[n, latent]`.
+    /// The loss and its two parts for these pixels, `[n, 1, 72, 128]`, and standard normal noise,
+    /// `[n, latent]`.
     fn objective(&self, pixels: &Tensor, code_noise: &Tensor) -> Objective {
-        // The code is drawn as mean + std · noise, so that gradients reach mean and std (arXiv:1312.6114, section 2.4).
+        // The code is drawn as mean + std · noise, so that gradients reach mean and std
+        // (arXiv:1312.6114, section 2.4).
         let Encoded {
             mean,
             log_variance,
@@ -108,18 +117,22 @@ impl TorchVae {
         }
     }
 
-    /// The code's mean for each image, `[n, latent]`. `images`: `[n, 72, 128]` u8, any number of them.
+    /// The code's mean for each image, `[n, latent]`. `images`: `[n, 72, 128]` u8, any number of
+    /// them.
     pub fn encode(&self, images: &Tensor) -> Tensor {
         self.in_chunks(images, |pixels| self.encoder.mean(&self.parameters, pixels))
             .unwrap_or_else(|| Tensor::zeros([0, self.latent], (Kind::Float, self.device())))
     }
 
-    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1]. `images`: `[n, 72, 128]` u8.
+    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1].
+    /// `images`: `[n, 72, 128]` u8.
     pub fn reconstruct(&self, images: &Tensor) -> Tensor {
         let shape = [-1, IMAGE_HEIGHT as i64, IMAGE_WIDTH as i64];
         self.in_chunks(images, |pixels| {
             let Encoded { mean, maps, .. } = self.encoder.encode(&self.parameters, pixels);
-            self.decoder.forward(&self.parameters, &mean, &maps).view(shape)
+            self.decoder
+                .forward(&self.parameters, &mean, &maps)
+                .view(shape)
         })
         .unwrap_or_else(|| Tensor::zeros([0, shape[1], shape[2]], (Kind::Float, self.device())))
     }
@@ -129,7 +142,8 @@ impl TorchVae {
         self.encoder.published_len()
     }
 
-    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot layout's order.
+    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot
+    /// layout's order.
     ///
     /// # Panics
     /// When `into` is not [`TorchVae::published_len`] long.
@@ -173,11 +187,14 @@ impl TorchVae {
         self.parameters.layout()
     }
 
-    /// Loss, squared error and divergence in the parameters' precision, and the gradient. `images`: `[n, 72, 128]` u8; `noise`: standard normal, `[n, latent]`.
+    /// Loss, squared error and divergence in the parameters' precision, and the gradient. `images`:
+    /// `[n, 72, 128]` u8; `noise`: standard normal, `[n, latent]`.
     pub(super) fn loss_and_gradient(&self, images: &Tensor, noise: &[f32]) -> ([f64; 3], Vec<f32>) {
         let kind = self.parameters.flat().kind();
         let pixels = pixels(images).to_kind(kind);
-        let noise = Tensor::from_slice(noise).view([-1, self.latent]).to_kind(kind);
+        let noise = Tensor::from_slice(noise)
+            .view([-1, self.latent])
+            .to_kind(kind);
         let Objective {
             loss,
             error,
@@ -185,7 +202,10 @@ impl TorchVae {
         } = self.objective(&pixels, &noise);
         let values = [&loss, &error, &divergence].map(|scalar| scalar.double_value(&[]));
         let gradient = self.parameters.gradient(&loss).to_kind(Kind::Float);
-        (values, Vec::try_from(gradient).expect("a flat vector of numbers"))
+        (
+            values,
+            Vec::try_from(gradient).expect("a flat vector of numbers"),
+        )
     }
 }
 
@@ -214,7 +234,8 @@ fn squared_error(reconstructed: &Tensor, pixels: &Tensor) -> Tensor {
     (reconstructed - pixels).square().sum(None) / pixels.size()[0] as f64
 }
 
-/// Divergence of N(mean, exp(log_variance)) from N(0, 1), summed over the code, mean over the batch (arXiv:1312.6114, appendix B).
+/// Divergence of N(mean, exp(log_variance)) from N(0, 1), summed over the code, mean over the batch
+/// (arXiv:1312.6114, appendix B).
 fn divergence(mean: &Tensor, log_variance: &Tensor) -> Tensor {
     let terms: Tensor = mean.square() + log_variance.exp() - log_variance - 1.0;
     terms.sum(None) * (0.5 / mean.size()[0] as f64)

@@ -3,14 +3,18 @@
 //! Four 4x4 convolutions of stride 2 without padding, a ReLU after each, and one linear layer:
 //! 1x72x128 → 32x35x63 → 64x16x30 → 128x7x14 → 256x2x6 → `vae.latent`.
 //!
-//! Images lie channels-last here: a kernel row then covers one contiguous run of memory, and a convolution is one product that reads its windows where they
-//! lie. PyTorch's channels-first weights are rearranged once, when a snapshot arrives.
+//! Images lie channels-last here: a kernel row then covers one contiguous run of memory, and a
+//! convolution is one product that reads its windows where they lie. PyTorch's channels-first
+//! weights are rearranged once, when a snapshot arrives.
 //!
-//! In [`Precision::Bf16`] the second to fourth convolution, 96 % of the work, multiply pairs of bfloat16; everything else is f32 as ever.
+//! In [`Precision::Bf16`] the second to fourth convolution, 96 % of the work, multiply pairs of
+//! bfloat16; everything else is f32 as ever.
 
 use skein_kernels::{Finish, Isa, Matrix, Pair, Panels, Rows, Start, Team, Windows, product};
 use skein_protocol::config::Precision;
-use skein_protocol::snapshot::{ENCODER_CHANNELS as CHANNELS, ENCODER_FEATURES as FEATURES, ENCODER_KERNEL as KERNEL};
+use skein_protocol::snapshot::{
+    ENCODER_CHANNELS as CHANNELS, ENCODER_FEATURES as FEATURES, ENCODER_KERNEL as KERNEL,
+};
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LONGEST_LATENT, LatentCode};
 
 use crate::linear::Linear;
@@ -35,7 +39,8 @@ pub struct EncoderScratch {
 }
 
 impl Encoder {
-    /// Takes the parameters by their names in a snapshot (`encoder.conv1.weight`, …), each a slice in PyTorch's order.
+    /// Takes the parameters by their names in a snapshot (`encoder.conv1.weight`, …), each a slice
+    /// in PyTorch's order.
     ///
     /// # Panics
     /// When a tensor has not the length its shape asks for.
@@ -43,15 +48,27 @@ impl Encoder {
         let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
         let convolutions = std::array::from_fn(|layer| {
             let name = format!("encoder.conv{}", layer + 1);
-            let (weights, bias) = (tensor(&format!("{name}.weight")), tensor(&format!("{name}.bias")));
+            let (weights, bias) = (
+                tensor(&format!("{name}.weight")),
+                tensor(&format!("{name}.bias")),
+            );
             // One channel makes no pairs.
-            let precision = if layer == 0 { Precision::F32 } else { precision };
-            let convolution = Convolution::new(isa, precision, size, CHANNELS[layer], weights, bias);
+            let precision = if layer == 0 {
+                Precision::F32
+            } else {
+                precision
+            };
+            let convolution =
+                Convolution::new(isa, precision, size, CHANNELS[layer], weights, bias);
             size = convolution.windows.positions();
             convolution
         });
         let pixels = size[0] * size[1];
-        assert_eq!(pixels * CHANNELS[4], FEATURES, "the last image is all features");
+        assert_eq!(
+            pixels * CHANNELS[4],
+            FEATURES,
+            "the last image is all features"
+        );
         let weights: Vec<f32> = tensor("encoder.mean.weight")
             .chunks_exact(FEATURES)
             .flat_map(|features| transposed(features, CHANNELS[4], pixels))
@@ -62,8 +79,8 @@ impl Encoder {
         }
     }
 
-    /// Mean of the latent code of a depth image, `[72, 128]`, top row first, 0 nearest and 255 farthest; the network sees it scaled to [0, 1]. Behind the code's
-    /// numbers there are zeros.
+    /// Mean of the latent code of a depth image, `[72, 128]`, top row first, 0 nearest and 255
+    /// farthest; the network sees it scaled to [0, 1]. Behind the code's numbers there are zeros.
     pub fn encode(&self, image: &[u8; IMAGE_PIXELS], scratch: &mut EncoderScratch) -> LatentCode {
         let EncoderScratch {
             images: [input, output],
@@ -118,8 +135,16 @@ enum Weights {
 }
 
 impl Convolution {
-    /// On an image of `size`, height and width. `weights`: `[output channels, input channels, 4, 4]`; `bias`: `[output channels]`.
-    fn new(isa: Isa, precision: Precision, size: [usize; 2], channels: usize, weights: &[f32], bias: &[f32]) -> Self {
+    /// On an image of `size`, height and width. `weights`: `[output channels, input channels, 4,
+    /// 4]`; `bias`: `[output channels]`.
+    fn new(
+        isa: Isa,
+        precision: Precision,
+        size: [usize; 2],
+        channels: usize,
+        weights: &[f32],
+        bias: &[f32],
+    ) -> Self {
         let len = KERNEL * KERNEL * channels;
         assert_eq!(
             weights.len(),
@@ -156,10 +181,22 @@ impl Convolution {
         output.resize(self.windows.count() * self.bias.len(), 0.0);
         let (start, finish) = (Start::Bias(&self.bias), Finish::Rectified);
         match &self.weights {
-            Weights::Single(weights) => product(Rows::Windows(&self.windows, input), weights, start, finish, output),
+            Weights::Single(weights) => product(
+                Rows::Windows(&self.windows, input),
+                weights,
+                start,
+                finish,
+                output,
+            ),
             Weights::Half(weights) => {
                 Pair::all_of(self.isa, input, pairs);
-                product(Rows::Windows(&self.windows, pairs), weights, start, finish, output);
+                product(
+                    Rows::Windows(&self.windows, pairs),
+                    weights,
+                    start,
+                    finish,
+                    output,
+                );
             }
         }
     }
@@ -167,7 +204,11 @@ impl Convolution {
 
 /// `[rows, columns]` row-major to `[columns, rows]`.
 fn transposed(matrix: &[f32], rows: usize, columns: usize) -> Vec<f32> {
-    assert_eq!(matrix.len(), rows * columns, "the matrix has the stated shape");
+    assert_eq!(
+        matrix.len(),
+        rows * columns,
+        "the matrix has the stated shape"
+    );
     (0..columns)
         .flat_map(|column| (0..rows).map(move |row| matrix[row * columns + column]))
         .collect()
@@ -186,7 +227,9 @@ mod tests {
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let mut values = vec![0.0; layout.values()];
         for tensor in layout.tensors() {
-            let bound = (tensor.shape[0] as f32 / tensor.range.len() as f32).sqrt().min(0.5);
+            let bound = (tensor.shape[0] as f32 / tensor.range.len() as f32)
+                .sqrt()
+                .min(0.5);
             values[tensor.range.clone()].fill_with(|| rng.random_range(-bound..bound));
         }
         (layout, values)
@@ -210,19 +253,26 @@ mod tests {
 
     /// The definition, channels first and in f64, index by index.
     fn naive(tensor: &impl Fn(&str) -> Vec<f32>, image: &[u8; IMAGE_PIXELS]) -> Vec<f64> {
-        let mut input: Vec<f64> = image.iter().map(|&depth| f64::from(depth) / 255.0).collect();
+        let mut input: Vec<f64> = image
+            .iter()
+            .map(|&depth| f64::from(depth) / 255.0)
+            .collect();
         for layer in 0..4 {
             let weights = tensor(&format!("encoder.conv{}.weight", layer + 1));
             let bias = tensor(&format!("encoder.conv{}.bias", layer + 1));
             let ([height, width], [rows, columns]) = (SIZES[layer], SIZES[layer + 1]);
             let mut output = Vec::new();
             for out in 0..CHANNELS[layer + 1] {
-                for (row, column) in (0..rows * columns).map(|pixel| (pixel / columns, pixel % columns)) {
+                for (row, column) in
+                    (0..rows * columns).map(|pixel| (pixel / columns, pixel % columns))
+                {
                     let mut sum = f64::from(bias[out]);
                     for channel in 0..CHANNELS[layer] {
                         for (y, x) in (0..16).map(|tap| (tap / 4, tap % 4)) {
-                            let weight = weights[((out * CHANNELS[layer] + channel) * 4 + y) * 4 + x];
-                            let pixel = input[(channel * height + 2 * row + y) * width + 2 * column + x];
+                            let weight =
+                                weights[((out * CHANNELS[layer] + channel) * 4 + y) * 4 + x];
+                            let pixel =
+                                input[(channel * height + 2 * row + y) * width + 2 * column + x];
                             sum += f64::from(weight) * pixel;
                         }
                     }
@@ -232,7 +282,12 @@ mod tests {
             input = output;
         }
         let weights = tensor("encoder.mean.weight");
-        let product = |row: &[f32]| row.iter().zip(&input).map(|(&w, x)| f64::from(w) * x).sum::<f64>();
+        let product = |row: &[f32]| {
+            row.iter()
+                .zip(&input)
+                .map(|(&w, x)| f64::from(w) * x)
+                .sum::<f64>()
+        };
         tensor("encoder.mean.bias")
             .iter()
             .zip(weights.chunks_exact(FEATURES))
@@ -246,7 +301,8 @@ mod tests {
             let (layout, values) = parameters(latent_len, seed);
             let tensor = |name: &str| &values[layout.tensor(name).unwrap().range.clone()];
             let latent = |precision| {
-                encoder(&layout, &values, Isa::best(), precision).encode(&image(seed), &mut EncoderScratch::default())
+                encoder(&layout, &values, Isa::best(), precision)
+                    .encode(&image(seed), &mut EncoderScratch::default())
             };
             let expected = naive(&|name: &str| tensor(name).to_vec(), &image(seed));
             assert_eq!(expected.len(), latent_len);
@@ -254,10 +310,14 @@ mod tests {
                 expected.iter().any(|value| value.abs() > 0.02),
                 "a comparison of noughts proves nothing"
             );
-            // Eight bits of precision are 4e-3 of an operand; over many terms, errors mostly cancel.
+            // Eight bits of precision are 4e-3 of an operand; over many terms, errors mostly
+            // cancel.
             for (precision, tolerance) in [(Precision::F32, 1e-5), (Precision::Bf16, 2e-3)] {
                 let code = latent(precision);
-                assert!(code[latent_len..].iter().all(|&value| value == 0.0), "behind the code");
+                assert!(
+                    code[latent_len..].iter().all(|&value| value == 0.0),
+                    "behind the code"
+                );
                 for (found, expected) in code.iter().zip(&expected) {
                     let error = (f64::from(*found) - expected).abs();
                     assert!(error < tolerance, "{found} {expected}, {precision}");
@@ -274,15 +334,20 @@ mod tests {
         let first = encoder.encode(&image(1), &mut scratch);
         assert_ne!(first, encoder.encode(&image(2), &mut scratch));
         assert_eq!(first, encoder.encode(&image(1), &mut scratch));
-        assert_eq!(first, encoder.encode(&image(1), &mut EncoderScratch::default()));
+        assert_eq!(
+            first,
+            encoder.encode(&image(1), &mut EncoderScratch::default())
+        );
     }
 
     #[test]
     fn every_instruction_set_gives_the_same_bits() {
         let (layout, values) = parameters(16, 3);
         for precision in [Precision::F32, Precision::Bf16] {
-            let latent =
-                |isa| encoder(&layout, &values, isa, precision).encode(&image(1), &mut EncoderScratch::default());
+            let latent = |isa| {
+                encoder(&layout, &values, isa, precision)
+                    .encode(&image(1), &mut EncoderScratch::default())
+            };
             for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
                 assert_eq!(latent(isa), latent(Isa::Portable), "{isa}, {precision}");
             }

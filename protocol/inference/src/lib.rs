@@ -1,9 +1,11 @@
 //! Native inference: depth image to latent code, observation to action, without libtorch.
 //!
-//! An actor looks at one image at a time, where a tensor library spends more time on itself than on the network. So the two networks are written out over
-//! the kernels that the learner trains them with; the whole-system tests hold them to the learner's. The learner uses the same encoder to make stored codes anew,
-//! so that all codes in its replay are made alike. A [`Network`] is immutable and shared between threads; what a thread writes
-//! to is its own [`Scratch`], allocated once.
+//! An actor looks at one image at a time, where a tensor library spends more time on itself than on
+//! the network. So the two networks are written out over the kernels that the learner trains them
+//! with; the whole-system tests hold them to the learner's. The learner uses the same encoder to
+//! make stored codes anew, so that all codes in its replay are made alike. A [`Network`] is
+//! immutable and shared between threads; what a thread writes to is its own [`Scratch`], allocated
+//! once.
 
 mod encoder;
 mod linear;
@@ -54,7 +56,8 @@ impl Network {
     /// Rearranges a snapshot's parameters; images are to be encoded in `precision`.
     ///
     /// # Panics
-    /// When the snapshot is not of this layout; [`Snapshot::receive`] and [`Snapshot::load`] let none such through.
+    /// When the snapshot is not of this layout; [`Snapshot::receive`] and [`Snapshot::load`] let
+    /// none such through.
     pub fn new(snapshot: &Snapshot, layout: &SnapshotLayout, precision: Precision) -> Self {
         Self {
             version: snapshot.version,

@@ -21,7 +21,10 @@ impl Linear {
             "as many weights for each output"
         );
         Self {
-            weights: Panels::of(isa, Matrix::of_rows(weights, weights.len() / bias.len()).transposed()),
+            weights: Panels::of(
+                isa,
+                Matrix::of_rows(weights, weights.len() / bias.len()).transposed(),
+            ),
             bias: bias.to_vec(),
         }
     }

@@ -1,4 +1,5 @@
-//! The policy: observation to action, by a squashed Gaussian (arXiv:1812.05905, appendix C) or with noise added (arXiv:1802.09477).
+//! The policy: observation to action, by a squashed Gaussian (arXiv:1812.05905, appendix C) or with
+//! noise added (arXiv:1802.09477).
 //!
 //! Three hidden layers with ReLU, then what [`PolicyHead`] says.
 
@@ -44,14 +45,19 @@ pub enum ActionDistribution {
 }
 
 impl Policy {
-    /// Takes the parameters by their names in a snapshot (`policy.layer1.weight`, …), each a slice in PyTorch's order.
+    /// Takes the parameters by their names in a snapshot (`policy.layer1.weight`, …), each a slice
+    /// in PyTorch's order.
     ///
     /// # Panics
     /// When a tensor has not the length its shape asks for.
     pub fn new<'a>(isa: Isa, head: PolicyHead, tensor: impl Fn(&str) -> &'a [f32]) -> Self {
         let layers = std::array::from_fn(|index| {
             let name = format!("policy.layer{}", index + 1);
-            Linear::new(isa, tensor(&format!("{name}.weight")), tensor(&format!("{name}.bias")))
+            Linear::new(
+                isa,
+                tensor(&format!("{name}.weight")),
+                tensor(&format!("{name}.bias")),
+            )
         });
         Self { layers, head }
     }
@@ -60,7 +66,11 @@ impl Policy {
     ///
     /// # Panics
     /// When `observation` has not the length the policy was trained on.
-    pub fn distribution(&self, observation: &[f32], scratch: &mut PolicyScratch) -> ActionDistribution {
+    pub fn distribution(
+        &self,
+        observation: &[f32],
+        scratch: &mut PolicyScratch,
+    ) -> ActionDistribution {
         let [input, output] = &mut scratch.values;
         input.clear();
         input.extend_from_slice(observation);
@@ -75,7 +85,9 @@ impl Policy {
         match self.head {
             PolicyHead::SquashedGaussian => ActionDistribution::SquashedGaussian {
                 mean: std::array::from_fn(|axis| outputs[axis]),
-                log_std: std::array::from_fn(|axis| outputs[ACTION + axis].clamp(LOG_STD.0, LOG_STD.1)),
+                log_std: std::array::from_fn(|axis| {
+                    outputs[ACTION + axis].clamp(LOG_STD.0, LOG_STD.1)
+                }),
             },
             PolicyHead::Noisy(std) => ActionDistribution::Noisy {
                 action: std::array::from_fn(|axis| outputs[axis].tanh()),
@@ -99,7 +111,9 @@ impl ActionDistribution {
         std::array::from_fn(|axis| {
             let noise: f32 = StandardNormal.sample(rng);
             match self {
-                Self::SquashedGaussian { mean, log_std } => (mean[axis] + log_std[axis].exp() * noise).tanh(),
+                Self::SquashedGaussian { mean, log_std } => {
+                    (mean[axis] + log_std[axis].exp() * noise).tanh()
+                }
                 Self::Noisy { action, std } => (action[axis] + std * noise).clamp(-1.0, 1.0),
             }
         })
@@ -153,13 +167,20 @@ mod tests {
                 .map(|out| {
                     let row = &weights[out * values.len()..][..values.len()];
                     let sum = bias[out] + row.iter().zip(&values).map(|(w, x)| w * x).sum::<f32>();
-                    if layer < POLICY_LAYERS { sum.max(0.0) } else { sum }
+                    if layer < POLICY_LAYERS {
+                        sum.max(0.0)
+                    } else {
+                        sum
+                    }
                 })
                 .collect();
         }
         let (mean, log_std) = gaussian(&policy(), &observation);
         for axis in 0..ACTION {
-            assert!((mean[axis] - values[axis]).abs() < 1e-6, "{mean:?} {values:?}");
+            assert!(
+                (mean[axis] - values[axis]).abs() < 1e-6,
+                "{mean:?} {values:?}"
+            );
             assert!(
                 (log_std[axis] - values[ACTION + axis]).abs() < 1e-6,
                 "{log_std:?} {values:?}"
@@ -178,9 +199,17 @@ mod tests {
         assert!(draws.iter().flatten().all(|command| command.abs() <= 1.0));
         let before_squashing: Vec<f32> = draws.iter().map(|action| action[0].atanh()).collect();
         let mean = before_squashing.iter().sum::<f32>() / draws.len() as f32;
-        let variance = before_squashing.iter().map(|x| (x - mean).powi(2)).sum::<f32>() / draws.len() as f32;
+        let variance = before_squashing
+            .iter()
+            .map(|x| (x - mean).powi(2))
+            .sum::<f32>()
+            / draws.len() as f32;
         assert!((mean - 0.5).abs() < 0.01, "{mean}");
-        assert!((variance.sqrt() - (-1f32).exp()).abs() < 0.01, "{}", variance.sqrt());
+        assert!(
+            (variance.sqrt() - (-1f32).exp()).abs() < 0.01,
+            "{}",
+            variance.sqrt()
+        );
     }
 
     #[test]
@@ -214,8 +243,15 @@ mod tests {
         assert_eq!(distribution.mode(), [0.2, 0.95]);
         let mut rng = Pcg64Mcg::seed_from_u64(1);
         let draws: Vec<_> = (0..20_000).map(|_| distribution.sample(&mut rng)).collect();
-        let (mean, count) = (draws.iter().map(|draw| draw[0]).sum::<f32>() / 2e4, draws.len() as f32);
-        let variance = draws.iter().map(|draw| (draw[0] - mean).powi(2)).sum::<f32>() / count;
+        let (mean, count) = (
+            draws.iter().map(|draw| draw[0]).sum::<f32>() / 2e4,
+            draws.len() as f32,
+        );
+        let variance = draws
+            .iter()
+            .map(|draw| (draw[0] - mean).powi(2))
+            .sum::<f32>()
+            / count;
         assert!(
             (mean - 0.2).abs() < 3e-3 && (variance.sqrt() - 0.1).abs() < 3e-3,
             "{mean} {variance}"

@@ -1,6 +1,8 @@
-//! What encoding an image costs as images grow: the encoder's four convolutions on the kernels it is made of, one image at a time.
+//! What encoding an image costs as images grow: the encoder's four convolutions on the kernels it
+//! is made of, one image at a time.
 //!
-//! The system's images have one size; the kernels have none, so the same layers can be tried on others.
+//! The system's images have one size; the kernels have none, so the same layers can be tried on
+//! others.
 
 use std::hint::black_box;
 
@@ -22,7 +24,14 @@ struct Layer {
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     let mut group = criterion.benchmark_group("image_size");
-    for [height, width] in [[54, 96], [72, 128], [108, 192], [144, 256], [216, 384], [288, 512]] {
+    for [height, width] in [
+        [54, 96],
+        [72, 128],
+        [108, 192],
+        [144, 256],
+        [216, 384],
+        [288, 512],
+    ] {
         let (mut layers, operations) = encoder([height, width]);
         let image = vec![0.5; height * width];
         group.throughput(Throughput::Elements(operations));

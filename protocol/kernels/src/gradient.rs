@@ -1,4 +1,5 @@
-//! The gradient of a layer's weights: what came in, times what flows back, summed over everything the weights were used for.
+//! The gradient of a layer's weights: what came in, times what flows back, summed over everything
+//! the weights were used for.
 
 use std::cell::RefCell;
 use std::ops::Range;
@@ -11,7 +12,8 @@ use crate::windows::Windows;
 
 /// Terms done before all elements are put back: both operands' parts then stay in the caches.
 const TERMS_AT_ONCE: usize = 512;
-/// Numbers between two tiles of the left operand: without them, all tiles would begin in the same few sets of the cache.
+/// Numbers between two tiles of the left operand: without them, all tiles would begin in the same
+/// few sets of the cache.
 const PADDING: usize = 16;
 
 /// The right operand, a row for each term.
@@ -77,9 +79,11 @@ impl<'a> Terms<'a> {
     }
 }
 
-/// `output = leftᵀ · right`, `[left's columns, right's columns]`, row-major: the sum over terms, in order, of one row of each.
+/// `output = leftᵀ · right`, `[left's columns, right's columns]`, row-major: the sum over terms, in
+/// order, of one row of each.
 ///
-/// Members of the team share the columns; no sum is split, so that the bits do not depend on how many they are.
+/// Members of the team share the columns; no sum is split, so that the bits do not depend on how
+/// many they are.
 ///
 /// # Panics
 /// When lengths do not belong together.
@@ -138,8 +142,13 @@ impl Job<'_> {
         SCRATCH.with_borrow_mut(|scratch| {
             for first in (0..terms).step_by(TERMS_AT_ONCE) {
                 let terms = first..(first + TERMS_AT_ONCE).min(terms);
-                let begin = if first == 0 { Begin::Zero } else { Begin::Output };
-                // SAFETY: `gradient` has asked for the instructions and looked at all lengths; this member alone writes its columns.
+                let begin = if first == 0 {
+                    Begin::Zero
+                } else {
+                    Begin::Output
+                };
+                // SAFETY: `gradient` has asked for the instructions and looked at all lengths; this
+                // member alone writes its columns.
                 unsafe { do_block(self, terms, scratch, begin) };
             }
         });
@@ -157,7 +166,8 @@ impl Job<'_> {
 }
 
 /// # Safety
-/// The instructions of `job` are there; the terms are; nobody else touches the job's columns of the output.
+/// The instructions of `job` are there; the terms are; nobody else touches the job's columns of the
+/// output.
 unsafe fn do_block(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
     // SAFETY: as the caller says.
     unsafe {
@@ -186,7 +196,12 @@ unsafe fn avx2(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin:
 }
 
 #[inline(always)]
-unsafe fn block<S: Simd<Term = f32>>(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
+unsafe fn block<S: Simd<Term = f32>>(
+    job: &Job<'_>,
+    terms: Range<usize>,
+    scratch: &mut Scratch,
+    begin: Begin,
+) {
     let (count, rows) = (terms.len(), job.left.columns());
     let apart = count * S::ROWS + PADDING;
     let left = scratch.left.of_len(rows.div_ceil(S::ROWS) * apart);
@@ -206,11 +221,16 @@ unsafe fn block<S: Simd<Term = f32>>(job: &Job<'_>, terms: Range<usize>, scratch
                     data: left[row / S::ROWS * apart..].as_ptr(),
                     stride: S::ROWS,
                 },
-                runs: [Run { offset: 0, len: count }],
+                runs: [Run {
+                    offset: 0,
+                    len: count,
+                }],
                 right: right.as_ptr(),
                 panel,
                 begin,
-                output: job.output.wrapping_add(row * job.right.columns() + panel.first),
+                output: job
+                    .output
+                    .wrapping_add(row * job.right.columns() + panel.first),
                 stride: job.right.columns(),
             };
             // SAFETY: as the caller says.
@@ -245,7 +265,8 @@ unsafe fn tile_of<S: Simd<Term = f32>, const M: usize>(tile: Tile) {
     }
 }
 
-/// Lays out the left operand's columns as tiles that begin `apart` numbers from each other, term by term. Behind the last column lies whatever was there.
+/// Lays out the left operand's columns as tiles that begin `apart` numbers from each other, term by
+/// term. Behind the last column lies whatever was there.
 #[inline(always)]
 fn pack_left<S: Simd>(left: Matrix<'_>, terms: Range<usize>, apart: usize, into: &mut [f32]) {
     let (count, columns) = (terms.len(), left.columns());
@@ -255,7 +276,8 @@ fn pack_left<S: Simd>(left: Matrix<'_>, terms: Range<usize>, apart: usize, into:
         let row = left.row(term);
         for tile in 0..whole {
             let (from, to) = (tile * S::ROWS, tile * apart + index * S::ROWS);
-            // SAFETY: the row has `columns` numbers, `into` room for `count` terms of as many tiles as they fill, as asserted.
+            // SAFETY: the row has `columns` numbers, `into` room for `count` terms of as many tiles
+            // as they fill, as asserted.
             unsafe {
                 into.as_mut_ptr()
                     .add(to)
@@ -272,7 +294,8 @@ fn pack_left<S: Simd>(left: Matrix<'_>, terms: Range<usize>, apart: usize, into:
 /// Lays out the panel's columns of the right operand, term by term.
 ///
 /// # Safety
-/// The terms that begin at `starts` have the panel's columns; `into` has room for as many rows of the panel's width.
+/// The terms that begin at `starts` have the panel's columns; `into` has room for as many rows of
+/// the panel's width.
 #[inline(always)]
 unsafe fn pack_right<S: Simd>(right: Terms<'_>, starts: &[usize], panel: Panel, into: &mut [f32]) {
     let data = right.data().as_ptr();

@@ -1,15 +1,17 @@
-//! Which vector instructions are used, chosen once at run time, and what a product's inner loop needs of them.
+//! Which vector instructions are used, chosen once at run time, and what a product's inner loop
+//! needs of them.
 
 use std::fmt;
 use std::sync::OnceLock;
 
 /// A set of vector instructions that the kernels are written for.
 ///
-/// Every kernel does the same operations on every number in the same order whichever is used: only how many numbers are in a register differs. So
-/// the results are equal bit for bit.
+/// Every kernel does the same operations on every number in the same order whichever is used: only
+/// how many numbers are in a register differs. So the results are equal bit for bit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Isa {
-    /// Whatever the compiler makes of plain arithmetic. Fused multiply-add is a call where the processor lacks it: slow, and equal.
+    /// Whatever the compiler makes of plain arithmetic. Fused multiply-add is a call where the
+    /// processor lacks it: slow, and equal.
     Portable,
     /// 256 bits: AVX2 and FMA.
     Avx2,
@@ -47,7 +49,9 @@ impl Isa {
                     && is_x86_feature_detected!("avx512dq")
             }
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512Bf16 => Self::Avx512.is_available() && is_x86_feature_detected!("avx512bf16"),
+            Self::Avx512Bf16 => {
+                Self::Avx512.is_available() && is_x86_feature_detected!("avx512bf16")
+            }
             #[cfg(not(target_arch = "x86_64"))]
             _ => false,
         }
@@ -76,7 +80,8 @@ impl fmt::Display for Isa {
 /// Registers of one kind, as the inner loops need them.
 ///
 /// # Safety
-/// Every function asks for the processor to have the instructions, and those with a pointer for [`Simd::LANES`] numbers or terms there.
+/// Every function asks for the processor to have the instructions, and those with a pointer for
+/// [`Simd::LANES`] numbers or terms there.
 pub trait Simd {
     /// What is multiplied: a number, or a pair of halves.
     type Term: Copy;
@@ -94,7 +99,8 @@ pub trait Simd {
     unsafe fn store(to: *mut f32, vector: Self::Vector);
     /// Asks for the cache line at an address, which need not be valid; does nothing else.
     unsafe fn fetch(from: *const f32);
-    /// a · b + c for terms a and b: rounded once if they are numbers, after each product if they are pairs.
+    /// a · b + c for terms a and b: rounded once if they are numbers, after each product if they
+    /// are pairs.
     unsafe fn fused(a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
     /// Zero for what is below zero. Not a number stays what it is.
     unsafe fn rectified(vector: Self::Vector) -> Self::Vector;
@@ -129,7 +135,8 @@ impl Simd for Scalar8 {
 
     #[inline(always)]
     unsafe fn load(from: *const f32) -> Self::Vector {
-        // SAFETY: the caller vouches for eight numbers; an array of them needs no other alignment than they do.
+        // SAFETY: the caller vouches for eight numbers; an array of them needs no other alignment
+        // than they do.
         unsafe { from.cast::<Self::Vector>().read() }
     }
 
@@ -220,7 +227,8 @@ pub(crate) mod x86 {
 
         #[inline(always)]
         unsafe fn rectified(vector: __m256) -> __m256 {
-            // SAFETY: as for `splat`. Where the two do not compare, the instruction gives its second operand.
+            // SAFETY: as for `splat`. Where the two do not compare, the instruction gives its
+            // second operand.
             unsafe { _mm256_max_ps(_mm256_setzero_ps(), vector) }
         }
 
@@ -233,7 +241,8 @@ pub(crate) mod x86 {
 
     pub struct Avx512;
 
-    // 12 x 2 accumulators, 2 registers for the panel's row; broadcasts are operands in memory: 26 of 32.
+    // 12 x 2 accumulators, 2 registers for the panel's row; broadcasts are operands in memory: 26
+    // of 32.
     impl Simd for Avx512 {
         type Term = f32;
         type Vector = __m512;
@@ -284,14 +293,20 @@ pub(crate) mod x86 {
 
         #[inline(always)]
         unsafe fn rectified(vector: __m512) -> __m512 {
-            // SAFETY: as for `splat`. Where the two do not compare, the instruction gives its second operand.
+            // SAFETY: as for `splat`. Where the two do not compare, the instruction gives its
+            // second operand.
             unsafe { _mm512_max_ps(_mm512_setzero_ps(), vector) }
         }
 
         #[inline(always)]
         unsafe fn gated(vector: __m512, by: __m512) -> __m512 {
             // SAFETY: as for `splat`.
-            unsafe { _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(by, _mm512_setzero_ps()), vector) }
+            unsafe {
+                _mm512_maskz_mov_ps(
+                    _mm512_cmp_ps_mask::<_CMP_GT_OQ>(by, _mm512_setzero_ps()),
+                    vector,
+                )
+            }
         }
     }
 
@@ -386,12 +401,18 @@ pub(crate) mod x86 {
         }
     }
 
-    /// Writes `terms` numbers of eight columns side by side into rows that lie `stride` apart; `terms` is a multiple of eight.
+    /// Writes `terms` numbers of eight columns side by side into rows that lie `stride` apart;
+    /// `terms` is a multiple of eight.
     ///
     /// # Safety
     /// AVX2 is there; so are the numbers and, from `into` on, eight numbers in each row.
     #[target_feature(enable = "avx2")]
-    pub(crate) unsafe fn interleave(columns: [*const f32; 8], terms: usize, into: *mut f32, stride: usize) {
+    pub(crate) unsafe fn interleave(
+        columns: [*const f32; 8],
+        terms: usize,
+        into: *mut f32,
+        stride: usize,
+    ) {
         for first in (0..terms).step_by(8) {
             // SAFETY: as the caller says.
             let rows = columns.map(|column| unsafe { _mm256_loadu_ps(column.add(first)) });
@@ -405,7 +426,10 @@ pub(crate) mod x86 {
                 }
             });
             let quads: [__m256; 8] = std::array::from_fn(|row| {
-                let (a, b) = (pairs[row & 4 | (row >> 1 & 1)], pairs[row & 4 | 2 | (row >> 1 & 1)]);
+                let (a, b) = (
+                    pairs[row & 4 | (row >> 1 & 1)],
+                    pairs[row & 4 | 2 | (row >> 1 & 1)],
+                );
                 if row & 1 == 0 {
                     _mm256_shuffle_ps::<0x44>(a, b)
                 } else {

@@ -1,15 +1,19 @@
-//! Functions of one number that loops over many can be vectorised with, equal bit for bit on every processor; and the loops themselves.
+//! Functions of one number that loops over many can be vectorised with, equal bit for bit on every
+//! processor; and the loops themselves.
 
 use crate::isa::Isa;
 
-/// e to the power of `x`, within two units in the last place; infinite above 88.72, zero below -87.33. Not a number stays what it is.
+/// e to the power of `x`, within two units in the last place; infinite above 88.72, zero below
+/// -87.33. Not a number stays what it is.
 ///
-/// x = n ln 2 + r, |r| ≤ ½ ln 2; e^r by its Taylor polynomial (degree 7: remainder below 1e-8), 2ⁿ by its bits.
+/// x = n ln 2 + r, |r| ≤ ½ ln 2; e^r by its Taylor polynomial (degree 7: remainder below 1e-8), 2ⁿ
+/// by its bits.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
     const LN_2_HIGH: f32 = 0.693_359_4;
     const LN_2_LOW: f32 = -2.121_944_4e-4;
-    /// Added and taken away again, it leaves the nearest whole number, as f32 has no fractions up there.
+    /// Added and taken away again, it leaves the nearest whole number, as f32 has no fractions up
+    /// there.
     const ROUND: f32 = 12_582_912.0;
     const LARGEST: f32 = 88.722_83;
     const SMALLEST: f32 = -87.336_54;
@@ -17,7 +21,15 @@ pub fn exp(x: f32) -> f32 {
     let n = bounded.mul_add(std::f32::consts::LOG2_E, ROUND) - ROUND;
     let r = n.mul_add(-LN_2_LOW, n.mul_add(-LN_2_HIGH, bounded));
     let mut sum = 1.0 / 5040.0;
-    for factor in [1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0] {
+    for factor in [
+        1.0 / 720.0,
+        1.0 / 120.0,
+        1.0 / 24.0,
+        1.0 / 6.0,
+        0.5,
+        1.0,
+        1.0,
+    ] {
         sum = r.mul_add(sum, factor);
     }
     // In two halves: 2ⁿ alone would overflow at n = 128, where e^x does not yet.
@@ -42,8 +54,10 @@ pub fn sigmoid(x: f32) -> f32 {
 }
 
 impl Isa {
-    /// Runs `work` compiled for these instructions: loops in it are vectorised with them, `mul_add` is an instruction. `work` is a closure of loops marked
-    /// `#[inline(always)]`, and all that it calls is marked so too: left to itself, the compiler leaves a long one outside, compiled for the plainest processor.
+    /// Runs `work` compiled for these instructions: loops in it are vectorised with them, `mul_add`
+    /// is an instruction. `work` is a closure of loops marked `#[inline(always)]`, and all that it
+    /// calls is marked so too: left to itself, the compiler leaves a long one outside, compiled for
+    /// the plainest processor.
     ///
     /// # Panics
     /// When this machine does not have the instructions.
@@ -87,7 +101,10 @@ mod tests {
         for x in range().filter(|x| (-87.3..88.7).contains(x)) {
             let (found, exact) = (exp(x), f64::from(x).exp());
             let error = (f64::from(found) - exact).abs() / exact;
-            assert!(error < 2.4e-7, "exp({x}) = {found}, not {exact}: off by {error}");
+            assert!(
+                error < 2.4e-7,
+                "exp({x}) = {found}, not {exact}: off by {error}"
+            );
         }
     }
 

@@ -1,7 +1,9 @@
-//! Halves: products of 16-bit numbers, at twice the rate where the processor has instructions for them.
+//! Halves: products of 16-bit numbers, at twice the rate where the processor has instructions for
+//! them.
 //!
-//! A bfloat16 is the upper half of an f32: its range, and eight bits of its precision. Two of them are one term of a product, multiplied pair by pair and summed
-//! in f32. What this costs in accuracy is the rounding of the operands to eight bits; sums are as exact as those of f32.
+//! A bfloat16 is the upper half of an f32: its range, and eight bits of its precision. Two of them
+//! are one term of a product, multiplied pair by pair and summed in f32. What this costs in
+//! accuracy is the rounding of the operands to eight bits; sums are as exact as those of f32.
 
 use crate::isa::{Isa, Scalar8, Simd};
 
@@ -19,7 +21,10 @@ impl Pair {
 
     /// The two numbers.
     pub fn numbers(self) -> [f32; 2] {
-        [f32::from_bits(self.0 << 16), f32::from_bits(self.0 & 0xffff_0000)]
+        [
+            f32::from_bits(self.0 << 16),
+            f32::from_bits(self.0 & 0xffff_0000),
+        ]
     }
 
     /// The same bits, in the type that registers are filled with.
@@ -79,7 +84,8 @@ impl Halves for Scalar8 {
     }
 }
 
-/// `S` for pairs. The second of a pair is added first, and each product rounds, as the instruction made for it does. (That one takes numbers below 1.2e-38 for zero.)
+/// `S` for pairs. The second of a pair is added first, and each product rounds, as the instruction
+/// made for it does. (That one takes numbers below 1.2e-38 for zero.)
 pub struct Apart<S>(S);
 
 impl<S: Halves> Simd for Apart<S> {
@@ -102,7 +108,8 @@ impl<S: Halves> Simd for Apart<S> {
 
     #[inline(always)]
     unsafe fn load_terms(from: *const Pair) -> S::Vector {
-        // SAFETY: the caller vouches for instructions and memory, here and below; a pair is as large as a number.
+        // SAFETY: the caller vouches for instructions and memory, here and below; a pair is as
+        // large as a number.
         unsafe { S::load(from.cast()) }
     }
 
@@ -206,14 +213,20 @@ mod tests {
             (f32::MAX, f32::INFINITY),
             (0.0, 0.0),
         ] {
-            assert_eq!(Pair::of(number, -number).numbers(), [nearest, -nearest], "{number}");
+            assert_eq!(
+                Pair::of(number, -number).numbers(),
+                [nearest, -nearest],
+                "{number}"
+            );
         }
         assert!(Pair::of(f32::from_bits(0x7f80_0001), 0.0).numbers()[0].is_nan());
     }
 
     #[test]
     fn pairs_are_the_same_bits_with_all_instructions() {
-        let numbers: Vec<f32> = (0..1000).map(|index| (index as f32 * 0.7133).sin() * 10.0).collect();
+        let numbers: Vec<f32> = (0..1000)
+            .map(|index| (index as f32 * 0.7133).sin() * 10.0)
+            .collect();
         let mut expected = Vec::new();
         Pair::all_of(Isa::Portable, &numbers, &mut expected);
         assert_eq!(expected[3], Pair::of(numbers[6], numbers[7]));

@@ -1,14 +1,17 @@
-//! The right operand of a product, packed so that the inner loop reads it from the first byte to the last.
+//! The right operand of a product, packed so that the inner loop reads it from the first byte to
+//! the last.
 //!
-//! Columns are gathered in panels as wide as a tile, and each panel is laid out term by term. Left where it lies, a matrix whose rows are a power of two apart
-//! would fall into a few sets of the cache.
+//! Columns are gathered in panels as wide as a tile, and each panel is laid out term by term. Left
+//! where it lies, a matrix whose rows are a power of two apart would fall into a few sets of the
+//! cache.
 
 use std::ops::Range;
 
 use crate::isa::Isa;
 use crate::pair::Term;
 
-/// A matrix seen in either direction: element (row, column) lies at `row · row_stride + column · column_stride`.
+/// A matrix seen in either direction: element (row, column) lies at `row · row_stride + column ·
+/// column_stride`.
 #[derive(Debug, Clone, Copy)]
 pub struct Matrix<'a, T = f32> {
     data: &'a [T],
@@ -54,7 +57,11 @@ impl<'a, T> Matrix<'a, T> {
     /// # Panics
     /// When there are not so many.
     pub fn columns_of(self, columns: Range<usize>) -> Self {
-        assert!(columns.end <= self.columns, "columns {columns:?} of {}", self.columns);
+        assert!(
+            columns.end <= self.columns,
+            "columns {columns:?} of {}",
+            self.columns
+        );
         Self {
             data: &self.data[columns.start * self.column_stride..],
             columns: columns.len(),
@@ -103,7 +110,8 @@ impl<T: Term> Aligned<T> {
         if self.lines.len() < lines {
             self.lines.resize(lines, Line([T::default(); LINE]));
         }
-        // SAFETY: a line is sixteen numbers and nothing else, so `lines` of them are at least `len` numbers side by side, borrowed from `self`.
+        // SAFETY: a line is sixteen numbers and nothing else, so `lines` of them are at least `len`
+        // numbers side by side, borrowed from `self`.
         unsafe { std::slice::from_raw_parts_mut(self.lines.as_mut_ptr().cast(), len) }
     }
 
@@ -200,7 +208,8 @@ impl<T: Term> Panels<T> {
     /// Where `panel` begins at `term`.
     pub(crate) fn at(&self, panel: Panel, term: usize) -> *const T {
         debug_assert!(term < self.terms.max(1));
-        // Inside the allocation: `pack` has laid out all terms of all panels. Of several panels at once all terms are taken.
+        // Inside the allocation: `pack` has laid out all terms of all panels. Of several panels at
+        // once all terms are taken.
         self.data
             .as_ptr()
             .wrapping_add(panel.first * self.terms + term * panel.width)
@@ -223,7 +232,9 @@ pub(crate) fn panels(isa: Isa, columns: usize) -> impl Iterator<Item = Panel> + 
 
 /// Columns with those laid out behind the last one.
 fn padded(isa: Isa, columns: usize) -> usize {
-    panels(isa, columns).last().map_or(0, |last| last.first + last.width)
+    panels(isa, columns)
+        .last()
+        .map_or(0, |last| last.first + last.width)
 }
 
 fn pack_panel<T: Term>(isa: Isa, matrix: Matrix<'_, T>, panel: Panel, into: &mut [T]) {
@@ -241,7 +252,8 @@ fn pack_panel<T: Term>(isa: Isa, matrix: Matrix<'_, T>, panel: Panel, into: &mut
         }
         return;
     }
-    // Along the columns, which lie side by side when the matrix is seen transposed; eight at a time, so that lines are written whole.
+    // Along the columns, which lie side by side when the matrix is seen transposed; eight at a
+    // time, so that lines are written whole.
     for first in (0..panel.width).step_by(EIGHT) {
         let columns = panel.columns.saturating_sub(first).min(EIGHT);
         let column = |index: usize| &data[(panel.first + first + index) * column_stride..];
@@ -266,8 +278,15 @@ fn pack_panel<T: Term>(isa: Isa, matrix: Matrix<'_, T>, panel: Panel, into: &mut
 /// Columns that are interleaved at a time; a panel's width is a multiple of it.
 const EIGHT: usize = 8;
 
-/// Writes the numbers of eight columns, all of one length, side by side into the rows of `into`, from its column `first` on.
-fn interleave<T: Term>(isa: Isa, columns: [&[T]; EIGHT], into: &mut [T], first: usize, width: usize) {
+/// Writes the numbers of eight columns, all of one length, side by side into the rows of `into`,
+/// from its column `first` on.
+fn interleave<T: Term>(
+    isa: Isa,
+    columns: [&[T]; EIGHT],
+    into: &mut [T],
+    first: usize,
+    width: usize,
+) {
     const { assert!(size_of::<T>() == 4, "pairs are moved as numbers are") };
     let terms = columns[0].len();
     assert!(
@@ -282,7 +301,8 @@ fn interleave<T: Term>(isa: Isa, columns: [&[T]; EIGHT], into: &mut [T], first: 
     #[cfg(target_arch = "x86_64")]
     if isa >= Isa::Avx2 && isa.is_available() {
         done = terms / EIGHT * EIGHT;
-        // SAFETY: the instructions are there, as just asked; so are `terms` numbers of each column and as many rows, as asserted above.
+        // SAFETY: the instructions are there, as just asked; so are `terms` numbers of each column
+        // and as many rows, as asserted above.
         unsafe {
             let columns = columns.map(|column| column.as_ptr().cast());
             crate::isa::x86::interleave(columns, done, into[first..].as_mut_ptr().cast(), width);

@@ -10,8 +10,9 @@ const SUMS: usize = 12;
 /// Rounds of one measurement: about a millisecond.
 const ROUNDS: usize = 1 << 18;
 
-/// Floating-point operations a second that the calling thread reaches in registers alone, a fused multiply-add counted as two. The best of a hundred
-/// measurements: others may be using the machine.
+/// Floating-point operations a second that the calling thread reaches in registers alone, a fused
+/// multiply-add counted as two. The best of a hundred measurements: others may be using the
+/// machine.
 pub fn peak_flops(isa: Isa) -> f64 {
     assert!(isa.is_available(), "{isa} is not to be had here");
     let operations = |lanes: usize| (2 * ROUNDS * SUMS * lanes) as f64;

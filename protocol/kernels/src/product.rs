@@ -9,7 +9,8 @@ use crate::tile::{Begin, End, MOST_ROWS, ROW_PANELS, Run};
 use crate::windows::Windows;
 use crate::work::{Starts, TERMS_AT_ONCE, Work, do_work};
 
-/// Rows that meet all panels before the next ones' turn, and numbers of a matrix's rows: they stay in the second cache meanwhile.
+/// Rows that meet all panels before the next ones' turn, and numbers of a matrix's rows: they stay
+/// in the second cache meanwhile.
 const ROWS_AT_ONCE: usize = 192;
 const NUMBERS_AT_ONCE: usize = 80 << 10;
 
@@ -38,14 +39,17 @@ pub enum Finish<'a> {
     Plain,
     /// Zero if it is below zero (ReLU). Not a number stays what it is.
     Rectified,
-    /// Zero where this matrix, `[rows, columns]`, is not above zero: the gradient through a ReLU whose output it is.
+    /// Zero where this matrix, `[rows, columns]`, is not above zero: the gradient through a ReLU
+    /// whose output it is.
     Gated(&'a [f32]),
 }
 
 /// `output = finish(start + rows · panels)`, `[rows, columns]`; everything row-major.
 ///
-/// Each element is the sum of its terms in order, one fused multiply-add each: the same bits for every instruction set, and however the rows are parted. Of pairs
-/// ([`Pair`](crate::Pair)) the second product is added before the first; the processor's instruction for them takes numbers below 1.2e-38 for zero, the others do not.
+/// Each element is the sum of its terms in order, one fused multiply-add each: the same bits for
+/// every instruction set, and however the rows are parted. Of pairs ([`Pair`](crate::Pair)) the
+/// second product is added before the first; the processor's instruction for them takes numbers
+/// below 1.2e-38 for zero, the others do not.
 ///
 /// # Panics
 /// When lengths do not belong together.
@@ -69,8 +73,9 @@ thread_local! {
     static PANEL: RefCell<Panels> = RefCell::new(Panels::new(Isa::Portable));
 }
 
-/// [`product`] with a right operand that is packed panel by panel, each just before its turn. For weights that change between any two products: packed at once
-/// and kept, they would be written to memory and read back from there.
+/// [`product`] with a right operand that is packed panel by panel, each just before its turn. For
+/// weights that change between any two products: packed at once and kept, they would be written to
+/// memory and read back from there.
 ///
 /// # Panics
 /// When lengths do not belong together.
@@ -114,7 +119,11 @@ fn multiply<T: Term>(
     finish: Finish<'_>,
     output: &mut [f32],
 ) {
-    assert!(panels.isa().is_available(), "{} is not to be had here", panels.isa());
+    assert!(
+        panels.isa().is_available(),
+        "{} is not to be had here",
+        panels.isa()
+    );
     let count = rows.count(panels.terms());
     let single;
     let (data, starts, runs) = match rows {
@@ -127,7 +136,8 @@ fn multiply<T: Term>(
         }
         Rows::Windows(windows, image) => (image, Starts::Listed(windows.starts()), windows.runs()),
     };
-    // A single row meets a number only once, and needs as many sums under way as there are registers.
+    // A single row meets a number only once, and needs as many sums under way as there are
+    // registers.
     let (terms_at_once, panels_at_once) = if count == 1 {
         (usize::MAX, ROW_PANELS)
     } else {
@@ -166,8 +176,9 @@ fn multiply<T: Term>(
                     output: output[column..].as_mut_ptr(),
                     output_starts: Starts::Even(place.stride),
                 };
-                // SAFETY: `check_lens` has seen to it that every row has all terms, bias, gate and output all columns of all rows; `panels` was packed for
-                // its instructions, which `Isa` has looked for.
+                // SAFETY: `check_lens` has seen to it that every row has all terms, bias, gate and
+                // output all columns of all rows; `panels` was packed for its instructions, which
+                // `Isa` has looked for.
                 unsafe { do_work(panels.isa(), &work) };
             }
         }
@@ -191,7 +202,11 @@ fn check_lens<T: Term>(
             data.len()
         ),
         Rows::Windows(windows, image) => {
-            assert_eq!(image.len(), windows.image_len(), "the image the windows are of");
+            assert_eq!(
+                image.len(),
+                windows.image_len(),
+                "the image the windows are of"
+            );
             assert_eq!(windows.window_len(), terms, "a window has all terms");
         }
     }

@@ -1,8 +1,9 @@
 //! Threads that do one thing together, many thousand times a second.
 //!
-//! An update is some thirty products of a tenth of a millisecond each; waking a thread through the kernel for every one would cost a share of it. So a member looks
-//! for work for a moment before it sleeps. Who does which part follows from numbers alone, and no sum is split between members: results are the same
-//! for any number of them.
+//! An update is some thirty products of a tenth of a millisecond each; waking a thread through the
+//! kernel for every one would cost a share of it. So a member looks for work for a moment before it
+//! sleeps. Who does which part follows from numbers alone, and no sum is split between members:
+//! results are the same for any number of them.
 
 use std::marker::PhantomData;
 use std::ops::Range;
@@ -11,8 +12,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicPtr, AtomicUsize, Ordering};
 use std::thread::{self, JoinHandle};
 
-/// Looks for work before a member sleeps: some tens of microseconds, as long as the processor pauses between two; longer than what lies between two
-/// products, shorter than what lies between two epochs.
+/// Looks for work before a member sleeps: some tens of microseconds, as long as the processor
+/// pauses between two; longer than what lies between two products, shorter than what lies between
+/// two epochs.
 const LOOKS: usize = 4096;
 
 /// A fixed number of threads, the caller's among them.
@@ -76,7 +78,9 @@ impl Team {
         }
         let shared = &*self.shared;
         let mut work: Work<'_> = &work;
-        shared.unfinished.store(self.helpers.len(), Ordering::Relaxed);
+        shared
+            .unfinished
+            .store(self.helpers.len(), Ordering::Relaxed);
         shared.work.store((&raw mut work).cast(), Ordering::Relaxed);
         shared.round.fetch_add(1, Ordering::Release);
         for helper in &self.helpers {
@@ -106,7 +110,8 @@ impl Team {
         });
     }
 
-    /// Lets every member do a part of the rows of `rows`, each `len` long: `work` is given the number of its first row and the rows.
+    /// Lets every member do a part of the rows of `rows`, each `len` long: `work` is given the
+    /// number of its first row and the rows.
     ///
     /// # Panics
     /// When `rows` are not whole ones.
@@ -160,9 +165,15 @@ impl<'a, T> Shared<'a, T> {
 
     /// # Safety
     /// Nobody else is given any of this part meanwhile.
-    #[allow(clippy::mut_from_ref, reason = "the caller gives each part to one member")]
+    #[allow(
+        clippy::mut_from_ref,
+        reason = "the caller gives each part to one member"
+    )]
     pub(crate) unsafe fn part(&self, part: Range<usize>) -> &mut [T] {
-        assert!(part.start <= part.end && part.end <= self.len, "a part of the memory");
+        assert!(
+            part.start <= part.end && part.end <= self.len,
+            "a part of the memory"
+        );
         // SAFETY: inside of what was lent, and nobody else's, the caller says.
         unsafe { std::slice::from_raw_parts_mut(self.data.add(part.start), part.len()) }
     }
@@ -191,7 +202,8 @@ fn help(shared: &Round, member: usize) {
         done += 1;
         let work = shared.work.load(Ordering::Relaxed);
         let outcome = catch_unwind(AssertUnwindSafe(|| {
-            // SAFETY: `run` has set the pointer before the round, and does not return, so that what it points to lives, until `unfinished` is zero.
+            // SAFETY: `run` has set the pointer before the round, and does not return, so that what
+            // it points to lives, until `unfinished` is zero.
             let work = unsafe { *work };
             work(member);
         }));
@@ -225,7 +237,8 @@ mod tests {
                 for _ in 0..50 {
                     team.split_rows(&mut rows, 3, 4, |first, rows| {
                         for (index, row) in rows.chunks_exact_mut(3).enumerate() {
-                            row.iter_mut().for_each(|value| *value += (first + index) as u32);
+                            row.iter_mut()
+                                .for_each(|value| *value += (first + index) as u32);
                         }
                     });
                 }

@@ -1,4 +1,5 @@
-//! Products and gradients against their definition, and every instruction set against every other, bit for bit.
+//! Products and gradients against their definition, and every instruction set against every other,
+//! bit for bit.
 
 use proptest::prelude::*;
 
@@ -19,7 +20,10 @@ fn numbers(len: usize, seed: u64) -> Vec<f32> {
 
 fn pairs(len: usize, seed: u64) -> Vec<Pair> {
     let numbers = numbers(2 * len, seed);
-    numbers.chunks(2).map(|two| Pair::of(two[0], two[1])).collect()
+    numbers
+        .chunks(2)
+        .map(|two| Pair::of(two[0], two[1]))
+        .collect()
 }
 
 fn available() -> impl Iterator<Item = Isa> {
@@ -39,7 +43,11 @@ fn defined(
             left.mul_add(right(term, column), sum)
         })
     };
-    let elements = |row: &Vec<f32>| (0..columns).map(|column| element(row, column)).collect::<Vec<f32>>();
+    let elements = |row: &Vec<f32>| {
+        (0..columns)
+            .map(|column| element(row, column))
+            .collect::<Vec<f32>>()
+    };
     rows.iter().flat_map(elements).collect()
 }
 
@@ -152,7 +160,8 @@ proptest! {
             gradient(&mut Team::new(1), isa, grad, Terms::Windows(&windows, &input), &mut found);
             prop_assert_eq!(&found, &expected_gradient, "{}", isa);
 
-            // What is spread is what is added back of the product, up to the order of sums; and the same with all instructions.
+            // What is spread is what is added back of the product, up to the order of sums; and the
+            // same with all instructions.
             let columns = defined(
                 &output.chunks(outputs).map(<[f32]>::to_vec).collect::<Vec<_>>(),
                 |term, number| weights[term * len + number],
@@ -187,7 +196,8 @@ proptest! {
         let (len, [_, across]) = (windows.window_len(), windows.positions());
         let (rows, weights) = (numbers(windows.count() * terms, seed), numbers(terms * len, seed + 1));
         let held = numbers(windows.image_len(), seed + 2);
-        // Number by number of a window: all windows' terms, one after the other, to what the image holds.
+        // Number by number of a window: all windows' terms, one after the other, to what the image
+        // holds.
         let mut expected = held.clone();
         for number in 0..len {
             let (y, x) = (number / channels / kernel[1], number / channels % kernel[1]);
@@ -287,7 +297,10 @@ fn what_is_not_a_number_is_not_hidden() {
             Finish::Rectified,
             &mut output,
         );
-        assert!(output.iter().all(|value| value.is_nan()), "{isa}: {output:?}");
+        assert!(
+            output.iter().all(|value| value.is_nan()),
+            "{isa}: {output:?}"
+        );
     }
 }
 

@@ -1,7 +1,9 @@
-//! The inner loop of every product: a tile of the output, held in registers from its first term to its last.
+//! The inner loop of every product: a tile of the output, held in registers from its first term to
+//! its last.
 //!
-//! An element of the output is the sum of its terms in the order of k, each added by one fused multiply-add. Neither the width of a register nor the
-//! size of a tile changes that, so all instruction sets give the same bits.
+//! An element of the output is the sum of its terms in the order of k, each added by one fused
+//! multiply-add. Neither the width of a register nor the size of a tile changes that, so all
+//! instruction sets give the same bits.
 
 use crate::isa::Simd;
 use crate::panels::Panel;
@@ -33,7 +35,8 @@ pub(crate) enum End {
     Plain,
     /// Zero if it is below zero.
     Rectified,
-    /// Zero where this matrix, laid out as the output and pointed at where the tile begins, is not above zero.
+    /// Zero where this matrix, laid out as the output and pointed at where the tile begins, is not
+    /// above zero.
     Gated(*const f32),
 }
 
@@ -90,15 +93,17 @@ impl<const M: usize> Output<M> {
     }
 }
 
-/// Full panels that a single row meets at once: eight sums under way hide that each term of one waits for the one before.
+/// Full panels that a single row meets at once: eight sums under way hide that each term of one
+/// waits for the one before.
 pub(crate) const ROW_PANELS: usize = 4;
 
 /// The tallest tile of any instruction set, and its columns.
 pub(crate) const MOST_ROWS: usize = 12;
 const MOST_COLUMNS: usize = 32;
 
-/// Calls a function that is generic over instruction set and height with the height that is only known now. No tile is made that the instruction set has no
-/// registers for: the guards are decided when the code is compiled.
+/// Calls a function that is generic over instruction set and height with the height that is only
+/// known now. No tile is made that the instruction set has no registers for: the guards are decided
+/// when the code is compiled.
 macro_rules! of_height {
     ($simd:ident, $rows:expr, $function:ident($($argument:expr),*)) => {
         of_height!(@ $simd, $rows, $function ($($argument),*) 1 2 3 4 5 6 7 8 9 10 11 12)
@@ -129,7 +134,8 @@ pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile<S::Term>, const M: usize>(
     end: End,
     output: Output<M>,
 ) {
-    // SAFETY: as the caller says; where columns are missing, the tile works on memory of its own, which has them all.
+    // SAFETY: as the caller says; where columns are missing, the tile works on memory of its own,
+    // which has them all.
     unsafe {
         if panel.columns == panel.width {
             return if panel.width == S::LANES {
@@ -145,13 +151,19 @@ pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile<S::Term>, const M: usize>(
             Begin::Zero => Begin::Zero,
             Begin::Output => {
                 for row in 0..M {
-                    aside.data.add(aside.rows[row]).copy_from(row_of(row), panel.columns);
+                    aside
+                        .data
+                        .add(aside.rows[row])
+                        .copy_from(row_of(row), panel.columns);
                 }
                 Begin::Output
             }
             Begin::Bias(bias) => {
                 for row in 0..M {
-                    aside.data.add(aside.rows[row]).copy_from(bias, panel.columns);
+                    aside
+                        .data
+                        .add(aside.rows[row])
+                        .copy_from(bias, panel.columns);
                 }
                 Begin::Output
             }
@@ -181,8 +193,9 @@ pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile<S::Term>, const M: usize>(
 /// A tile of `M` rows and `N` registers: output = end(begin + left · panel).
 ///
 /// # Safety
-/// `S`'s instructions are there. The left tile has `M` rows with all terms of `runs`; `panel` has as many rows of `panel_width` numbers as the runs have terms;
-/// `output`, a bias and a gate have `M` rows (a bias one) of `N · LANES` numbers. Nothing else touches the output meanwhile.
+/// `S`'s instructions are there. The left tile has `M` rows with all terms of `runs`; `panel` has
+/// as many rows of `panel_width` numbers as the runs have terms; `output`, a bias and a gate have
+/// `M` rows (a bias one) of `N · LANES` numbers. Nothing else touches the output meanwhile.
 #[inline(always)]
 pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N: usize>(
     left: L,
@@ -253,11 +266,13 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N
     }
 }
 
-/// Asks for the memory that a tile ends at, when it begins: it has often left the nearer caches, and would be waited for when the sums are done.
+/// Asks for the memory that a tile ends at, when it begins: it has often left the nearer caches,
+/// and would be waited for when the sums are done.
 #[inline(always)]
 unsafe fn fetch_ahead<S: Simd, const M: usize, const N: usize>(end: End, output: Output<M>) {
     let places = |from: *const f32| {
-        (0..M * N).map(move |place| from.wrapping_add(output.rows[place / N] + place % N * S::LANES))
+        (0..M * N)
+            .map(move |place| from.wrapping_add(output.rows[place / N] + place % N * S::LANES))
     };
     // SAFETY: any address may be asked for.
     unsafe {
@@ -276,7 +291,8 @@ unsafe fn fetch_ahead<S: Simd, const M: usize, const N: usize>(end: End, output:
 
 /// Stores finished sums, each as `finish` makes it of the sum and its place.
 ///
-/// One short loop for each way to finish: in a long one, which the compiler does not unroll, the sums would be indexed, and so live in memory from the first term on.
+/// One short loop for each way to finish: in a long one, which the compiler does not unroll, the
+/// sums would be indexed, and so live in memory from the first term on.
 #[inline(always)]
 unsafe fn put<S: Simd, const M: usize, const N: usize>(
     sums: [[S::Vector; N]; M],
@@ -324,7 +340,11 @@ pub(crate) unsafe fn row_of_panels<S: Simd>(
                 let term = S::splat(*left.add(run.offset + k));
                 for (panel, sums) in panels.iter().zip(&mut sums) {
                     for (part, sum) in sums.iter_mut().enumerate() {
-                        *sum = S::fused(term, S::load_terms(panel.add(passed + part * S::LANES)), *sum);
+                        *sum = S::fused(
+                            term,
+                            S::load_terms(panel.add(passed + part * S::LANES)),
+                            *sum,
+                        );
                     }
                 }
                 passed += 2 * S::LANES;

@@ -1,7 +1,9 @@
 //! Windows on a channels-last image: what a convolution sees through its kernel.
 //!
-//! A window's numbers, row by row of the kernel, are runs of memory side by side in the image. Convolutions forward read them where they lie; what a
-//! transposed convolution makes of a pixel is added back through the same windows. So one description serves all passes of both kinds of layer.
+//! A window's numbers, row by row of the kernel, are runs of memory side by side in the image.
+//! Convolutions forward read them where they lie; what a transposed convolution makes of a pixel is
+//! added back through the same windows. So one description serves all passes of both kinds of
+//! layer.
 
 use std::ops::Range;
 
@@ -19,25 +21,31 @@ pub struct Windows {
     positions: [usize; 2],
     /// Where in the image each window begins.
     starts: Vec<usize>,
-    /// The window's rows, from where it begins; together in the order [kernel row, kernel column, channel].
+    /// The window's rows, from where it begins; together in the order [kernel row, kernel column,
+    /// channel].
     runs: Vec<Run>,
     window_len: usize,
 }
 
 impl Windows {
-    /// Windows of `kernel` (height, width) on an image of `size` (height, width) with `channels`, moved by `stride`.
+    /// Windows of `kernel` (height, width) on an image of `size` (height, width) with `channels`,
+    /// moved by `stride`.
     ///
     /// # Panics
     /// When the kernel does not fit into the image, or something is zero.
     pub fn new(size: [usize; 2], channels: usize, kernel: [usize; 2], stride: usize) -> Self {
         assert!(
-            channels > 0 && stride > 0 && (0..2).all(|axis| (1..=size[axis]).contains(&kernel[axis])),
+            channels > 0
+                && stride > 0
+                && (0..2).all(|axis| (1..=size[axis]).contains(&kernel[axis])),
             "a kernel of {kernel:?} moved by {stride} has no place in an image of {size:?} with {channels} channels"
         );
         let positions = [0, 1].map(|axis| (size[axis] - kernel[axis]) / stride + 1);
         let row_len = size[1] * channels;
         let starts = (0..positions[0] * positions[1])
-            .map(|window| (window / positions[1] * row_len + window % positions[1] * channels) * stride)
+            .map(|window| {
+                (window / positions[1] * row_len + window % positions[1] * channels) * stride
+            })
             .collect();
         let len = kernel[1] * channels;
         let runs = (0..kernel[0])
@@ -106,7 +114,8 @@ impl Windows {
         self.runs[number / row_len].offset + number % row_len
     }
 
-    /// Adds each window's numbers, `[windows, window_len]`, to where they belong in `image`. The adjoint of looking through the windows.
+    /// Adds each window's numbers, `[windows, window_len]`, to where they belong in `image`. The
+    /// adjoint of looking through the windows.
     ///
     /// # Panics
     /// When a length is off.
@@ -127,7 +136,9 @@ impl Windows {
             #[inline(always)]
             || {
                 for (row, run) in self.runs.iter().enumerate() {
-                    for (&start, numbers) in starts.iter().zip(numbers.chunks_exact(self.window_len)) {
+                    for (&start, numbers) in
+                        starts.iter().zip(numbers.chunks_exact(self.window_len))
+                    {
                         let from = &numbers[row * run.len..][..run.len];
                         let into = &mut image[start + run.offset..][..run.len];
                         for (into, from) in into.iter_mut().zip(from) {
@@ -140,16 +151,25 @@ impl Windows {
     }
 }
 
-/// Adds `rows · panels`, a window's numbers for each row, to where they belong in `image`: a transposed convolution forward, and what flows back through a
-/// convolution. `scratch` is used again from call to call.
+/// Adds `rows · panels`, a window's numbers for each row, to where they belong in `image`: a
+/// transposed convolution forward, and what flows back through a convolution. `scratch` is used
+/// again from call to call.
 ///
-/// Where channels are a multiple of 32, an element of the image is what it held, to which each window's terms are added, one fused multiply-add each; windows in the order
-/// of where they see the element, by rows of the kernel and from left to right. With other channels it is the sum of what it held and of its windows' sums, by rows of windows
-/// in groups, by rows of the kernel, and by windows from left to right.
+/// Where channels are a multiple of 32, an element of the image is what it held, to which each
+/// window's terms are added, one fused multiply-add each; windows in the order of where they see
+/// the element, by rows of the kernel and from left to right. With other channels it is the sum of
+/// what it held and of its windows' sums, by rows of windows in groups, by rows of the kernel, and
+/// by windows from left to right.
 ///
 /// # Panics
 /// When lengths do not belong together.
-pub fn spread(rows: &[f32], panels: &Panels, windows: &Windows, scratch: &mut Vec<f32>, image: &mut [f32]) {
+pub fn spread(
+    rows: &[f32],
+    panels: &Panels,
+    windows: &Windows,
+    scratch: &mut Vec<f32>,
+    image: &mut [f32],
+) {
     let terms = panels.terms();
     assert_eq!(
         panels.columns(),
@@ -157,7 +177,11 @@ pub fn spread(rows: &[f32], panels: &Panels, windows: &Windows, scratch: &mut Ve
         "a column for each number of a window"
     );
     assert_eq!(rows.len(), windows.count() * terms, "a row for each window");
-    assert_eq!(image.len(), windows.image_len, "the image the windows are of");
+    assert_eq!(
+        image.len(),
+        windows.image_len,
+        "the image the windows are of"
+    );
     if windows.channels.is_multiple_of(WHOLE_PANELS) {
         spread_in_place(rows, panels, windows, image);
     } else {
@@ -165,10 +189,12 @@ pub fn spread(rows: &[f32], panels: &Panels, windows: &Windows, scratch: &mut Ve
     }
 }
 
-/// So many columns are whole panels of all instruction sets: what is added in which order depends on none of them.
+/// So many columns are whole panels of all instruction sets: what is added in which order depends
+/// on none of them.
 const WHOLE_PANELS: usize = 32;
 
-/// Panel by panel, sums that begin with what is in the image. A panel's columns are channels of one place in the kernel, where no two windows see the same pixel.
+/// Panel by panel, sums that begin with what is in the image. A panel's columns are channels of one
+/// place in the kernel, where no two windows see the same pixel.
 fn spread_in_place(rows: &[f32], panels: &Panels, windows: &Windows, image: &mut [f32]) {
     let (isa, terms) = (panels.isa(), panels.terms());
     assert!(isa.is_available(), "{isa} is not to be had here");
@@ -191,18 +217,26 @@ fn spread_in_place(rows: &[f32], panels: &Panels, windows: &Windows, image: &mut
                 output: image[windows.offset(panel.first)..].as_mut_ptr(),
                 output_starts: Starts::Listed(windows.starts()),
             };
-            // SAFETY: the instructions are there; there is a row of all terms for each window, and each window, seen from the panel's first number on, has the
-            // panel's columns side by side, apart from those of the others.
+            // SAFETY: the instructions are there; there is a row of all terms for each window, and
+            // each window, seen from the panel's first number on, has the panel's columns side by
+            // side, apart from those of the others.
             unsafe { do_work(isa, &work) };
         }
     }
 }
 
-/// Rows that a product is not done for fewer of, if there are: every panel that is fetched meets them all.
+/// Rows that a product is not done for fewer of, if there are: every panel that is fetched meets
+/// them all.
 const ROWS_AT_ONCE: usize = 24;
 
 /// Some rows of windows at a time, so that what is made is added back from a near cache.
-fn spread_by_scratch(rows: &[f32], panels: &Panels, windows: &Windows, scratch: &mut Vec<f32>, image: &mut [f32]) {
+fn spread_by_scratch(
+    rows: &[f32],
+    panels: &Panels,
+    windows: &Windows,
+    scratch: &mut Vec<f32>,
+    image: &mut [f32],
+) {
     let terms = panels.terms();
     let across = windows.positions[1];
     let at_once = across * ROWS_AT_ONCE.div_ceil(across);
@@ -229,11 +263,19 @@ mod tests {
 
     #[test]
     fn what_is_added_back_lies_where_it_was_seen() {
-        // 3 x 4 pixels, one channel, windows of 2 x 2 moved by 2: two of them, in the upper two rows.
+        // 3 x 4 pixels, one channel, windows of 2 x 2 moved by 2: two of them, in the upper two
+        // rows.
         let windows = Windows::new([3, 4], 1, [2, 2], 2);
         let mut image = [0.5; 12];
-        windows.add_back(Isa::best(), &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0], &mut image);
-        assert_eq!(image, [1.5, 2.5, 5.5, 6.5, 3.5, 4.5, 7.5, 8.5, 0.5, 0.5, 0.5, 0.5]);
+        windows.add_back(
+            Isa::best(),
+            &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0],
+            &mut image,
+        );
+        assert_eq!(
+            image,
+            [1.5, 2.5, 5.5, 6.5, 3.5, 4.5, 7.5, 8.5, 0.5, 0.5, 0.5, 0.5]
+        );
     }
 
     #[test]

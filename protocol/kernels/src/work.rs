@@ -1,11 +1,15 @@
-//! What a product is cut into: some rows, some terms, one panel; done with the instructions that the panel was packed for.
+//! What a product is cut into: some rows, some terms, one panel; done with the instructions that
+//! the panel was packed for.
 
 use crate::isa::{Isa, Simd};
 use crate::pair::Term;
 use crate::panels::Panel;
-use crate::tile::{Begin, End, InPlace, Output, ROW_PANELS, Run, of_height, panel_tile, row_of_panels};
+use crate::tile::{
+    Begin, End, InPlace, Output, ROW_PANELS, Run, of_height, panel_tile, row_of_panels,
+};
 
-/// Terms of a panel that all rows meet before the next ones' turn: they stay in the first cache meanwhile.
+/// Terms of a panel that all rows meet before the next ones' turn: they stay in the first cache
+/// meanwhile.
 pub(crate) const TERMS_AT_ONCE: usize = 256;
 
 /// Where rows begin.
@@ -37,7 +41,8 @@ pub(crate) struct Work<'a, T> {
 }
 
 impl Starts<'_> {
-    /// Where each row of a tile begins. Asked once for all of them: row by row, a tile of few terms would take longer to begin than to do.
+    /// Where each row of a tile begins. Asked once for all of them: row by row, a tile of few terms
+    /// would take longer to begin than to do.
     #[inline(always)]
     fn of<const M: usize>(self, row: usize) -> [usize; M] {
         match self {
@@ -93,9 +98,12 @@ unsafe fn all_tiles<S: Simd>(work: &Work<'_, S::Term>) {
     if work.panel.width == ROW_PANELS * 2 * S::LANES {
         let [start] = work.starts.of(work.first);
         let left = work.left.wrapping_add(start);
-        let panels = std::array::from_fn(|panel| work.right.wrapping_add(panel * work.terms * 2 * S::LANES));
+        let panels =
+            std::array::from_fn(|panel| work.right.wrapping_add(panel * work.terms * 2 * S::LANES));
         // SAFETY: as the caller says: the panels lie one behind the other.
-        return unsafe { row_of_panels::<S>(left, work.runs, panels, work.begin, work.end, work.output) };
+        return unsafe {
+            row_of_panels::<S>(left, work.runs, panels, work.begin, work.end, work.output)
+        };
     }
     let mut row = work.first;
     while row < work.first + work.rows {
@@ -108,7 +116,10 @@ unsafe fn all_tiles<S: Simd>(work: &Work<'_, S::Term>) {
 
 #[inline(always)]
 unsafe fn tile_of<S: Simd, const M: usize>(work: &Work<'_, S::Term>, row: usize) {
-    let left = work.starts.of(row).map(|start| work.left.wrapping_add(start));
+    let left = work
+        .starts
+        .of(row)
+        .map(|start| work.left.wrapping_add(start));
     let output = Output {
         data: work.output,
         rows: work.output_starts.of(row),

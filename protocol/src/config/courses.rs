@@ -6,16 +6,19 @@ use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require};
 
-/// `[courses]`: what is flown through. Paths are relative to the configuration file; given with `--set`, to the working directory. Courses that are not named are those that come with
-/// Skein, in `configs/courses/`.
+/// `[courses]`: what is flown through. Paths are relative to the configuration file; given with
+/// `--set`, to the working directory. Courses that are not named are those that come with Skein, in
+/// `configs/courses/`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoursesSection {
     /// The course training flies.
     pub training: PathBuf,
-    /// Share of training episodes flown on a generated course instead, a new one each, in [0, 1]. Default 0: the training course only, as in the paper.
+    /// Share of training episodes flown on a generated course instead, a new one each, in [0, 1].
+    /// Default 0: the training course only, as in the paper.
     pub generated_share: f64,
-    /// The courses of the final evaluation, in the order of its table. The first is the one snapshots are confirmed on.
+    /// The courses of the final evaluation, in the order of its table. The first is the one
+    /// snapshots are confirmed on.
     pub evaluation: Vec<PathBuf>,
 }
 
@@ -40,7 +43,11 @@ impl Default for CoursesSection {
 impl CoursesSection {
     /// What a course is called in reports: its file's name without the ending.
     pub fn name_of(course: &Path) -> String {
-        course.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+        course
+            .file_stem()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned()
     }
 
     /// Every course file.

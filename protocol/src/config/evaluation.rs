@@ -12,17 +12,21 @@ pub struct EvaluationSection {
     pub episodes: u64,
     /// Episodes that confirm a candidate for the best snapshot. Default 20.
     pub confirm_episodes: u64,
-    /// Where they are flown: on the `first-course` of the evaluation, or each on a `generated` course of its own that no training episode flies. A policy that shall fly courses it
-    /// has never seen must not be chosen on one of them. Default `first-course`.
+    /// Where they are flown: on the `first-course` of the evaluation, or each on a `generated`
+    /// course of its own that no training episode flies. A policy that shall fly courses it has
+    /// never seen must not be chosen on one of them. Default `first-course`.
     pub confirm_on: ConfirmOn,
-    /// Training episodes over which walls passed are averaged to find candidates (paper: 50). Default 50.
+    /// Training episodes over which walls passed are averaged to find candidates (paper: 50).
+    /// Default 50.
     pub window_episodes: u64,
     /// Training episodes between two candidates at least. Default 50.
     pub every_episodes: u64,
-    /// How far below that of the best snapshot so far a candidate's average may lie, in walls: the average of so few episodes is noisy. Default 0.3.
+    /// How far below that of the best snapshot so far a candidate's average may lie, in walls: the
+    /// average of so few episodes is noisy. Default 0.3.
     pub candidate_margin: f64,
-    /// Share R of walls passed in a candidate's evaluation episodes from which on the policy counts as trained. Only told, as time and episodes that it took
-    /// (paper: R > 0.9); nothing that is learned depends on it. Default 0.9.
+    /// Share R of walls passed in a candidate's evaluation episodes from which on the policy counts
+    /// as trained. Only told, as time and episodes that it took (paper: R > 0.9); nothing that is
+    /// learned depends on it. Default 0.9.
     pub trained_rate: f64,
 }
 
@@ -58,7 +62,12 @@ impl EvaluationSection {
             ("evaluation.window_episodes", self.window_episodes),
             ("evaluation.every_episodes", self.every_episodes),
         ] {
-            require((1..=1_000_000).contains(&value), key, value, "is outside 1..=1000000")?;
+            require(
+                (1..=1_000_000).contains(&value),
+                key,
+                value,
+                "is outside 1..=1000000",
+            )?;
         }
         require(
             self.candidate_margin >= 0.0 && self.candidate_margin.is_finite(),

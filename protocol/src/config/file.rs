@@ -65,11 +65,15 @@ pub enum ConfigError {
     },
 }
 
-/// The override that brought about the failure of `attempt` with all of `overrides`: since it, and not before, the attempt fails with these very words.
-/// `None` when the file alone fails so.
+/// The override that brought about the failure of `attempt` with all of `overrides`: since it, and
+/// not before, the attempt fails with these very words. `None` when the file alone fails so.
 ///
-/// `attempt` is given the first so many overrides, and returns what the user would be told; `None` when it succeeds.
-pub fn culprit(overrides: &[String], attempt: impl Fn(&[String]) -> Option<String>) -> Option<&String> {
+/// `attempt` is given the first so many overrides, and returns what the user would be told; `None`
+/// when it succeeds.
+pub fn culprit(
+    overrides: &[String],
+    attempt: impl Fn(&[String]) -> Option<String>,
+) -> Option<&String> {
     let failure = attempt(overrides);
     (0..overrides.len())
         .rev()
@@ -77,13 +81,15 @@ pub fn culprit(overrides: &[String], attempt: impl Fn(&[String]) -> Option<Strin
         .map(|count| &overrides[count])
 }
 
-/// Names the folder of the configurations that come with Skein, whose `courses/` holds the default courses; the scripts in `launch/` set it. Without it they are looked for beside the
+/// Names the folder of the configurations that come with Skein, whose `courses/` holds the default
+/// courses; the scripts in `launch/` set it. Without it they are looked for beside the
 /// configuration file.
 const SHIPPED_CONFIGS: &str = "SKEIN_CONFIGS";
 
 impl Config {
-    /// Reads `path`, applies `overrides` (`section.key=value`, the value in TOML's notation or a bare word) and validates the result. Course paths
-    /// become relative to the working directory: in the file they are relative to the file, in an override to the working directory.
+    /// Reads `path`, applies `overrides` (`section.key=value`, the value in TOML's notation or a
+    /// bare word) and validates the result. Course paths become relative to the working directory:
+    /// in the file they are relative to the file, in an override to the working directory.
     ///
     /// # Errors
     /// [`ConfigError`] names file, key, value and remedy, and the override that is to blame.
@@ -92,7 +98,11 @@ impl Config {
             Err(error) if !matches!(error, ConfigError::Override { .. }) => error,
             settled => return settled,
         };
-        let told = |overrides: &[String]| Self::resolve(path, overrides).err().map(|error| error.to_string());
+        let told = |overrides: &[String]| {
+            Self::resolve(path, overrides)
+                .err()
+                .map(|error| error.to_string())
+        };
         Err(match culprit(overrides, told) {
             Some(text) => ConfigError::Overridden {
                 text: text.clone(),
@@ -110,7 +120,8 @@ impl Config {
         Self::parse(&text, path, overrides)
     }
 
-    /// Reads a configuration from the `text` of a configuration file at `path`, as [`Config::load`] does, but for telling which override is to blame.
+    /// Reads a configuration from the `text` of a configuration file at `path`, as [`Config::load`]
+    /// does, but for telling which override is to blame.
     ///
     /// # Errors
     /// [`ConfigError`] names file, key, value and remedy.
@@ -120,7 +131,12 @@ impl Config {
     }
 
     /// [`Config::parse`], with the courses that are not named in `shipped`, or beside the file.
-    fn parse_with(text: &str, path: &Path, overrides: &[String], shipped: Option<&Path>) -> Result<Self, ConfigError> {
+    fn parse_with(
+        text: &str,
+        path: &Path,
+        overrides: &[String],
+        shipped: Option<&Path>,
+    ) -> Result<Self, ConfigError> {
         let mut table: Table = toml::from_str(text).map_err(|source| ConfigError::Syntax {
             path: path.to_owned(),
             source: Box::new(source),
@@ -128,7 +144,11 @@ impl Config {
         for text in overrides {
             apply_override(&mut table, text)?;
         }
-        let named = |key: &str| table.get("courses").is_some_and(|courses| courses.get(key).is_some());
+        let named = |key: &str| {
+            table
+                .get("courses")
+                .is_some_and(|courses| courses.get(key).is_some())
+        };
         let named = [named("training"), named("evaluation")];
         let mut config = from_table(table).map_err(|message| ConfigError::Key {
             path: path.to_owned(),
@@ -162,17 +182,26 @@ impl Config {
 
     /// The whole configuration as TOML, defaults included.
     pub fn to_toml(&self) -> String {
-        toml::to_string_pretty(self).expect("every field of the configuration is representable in TOML")
+        toml::to_string_pretty(self)
+            .expect("every field of the configuration is representable in TOML")
     }
 }
 
-/// Deserializes section by section, so that an error names its section: the parser itself only knows the key.
+/// Deserializes section by section, so that an error names its section: the parser itself only
+/// knows the key.
 fn from_table(mut table: Table) -> Result<Config, String> {
     let mut config = Config::default();
-    fn section<T: serde::de::DeserializeOwned>(table: &mut Table, name: &str, into: &mut T) -> Result<(), String> {
+    fn section<T: serde::de::DeserializeOwned>(
+        table: &mut Table,
+        name: &str,
+        into: &mut T,
+    ) -> Result<(), String> {
         if let Some(value) = table.remove(name) {
             *into = value.try_into().map_err(|error: toml::de::Error| {
-                format!("[{name}] {}", error.to_string().trim_end().replace('\n', " "))
+                format!(
+                    "[{name}] {}",
+                    error.to_string().trim_end().replace('\n', " ")
+                )
             })?;
         }
         Ok(())
@@ -202,9 +231,14 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
         problem: problem.to_owned(),
     };
     let (path, value) = text.split_once('=').ok_or_else(|| fail("has no `=`"))?;
-    let (sections, key) = path.trim().rsplit_once('.').ok_or_else(|| fail("names no section"))?;
+    let (sections, key) = path
+        .trim()
+        .rsplit_once('.')
+        .ok_or_else(|| fail("names no section"))?;
     if sections.split('.').count() > DEEPEST {
-        return Err(fail("names sections deeper within each other than any section lies"));
+        return Err(fail(
+            "names sections deeper within each other than any section lies",
+        ));
     }
     let mut target = table;
     for section in sections.split('.') {
@@ -216,13 +250,15 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
     }
     let mut value = parse_value(value.trim());
     if matches!((sections, key), ("courses", "training" | "evaluation")) {
-        make_absolute(&mut value).map_err(|error| fail(&format!("no path can be made of it ({error})")))?;
+        make_absolute(&mut value)
+            .map_err(|error| fail(&format!("no path can be made of it ({error})")))?;
     }
     target.insert(key.to_owned(), value);
     Ok(())
 }
 
-/// Paths on the command line are the user's, who knows nothing of the configuration file's folder. What is no path is left for validation to refuse.
+/// Paths on the command line are the user's, who knows nothing of the configuration file's folder.
+/// What is no path is left for validation to refuse.
 fn make_absolute(value: &mut Value) -> io::Result<()> {
     match value {
         Value::String(path) => {
@@ -242,13 +278,16 @@ fn parse_value(text: &str) -> Value {
         .unwrap_or_else(|| Value::String(text.to_owned()))
 }
 
-/// Reads a text file of a size that people write. Of what is no file, a pipe or a device, the end might never come.
+/// Reads a text file of a size that people write. Of what is no file, a pipe or a device, the end
+/// might never come.
 fn read_text(path: &Path) -> io::Result<String> {
     /// Many times what a configuration with every key and a comment on each has.
     const LONGEST: u64 = 1 << 20;
     let about = fs::metadata(path)?;
     if !about.is_file() || about.len() > LONGEST {
-        return Err(io::Error::other(format!("is no text file of at most {LONGEST} bytes")));
+        return Err(io::Error::other(format!(
+            "is no text file of at most {LONGEST} bytes"
+        )));
     }
     fs::read_to_string(path)
 }
@@ -302,7 +341,10 @@ mod tests {
         assert_eq!(engines(&["vae.decoder=u-net"]), (native, libtorch));
         for algorithm in ["sac", "td3"] {
             let algorithm = format!("learning.algorithm={algorithm}");
-            assert_eq!(engines(&["learning.encoder=end-to-end", &algorithm]).0, libtorch);
+            assert_eq!(
+                engines(&["learning.encoder=end-to-end", &algorithm]).0,
+                libtorch
+            );
             assert_eq!(engines(&["run.engine=libtorch", &algorithm]).0, libtorch);
         }
     }
@@ -310,7 +352,9 @@ mod tests {
     #[test]
     fn course_paths_are_relative_to_the_file() {
         let config = load("[courses]\ntraining = \"a/b.toml\"", &[]).unwrap();
-        assert!(config.courses.training.is_absolute() && config.courses.training.ends_with("a/b.toml"));
+        assert!(
+            config.courses.training.is_absolute() && config.courses.training.ends_with("a/b.toml")
+        );
     }
 
     #[test]
@@ -327,10 +371,16 @@ mod tests {
         );
         let courses = parse("[courses]\ntraining = \"a.toml\"").courses;
         assert_eq!(courses.training, Path::new("/mine/a.toml"));
-        assert_eq!(courses.evaluation[0], Path::new("/skein/configs/courses/training.toml"));
+        assert_eq!(
+            courses.evaluation[0],
+            Path::new("/skein/configs/courses/training.toml")
+        );
         let courses = parse("[courses]\nevaluation = [\"b.toml\"]").courses;
         assert_eq!(courses.evaluation, [Path::new("/mine/b.toml")]);
-        assert_eq!(courses.training, Path::new("/skein/configs/courses/training.toml"));
+        assert_eq!(
+            courses.training,
+            Path::new("/skein/configs/courses/training.toml")
+        );
     }
 
     #[test]
@@ -345,7 +395,10 @@ mod tests {
         )
         .unwrap();
         assert_eq!(config.courses.training, here.join("a/b.toml"));
-        assert_eq!(config.courses.evaluation, [here.join("c.toml"), "/d.toml".into()]);
+        assert_eq!(
+            config.courses.evaluation,
+            [here.join("c.toml"), "/d.toml".into()]
+        );
         let error = load("", &["courses.training="]).unwrap_err();
         assert!(error.contains("--set courses.training="), "{error}");
     }
@@ -354,8 +407,13 @@ mod tests {
     fn a_folder_whose_name_cannot_be_written_down_is_refused() {
         use std::os::unix::ffi::OsStrExt;
         let path = Path::new(std::ffi::OsStr::from_bytes(b"/runs/\xff/config.toml"));
-        let error = Config::parse_with("", path, &[], None).unwrap_err().to_string();
-        assert!(error.contains("is not UTF-8") && error.contains("rename"), "{error}");
+        let error = Config::parse_with("", path, &[], None)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("is not UTF-8") && error.contains("rename"),
+            "{error}"
+        );
     }
 
     #[test]
@@ -383,7 +441,10 @@ mod tests {
         ] {
             let error = load(text, &overrides).unwrap_err();
             match blamed {
-                Some(blamed) => assert!(error.starts_with(&format!("with --set {blamed}, ")), "{error}"),
+                Some(blamed) => assert!(
+                    error.starts_with(&format!("with --set {blamed}, ")),
+                    "{error}"
+                ),
                 None => assert!(!error.contains("--set"), "{error}"),
             }
             assert!(error.contains("test.toml"), "{error}");
@@ -394,12 +455,19 @@ mod tests {
     fn overrides_take_toml_and_bare_words() {
         let config = load(
             "",
-            &["run.seed=7", "run.device=cuda:1", "simulator.vehicle.preset=point"],
+            &[
+                "run.seed=7",
+                "run.device=cuda:1",
+                "simulator.vehicle.preset=point",
+            ],
         )
         .unwrap();
         assert_eq!(config.run.seed, 7);
         assert_eq!(config.run.device, Device::Cuda(1));
-        assert_eq!(config.simulator["vehicle"]["preset"].as_str(), Some("point"));
+        assert_eq!(
+            config.simulator["vehicle"]["preset"].as_str(),
+            Some("point")
+        );
     }
 
     #[test]
@@ -410,9 +478,21 @@ mod tests {
                 vec![],
                 vec!["test.toml", "[run]", "unknown field `sed`", "seed"],
             ),
-            ("[rum]", vec![], vec!["test.toml", "unknown section [rum]", "run"]),
-            ("[run]\nseed = \"x\"", vec![], vec!["test.toml", "[run]", "seed"]),
-            ("", vec!["seed=1"], vec!["--set seed=1", "section.key=value"]),
+            (
+                "[rum]",
+                vec![],
+                vec!["test.toml", "unknown section [rum]", "run"],
+            ),
+            (
+                "[run]\nseed = \"x\"",
+                vec![],
+                vec!["test.toml", "[run]", "seed"],
+            ),
+            (
+                "",
+                vec!["seed=1"],
+                vec!["--set seed=1", "section.key=value"],
+            ),
             ("", vec!["run.seed"], vec!["--set run.seed", "no `=`"]),
             (
                 "[learning]\nwarmup_steps = 200000",
@@ -420,17 +500,29 @@ mod tests {
                 vec!["learning.warmup_steps = 200000", "replay.capacity"],
             ),
             ("[run]\ndevice = \"gpu\"", vec![], vec!["gpu", "cuda:N"]),
-            ("[run]\nengine = \"jax\"", vec![], vec!["jax", "native", "libtorch"]),
+            (
+                "[run]\nengine = \"jax\"",
+                vec![],
+                vec!["jax", "native", "libtorch"],
+            ),
             (
                 "[run]\nengine = \"native\"",
                 vec!["run.device=cuda:1"],
-                vec!["run.engine = native", "run.device = cuda:1", "leave run.engine out"],
+                vec![
+                    "run.engine = native",
+                    "run.device = cuda:1",
+                    "leave run.engine out",
+                ],
             ),
             ("[sac]\ndiscount = nan", vec![], vec!["sac.discount = NaN"]),
             (
                 "[learning]\nsegment_steps = 1",
                 vec![],
-                vec!["learning.episodes_per_epoch = 10", "segment_steps = 1", "set it to 1"],
+                vec![
+                    "learning.episodes_per_epoch = 10",
+                    "segment_steps = 1",
+                    "set it to 1",
+                ],
             ),
             (
                 "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1",
@@ -455,12 +547,20 @@ mod tests {
             (
                 "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1\nhistory_steps = [2]",
                 vec![],
-                vec!["learning.history_steps = [2]", "segment_steps = 1", "name none"],
+                vec![
+                    "learning.history_steps = [2]",
+                    "segment_steps = 1",
+                    "name none",
+                ],
             ),
             (
                 "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1\nmirror = true",
                 vec![],
-                vec!["learning.mirror = true", "segment_steps = 1", "set it to false"],
+                vec![
+                    "learning.mirror = true",
+                    "segment_steps = 1",
+                    "set it to false",
+                ],
             ),
             (
                 "[learning]\nhistory_steps = [4, 2]",
@@ -493,7 +593,11 @@ mod tests {
                     "set it to one of them",
                 ],
             ),
-            ("[vae]\nlatent = 0", vec![], vec!["test.toml", "vae.latent = 0"]),
+            (
+                "[vae]\nlatent = 0",
+                vec![],
+                vec!["test.toml", "vae.latent = 0"],
+            ),
             (
                 "[td3]\ncritic_networks = 0",
                 vec![],
@@ -507,12 +611,20 @@ mod tests {
             (
                 "[learning]\nencoder = \"end-to-end\"",
                 vec!["learning.critic_input=ground-truth"],
-                vec!["learning.critic_input = ground-truth", "end-to-end", "sees no image"],
+                vec![
+                    "learning.critic_input = ground-truth",
+                    "end-to-end",
+                    "sees no image",
+                ],
             ),
             (
                 "[learning]\nencoder = \"end-to-end\"\naverage_updates = 10",
                 vec![],
-                vec!["learning.average_updates = 10", "end-to-end", "not averaged"],
+                vec![
+                    "learning.average_updates = 10",
+                    "end-to-end",
+                    "not averaged",
+                ],
             ),
             (
                 "[learning]\naverage_updates = 2000000",

@@ -17,17 +17,24 @@ const MOST_HISTORY: usize = 16;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearningSection {
-    /// What learns the policy: `sac` or `td3`, each with a section of its own. Default `sac`, as in the paper.
+    /// What learns the policy: `sac` or `td3`, each with a section of its own. Default `sac`, as in
+    /// the paper.
     pub algorithm: AlgorithmName,
-    /// What trains the encoder that turns a depth image into the numbers the policy sees: `vae`, or `end-to-end`, where the critic's loss does and `[vae]` has no say but in
-    /// the code's length and the encoder's precision. Every transition keeps its images then, 9 KiB each. Default `vae`, as in the paper.
+    /// What trains the encoder that turns a depth image into the numbers the policy sees: `vae`, or
+    /// `end-to-end`, where the critic's loss does and `[vae]` has no say but in the code's length
+    /// and the encoder's precision. Every transition keeps its images then, 9 KiB each. Default
+    /// `vae`, as in the paper.
     pub encoder: EncoderTraining,
-    /// Episodes flown with one frozen snapshot before the networks are updated. 1 is the paper's delayed learning. Default 10.
+    /// Episodes flown with one frozen snapshot before the networks are updated. 1 is the paper's
+    /// delayed learning. Default 10.
     pub episodes_per_epoch: u64,
-    /// Steps after which the networks are updated and the weights refreshed in the middle of an episode, which goes on with them. 0 waits for the episode's end, as
-    /// delayed learning does; 1 is direct updates, which the paper compares that with. One actor flies at a time then. Default 0.
+    /// Steps after which the networks are updated and the weights refreshed in the middle of an
+    /// episode, which goes on with them. 0 waits for the episode's end, as delayed learning does; 1
+    /// is direct updates, which the paper compares that with. One actor flies at a time then.
+    /// Default 0.
     pub segment_steps: u64,
-    /// Epochs a snapshot is behind when it is flown: 0 flies the newest; 1 lets actors fly while the learner updates. Default 0.
+    /// Epochs a snapshot is behind when it is flown: 0 flies the newest; 1 lets actors fly while
+    /// the learner updates. Default 0.
     pub policy_lag: u64,
     /// Policy updates per environment step, done at the end of the epoch. Default 0.5.
     pub updates_per_step: f64,
@@ -35,19 +42,24 @@ pub struct LearningSection {
     pub warmup_steps: usize,
     /// Episodes before training starts from the next level (paper: 10). Default 10.
     pub episodes_per_level: u64,
-    /// Start levels that training goes through before it returns to the first (paper: 5); at most the walls of the training course. Default 5.
+    /// Start levels that training goes through before it returns to the first (paper: 5); at most
+    /// the walls of the training course. Default 5.
     pub levels: u8,
     /// What the policy sees of a moment. Default `latent`, as in the paper.
     pub observation: Observation,
-    /// Earlier moments that it sees beside the present one, by how many steps they lie back, rising; before reset all was as at reset. What was in view a second ago no longer is when
+    /// Earlier moments that it sees beside the present one, by how many steps they lie back,
+    /// rising; before reset all was as at reset. What was in view a second ago no longer is when
     /// the drone is in an opening. Default none, as in the paper.
     pub history_steps: Vec<usize>,
-    /// Whether every episode is learned from twice, the second time as seen in a mirror, where left and right change places. Twice the transitions for the same steps
-    /// flown; they fill the replay twice as fast. Default false, as in the paper.
+    /// Whether every episode is learned from twice, the second time as seen in a mirror, where left
+    /// and right change places. Twice the transitions for the same steps flown; they fill the
+    /// replay twice as fast. Default false, as in the paper.
     pub mirror: bool,
-    /// Policy updates over which the policy that flies is averaged, exponentially weighted; 0 flies the policy as the last update left it. Default 0, as in the paper.
+    /// Policy updates over which the policy that flies is averaged, exponentially weighted; 0 flies
+    /// the policy as the last update left it. Default 0, as in the paper.
     pub average_updates: usize,
-    /// What the critic sees. It is needed in training alone, where the simulator can tell it more than the drone sees. Default `observation`, as in the paper.
+    /// What the critic sees. It is needed in training alone, where the simulator can tell it more
+    /// than the drone sees. Default `observation`, as in the paper.
     pub critic_input: CriticInput,
 }
 
@@ -112,7 +124,9 @@ impl LearningSection {
             self.average_updates,
             format!("is above {MOST_AVERAGED}: what flies would hardly ever change"),
         )?;
-        let rising = |steps: &[usize]| steps.is_sorted_by(|earlier, later| earlier < later) && !steps.starts_with(&[0]);
+        let rising = |steps: &[usize]| {
+            steps.is_sorted_by(|earlier, later| earlier < later) && !steps.starts_with(&[0])
+        };
         require(
             rising(&self.history_steps),
             "learning.history_steps",
@@ -132,7 +146,8 @@ impl LearningSection {
         1 + usize::from(self.mirror)
     }
 
-    /// Whether episodes are flown in segments, so that the weights are refreshed in the middle of them.
+    /// Whether episodes are flown in segments, so that the weights are refreshed in the middle of
+    /// them.
     pub fn in_segments(&self) -> bool {
         self.segment_steps > 0
     }
@@ -164,13 +179,16 @@ impl LearningSection {
         )
     }
 
-    /// One episode is under way in segments at a time: only then does each segment follow from all that was flown before.
+    /// One episode is under way in segments at a time: only then does each segment follow from all
+    /// that was flown before.
     fn validate_segments(&self) -> Result<(), Invalid> {
         require(
             self.segment_steps <= MOST_FLOWN as u64,
             "learning.segment_steps",
             self.segment_steps,
-            format!("is above {MOST_FLOWN}, the longest episode in segments: 0 learns after whole episodes"),
+            format!(
+                "is above {MOST_FLOWN}, the longest episode in segments: 0 learns after whole episodes"
+            ),
         )?;
         for (key, value, needed) in [
             ("learning.episodes_per_epoch", self.episodes_per_epoch, 1),
@@ -232,7 +250,8 @@ impl fmt::Display for AlgorithmName {
 pub enum EncoderTraining {
     /// A variational auto-encoder, which is then frozen (the paper).
     Vae,
-    /// The critic's loss: policy and critic see through one convolutional encoder (arXiv:1910.01741, arXiv:2004.13649).
+    /// The critic's loss: policy and critic see through one convolutional encoder
+    /// (arXiv:1910.01741, arXiv:2004.13649).
     EndToEnd,
 }
 
@@ -242,7 +261,8 @@ pub enum EncoderTraining {
 pub enum CriticInput {
     /// What the policy sees.
     Observation,
-    /// What the simulator knows: where drone and openings are, how the drone moves, and what disturbs it (an asymmetric critic, arXiv:1710.06542).
+    /// What the simulator knows: where drone and openings are, how the drone moves, and what
+    /// disturbs it (an asymmetric critic, arXiv:1710.06542).
     GroundTruth,
 }
 
@@ -252,7 +272,8 @@ pub enum Observation {
     /// The latent code of the depth image alone (the paper's state).
     #[serde(rename = "latent")]
     Latent,
-    /// The latent code and the vehicle's own lateral and vertical velocity in m/s: with a sluggish vehicle one image is not a state.
+    /// The latent code and the vehicle's own lateral and vertical velocity in m/s: with a sluggish
+    /// vehicle one image is not a state.
     #[serde(rename = "latent+velocity")]
     LatentVelocity,
     /// The above and the previous action.
@@ -260,7 +281,8 @@ pub enum Observation {
     LatentVelocityAction,
 }
 
-/// What the policy sees: the present moment, then earlier ones. Actor and learner build observations by this alone.
+/// What the policy sees: the present moment, then earlier ones. Actor and learner build
+/// observations by this alone.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct View {
     /// What is seen of each.
@@ -301,7 +323,8 @@ impl View {
         false
     }
 
-    /// Writes what is seen of a moment: the latent code, `velocity_mps` the vehicle's forward, left and up velocity, `previous_action` zero at reset.
+    /// Writes what is seen of a moment: the latent code, `velocity_mps` the vehicle's forward, left
+    /// and up velocity, `previous_action` zero at reset.
     ///
     /// # Panics
     /// When `into` is not [`View::moment_len`] long.
@@ -312,7 +335,11 @@ impl View {
         previous_action: &[f32; ACTION],
         into: &mut [f32],
     ) {
-        assert_eq!(into.len(), self.moment_len(), "what is seen has a fixed length");
+        assert_eq!(
+            into.len(),
+            self.moment_len(),
+            "what is seen has a fixed length"
+        );
         self.write_code(code, into);
         let rest = &mut into[self.latent..];
         if self.moment != Observation::Latent {
@@ -331,20 +358,25 @@ impl View {
         into[..self.latent].copy_from_slice(&code[..self.latent]);
     }
 
-    /// The moments seen at `step` of an episode, by their steps, in the vector's order; before reset there was the reset.
+    /// The moments seen at `step` of an episode, by their steps, in the vector's order; before
+    /// reset there was the reset.
     pub fn moments(&self, step: usize) -> impl Iterator<Item = usize> {
         std::iter::once(0)
             .chain(self.history_steps.iter().copied())
             .map(move |back| step.saturating_sub(back))
     }
 
-    /// Writes the observation vector at `step` of an episode, of which `write_moment` writes what is seen of a step's moment.
+    /// Writes the observation vector at `step` of an episode, of which `write_moment` writes what
+    /// is seen of a step's moment.
     ///
     /// # Panics
     /// When `into` is not [`View::len`] long.
     pub fn write(&self, step: usize, into: &mut [f32], write_moment: impl Fn(usize, &mut [f32])) {
         assert_eq!(into.len(), self.len(), "an observation has a fixed length");
-        for (moment, into) in self.moments(step).zip(into.chunks_exact_mut(self.moment_len())) {
+        for (moment, into) in self
+            .moments(step)
+            .zip(into.chunks_exact_mut(self.moment_len()))
+        {
             write_moment(moment, into);
         }
     }

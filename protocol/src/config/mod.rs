@@ -1,7 +1,8 @@
 //! The configuration of a run: one file, one struct, one section each.
 //!
-//! Every key has a default beside its documentation, unknown keys are refused, and [`Config::validate`] says which key is wrong, why, and what would
-//! happen. The `[simulator]` section belongs to the simulator and is passed on untouched: this crate does not know physics.
+//! Every key has a default beside its documentation, unknown keys are refused, and
+//! [`Config::validate`] says which key is wrong, why, and what would happen. The `[simulator]`
+//! section belongs to the simulator and is passed on untouched: this crate does not know physics.
 
 mod courses;
 mod evaluation;
@@ -22,7 +23,9 @@ use crate::segment::MOST_FLOWN;
 pub use courses::CoursesSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
 pub use file::{ConfigError, culprit};
-pub use learning::{AlgorithmName, CriticInput, EncoderTraining, LearningSection, Observation, View};
+pub use learning::{
+    AlgorithmName, CriticInput, EncoderTraining, LearningSection, Observation, View,
+};
 pub use replay::{ReplaySection, SuccessRule};
 pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};
@@ -54,7 +57,8 @@ pub struct Config {
     pub checkpoints: CheckpointSection,
     /// Limits and deadlines between the processes; without influence on what is learned.
     pub transport: TransportSection,
-    /// Vehicle, camera, reward, course generator, disturbances: see the simulator's `SimulatorSettings`.
+    /// Vehicle, camera, reward, course generator, disturbances: see the simulator's
+    /// `SimulatorSettings`.
     pub simulator: toml::Table,
 }
 
@@ -80,7 +84,8 @@ impl Config {
         }
     }
 
-    /// What computes policy and critic: the run's engine, but what learns from images is written for libtorch alone.
+    /// What computes policy and critic: the run's engine, but what learns from images is written
+    /// for libtorch alone.
     pub fn policy_engine(&self) -> Engine {
         match self.learning.encoder {
             EncoderTraining::Vae => self.run.engine(),
@@ -169,7 +174,10 @@ impl Config {
 
     /// What episodes in segments ask of other sections.
     fn validate_segments(&self) -> Result<(), Invalid> {
-        let (segment_steps, longest) = (self.learning.segment_steps, self.transport.max_records_per_episode);
+        let (segment_steps, longest) = (
+            self.learning.segment_steps,
+            self.transport.max_records_per_episode,
+        );
         require(
             !self.learning.in_segments()
                 || self.replay.success == SuccessRule::LevelUp
@@ -194,7 +202,8 @@ impl Config {
 /// Transitions held at most where each keeps its image: 1.8 GB of images.
 const MOST_WITH_IMAGES: usize = 200_000;
 
-/// How deep sections, tables and lists may lie within each other: the parser of TOML itself ends at 80, and recursion at the end of the stack.
+/// How deep sections, tables and lists may lie within each other: the parser of TOML itself ends at
+/// 80, and recursion at the end of the stack.
 pub(crate) const DEEPEST: usize = 16;
 
 /// Lists and tables within each other in `value`.
@@ -220,7 +229,12 @@ pub struct Invalid {
 
 /// The check of a network's width.
 pub(crate) fn require_width(key: &'static str, width: usize) -> Result<(), Invalid> {
-    require((1..=4096).contains(&width), key, width, "is outside 1..=4096")
+    require(
+        (1..=4096).contains(&width),
+        key,
+        width,
+        "is outside 1..=4096",
+    )
 }
 
 /// The check of a minibatch of transitions.

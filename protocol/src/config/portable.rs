@@ -1,4 +1,5 @@
-//! What of a configuration is the same wherever the run's directory lies: for comparing two of them.
+//! What of a configuration is the same wherever the run's directory lies: for comparing two of
+//! them.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -9,7 +10,8 @@ use xxhash_rust::xxh3::xxh3_64;
 use super::Config;
 
 impl Config {
-    /// The whole configuration as TOML, but of course files the names only, so that a run's directory can be moved.
+    /// The whole configuration as TOML, but of course files the names only, so that a run's
+    /// directory can be moved.
     pub fn portable(&self) -> String {
         let mut portable = self.clone();
         for course in portable.courses.paths_mut() {
@@ -18,7 +20,8 @@ impl Config {
         portable.to_toml()
     }
 
-    /// Fingerprint of the [portable](Config::portable) configuration; processes of one run compare it.
+    /// Fingerprint of the [portable](Config::portable) configuration; processes of one run compare
+    /// it.
     pub fn digest(&self) -> u64 {
         Self::digest_of(&self.portable())
     }
@@ -28,21 +31,32 @@ impl Config {
         xxh3_64(portable.as_bytes())
     }
 
-    /// In what `other`, the portable text of another configuration, differs from this one: for each key `section.key = value there, value here`.
+    /// In what `other`, the portable text of another configuration, differs from this one: for each
+    /// key `section.key = value there, value here`.
     ///
     /// # Errors
     /// When `other` is not TOML.
     pub fn differences(&self, other: &str) -> Result<Vec<String>, toml::de::Error> {
         let there = flat(&toml::from_str(other)?);
-        let here = flat(&toml::from_str(&self.portable()).expect("what was written as TOML is TOML"));
+        let here =
+            flat(&toml::from_str(&self.portable()).expect("what was written as TOML is TOML"));
         let keys: std::collections::BTreeSet<&String> = there.keys().chain(here.keys()).collect();
         let value = |values: &BTreeMap<String, String>, key: &str| {
-            values.get(key).cloned().unwrap_or_else(|| "nothing".to_owned())
+            values
+                .get(key)
+                .cloned()
+                .unwrap_or_else(|| "nothing".to_owned())
         };
         Ok(keys
             .into_iter()
             .filter(|&key| there.get(key) != here.get(key))
-            .map(|key| format!("{key} = {} there, {} here", value(&there, key), value(&here, key)))
+            .map(|key| {
+                format!(
+                    "{key} = {} there, {} here",
+                    value(&there, key),
+                    value(&here, key)
+                )
+            })
             .collect())
     }
 }
@@ -74,12 +88,18 @@ mod tests {
     #[test]
     fn two_configurations_differ_in_the_keys_that_differ() {
         let here = Config::default();
-        assert_eq!(here.differences(&here.portable()).unwrap(), Vec::<String>::new());
+        assert_eq!(
+            here.differences(&here.portable()).unwrap(),
+            Vec::<String>::new()
+        );
         let mut there = here.clone();
         there.sac.discount = 0.5;
         there.simulator.insert(
             "vehicle".into(),
-            Value::Table(Table::from_iter([("preset".to_owned(), Value::from("point"))])),
+            Value::Table(Table::from_iter([(
+                "preset".to_owned(),
+                Value::from("point"),
+            )])),
         );
         let differences = here.differences(&there.portable()).unwrap();
         assert_eq!(
@@ -95,7 +115,8 @@ mod tests {
     fn where_the_courses_lie_makes_no_difference() {
         let here = Config::default();
         let mut moved = here.clone();
-        moved.courses.training = PathBuf::from("/elsewhere").join(here.courses.training.file_name().unwrap());
+        moved.courses.training =
+            PathBuf::from("/elsewhere").join(here.courses.training.file_name().unwrap());
         assert_eq!(moved.digest(), here.digest());
         assert!(here.differences(&moved.portable()).unwrap().is_empty());
     }

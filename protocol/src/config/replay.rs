@@ -10,12 +10,13 @@ use super::{Invalid, require};
 pub struct ReplaySection {
     /// Transitions held in both parts together (paper: 2^17). Default 131072.
     pub capacity: usize,
-    /// Share of the capacity, and of every minibatch, that belongs to success experience (paper: 0.125); with 0 there is one part for everything, as in
-    /// ordinary SAC. Default 0.125.
+    /// Share of the capacity, and of every minibatch, that belongs to success experience (paper:
+    /// 0.125); with 0 there is one part for everything, as in ordinary SAC. Default 0.125.
     pub success_share: f64,
     /// What counts as success experience; the paper does not say. Default `level-up`.
     pub success: SuccessRule,
-    /// Steps that led to the level-up and count as success with it; only for `success = "approach"`. Default 5.
+    /// Steps that led to the level-up and count as success with it; only for `success =
+    /// "approach"`. Default 5.
     pub approach_steps: usize,
 }
 

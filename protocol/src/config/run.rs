@@ -17,13 +17,14 @@ pub struct RunSection {
     pub episodes: u64,
     /// Where the learner computes: `cpu` or `cuda:N`. Default `cpu`.
     pub device: Device,
-    /// What computes the learner's networks: `native` or `libtorch`. Part of the result: the two add in different orders. Default: `native` on the
-    /// processor, `libtorch` on a CUDA device, where there is no other. Convolutions that `learning.encoder = "end-to-end"` or `vae.decoder = "u-net"` train are on `libtorch` in
-    /// any case; asking for `native` is refused then.
+    /// What computes the learner's networks: `native` or `libtorch`. Part of the result: the two
+    /// add in different orders. Default: `native` on the processor, `libtorch` on a CUDA device,
+    /// where there is no other. Convolutions that `learning.encoder = "end-to-end"` or `vae.decoder
+    /// = "u-net"` train are on `libtorch` in any case; asking for `native` is refused then.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub engine: Option<Engine>,
-    /// Threads that the learner's networks are computed with. Of the engine `libtorch` part of the result, as another count sums in another order; of `native` not.
-    /// Default 2.
+    /// Threads that the learner's networks are computed with. Of the engine `libtorch` part of the
+    /// result, as another count sums in another order; of `native` not. Default 2.
     pub learner_threads: usize,
 }
 

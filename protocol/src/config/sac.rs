@@ -3,19 +3,22 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Invalid, require, require_batch_size, require_critic_networks, require_discount, require_learning_rate,
-    require_width,
+    Invalid, require, require_batch_size, require_critic_networks, require_discount,
+    require_learning_rate, require_width,
 };
 use crate::ACTION;
 
-/// `[sac]`: soft actor-critic with learned temperature (arXiv:1812.05905). The paper leaves every value here open.
+/// `[sac]`: soft actor-critic with learned temperature (arXiv:1812.05905). The paper leaves every
+/// value here open.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SacSection {
-    /// Width of the hidden layers of policy (three) and critic (two). Default 256, as in arXiv:1812.05905.
+    /// Width of the hidden layers of policy (three) and critic (two). Default 256, as in
+    /// arXiv:1812.05905.
     pub hidden_width: usize,
-    /// Networks that give the critic's two estimates of Q: 1, with two outputs (paper), or 2, with one each, whose errors have less in common, so that the smaller estimate is
-    /// one of a value that both overrate less often. Default 1.
+    /// Networks that give the critic's two estimates of Q: 1, with two outputs (paper), or 2, with
+    /// one each, whose errors have less in common, so that the smaller estimate is one of a value
+    /// that both overrate less often. Default 1.
     pub critic_networks: usize,
     /// Transitions in a minibatch. Default 256, as in arXiv:1812.05905.
     pub batch_size: usize,
@@ -60,7 +63,10 @@ impl SacSection {
         for (key, rate) in [
             ("sac.policy_learning_rate", self.policy_learning_rate),
             ("sac.critic_learning_rate", self.critic_learning_rate),
-            ("sac.temperature_learning_rate", self.temperature_learning_rate),
+            (
+                "sac.temperature_learning_rate",
+                self.temperature_learning_rate,
+            ),
         ] {
             require_learning_rate(key, rate)?;
         }

@@ -3,19 +3,22 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Invalid, require, require_batch_size, require_critic_networks, require_discount, require_learning_rate,
-    require_width,
+    Invalid, require, require_batch_size, require_critic_networks, require_discount,
+    require_learning_rate, require_width,
 };
 
-/// `[td3]`: twin delayed deep deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477), which the paper compares with (its Fig. 11) without saying any of these
-/// values. Networks are as wide and minibatches as large as in `[sac]` by default, so that the two are compared on equal terms.
+/// `[td3]`: twin delayed deep deterministic policy gradient (Fujimoto et al. 2018,
+/// arXiv:1802.09477), which the paper compares with (its Fig. 11) without saying any of these
+/// values. Networks are as wide and minibatches as large as in `[sac]` by default, so that the two
+/// are compared on equal terms.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Td3Section {
     /// Width of the hidden layers of policy (three) and critic (two). Default 256.
     pub hidden_width: usize,
-    /// Networks that give the critic's two estimates of Q: 1, with two outputs (paper), or 2, with one each, whose errors have less in common, so that the smaller estimate is
-    /// one of a value that both overrate less often. Default 1.
+    /// Networks that give the critic's two estimates of Q: 1, with two outputs (paper), or 2, with
+    /// one each, whose errors have less in common, so that the smaller estimate is one of a value
+    /// that both overrate less often. Default 1.
     pub critic_networks: usize,
     /// Transitions in a minibatch. Default 256.
     pub batch_size: usize,
@@ -25,11 +28,14 @@ pub struct Td3Section {
     pub critic_learning_rate: f64,
     /// Discount per control period, γ. Default 0.99.
     pub discount: f64,
-    /// Share of policy and critic that moves into the target networks when the policy is updated, τ. Default 0.005.
+    /// Share of policy and critic that moves into the target networks when the policy is updated,
+    /// τ. Default 0.005.
     pub target_rate: f64,
-    /// Standard deviation of the noise added to actions in training episodes, each command in [-1, 1]. Default 0.1, as in arXiv:1802.09477.
+    /// Standard deviation of the noise added to actions in training episodes, each command in [-1,
+    /// 1]. Default 0.1, as in arXiv:1802.09477.
     pub exploration_noise: f64,
-    /// Standard deviation of the noise that smooths the targets. Default 0.2, as in arXiv:1802.09477.
+    /// Standard deviation of the noise that smooths the targets. Default 0.2, as in
+    /// arXiv:1802.09477.
     pub target_noise: f64,
     /// Bound of that noise. Default 0.5, as in arXiv:1802.09477.
     pub target_noise_bound: f64,

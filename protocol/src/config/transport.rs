@@ -6,17 +6,21 @@ use serde::{Deserialize, Serialize};
 
 use super::{Invalid, require};
 
-/// `[transport]`: limits and deadlines between the processes. Nothing here influences what is learned.
+/// `[transport]`: limits and deadlines between the processes. Nothing here influences what is
+/// learned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TransportSection {
     /// Actors that may be attached at one time. Default 64.
     pub max_actors: usize,
-    /// Records of the longest possible episode: its steps and the closing record. Bounds the shared memory of an actor, 9.4 KiB a record. Default 256.
+    /// Records of the longest possible episode: its steps and the closing record. Bounds the shared
+    /// memory of an actor, 9.4 KiB a record. Default 256.
     pub max_records_per_episode: usize,
-    /// Tickets an actor holds at one time; 2 keep it busy while the learner takes an episode in. Default 2.
+    /// Tickets an actor holds at one time; 2 keep it busy while the learner takes an episode in.
+    /// Default 2.
     pub tickets_per_actor: usize,
-    /// Seconds without a record or a heartbeat after which an actor's tickets are issued again. Default 5.
+    /// Seconds without a record or a heartbeat after which an actor's tickets are issued again.
+    /// Default 5.
     pub actor_silence_secs: f64,
     /// Seconds a ticket may take before it is issued again. Default 60.
     pub episode_deadline_secs: f64,
@@ -38,10 +42,12 @@ impl Default for TransportSection {
 }
 
 impl TransportSection {
-    /// Interval of the heartbeats that both sides give, well below either silence limit, and at most two seconds: all that is done at times is done
-    /// at heartbeats.
+    /// Interval of the heartbeats that both sides give, well below either silence limit, and at
+    /// most two seconds: all that is done at times is done at heartbeats.
     pub fn heartbeat(&self) -> Duration {
-        Duration::from_secs_f64((self.actor_silence_secs.min(self.learner_silence_secs) / 8.0).min(2.0))
+        Duration::from_secs_f64(
+            (self.actor_silence_secs.min(self.learner_silence_secs) / 8.0).min(2.0),
+        )
     }
 
     pub(super) fn validate(&self) -> Result<(), Invalid> {
@@ -65,7 +71,10 @@ impl TransportSection {
         )?;
         for (key, secs) in [
             ("transport.actor_silence_secs", self.actor_silence_secs),
-            ("transport.episode_deadline_secs", self.episode_deadline_secs),
+            (
+                "transport.episode_deadline_secs",
+                self.episode_deadline_secs,
+            ),
             ("transport.learner_silence_secs", self.learner_silence_secs),
         ] {
             require(

@@ -7,19 +7,23 @@ use serde::{Deserialize, Serialize};
 use super::{Engine, Invalid, RunSection, require, require_learning_rate};
 use crate::LONGEST_LATENT;
 
-/// Lengths a latent code may have. Records have room for the longest; mean and log-variance of the shortest fill the 16 lanes that the learner adds up at a time.
+/// Lengths a latent code may have. Records have room for the longest; mean and log-variance of the
+/// shortest fill the 16 lanes that the learner adds up at a time.
 const LATENTS: [usize; 4] = [8, 16, 32, LONGEST_LATENT];
 
-/// `[vae]`: the variational auto-encoder (paper, section 3.3), trained together with the agent and then frozen.
+/// `[vae]`: the variational auto-encoder (paper, section 3.3), trained together with the agent and
+/// then frozen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VaeSection {
     /// Length of the latent code: 8, 16, 32 or 64 (paper: 32). Default 32.
     pub latent: usize,
-    /// Environment steps during which the VAE is trained; then it is frozen and stored latents are recomputed (paper: 10000). Default 10000.
+    /// Environment steps during which the VAE is trained; then it is frozen and stored latents are
+    /// recomputed (paper: 10000). Default 10000.
     pub train_steps: usize,
-    /// Environment steps after which stored latents are recomputed while the VAE is still trained, so that a policy that learns meanwhile learns from codes of one
-    /// encoder. 0 recomputes them only when it is frozen, as in the paper. Default 0.
+    /// Environment steps after which stored latents are recomputed while the VAE is still trained,
+    /// so that a policy that learns meanwhile learns from codes of one encoder. 0 recomputes them
+    /// only when it is frozen, as in the paper. Default 0.
     pub recode_steps: usize,
     /// VAE steps per environment step, done at the end of the epoch. Default 0.1.
     pub updates_per_step: f64,
@@ -27,13 +31,18 @@ pub struct VaeSection {
     pub batch_size: usize,
     /// Adam's step size. Default 1e-3.
     pub learning_rate: f64,
-    /// Weight of the Kullback-Leibler term against the squared error summed over the image's pixels. Default 1, the plain VAE.
+    /// Weight of the Kullback-Leibler term against the squared error summed over the image's
+    /// pixels. Default 1, the plain VAE.
     pub kl_weight: f64,
-    /// What reproduces the image, in training alone: `plain`, or `u-net`, which sees the encoder's feature maps beside the code (arXiv:1505.04597). The encoder that flies is the
-    /// same. A U-Net is trained on libtorch, whatever trains the policy. Default `plain`, as in the paper.
+    /// What reproduces the image, in training alone: `plain`, or `u-net`, which sees the encoder's
+    /// feature maps beside the code (arXiv:1505.04597). The encoder that flies is the same. A U-Net
+    /// is trained on libtorch, whatever trains the policy. Default `plain`, as in the paper.
     pub decoder: DecoderName,
-    /// In what precision depth images are encoded: `f32` or `bf16`. Part of the result. AVX-512's instruction for bfloat16 is used where it is, AMX never: AMD's Zen 4
-    /// encodes nearly twice as fast with it, Intel's Sapphire and Emerald Rapids more slowly than in `f32`; all processors get the same numbers (those below 1.2e-38 apart). The VAE is trained in `f32` either way. Default `f32`.
+    /// In what precision depth images are encoded: `f32` or `bf16`. Part of the result. AVX-512's
+    /// instruction for bfloat16 is used where it is, AMX never: AMD's Zen 4 encodes nearly twice as
+    /// fast with it, Intel's Sapphire and Emerald Rapids more slowly than in `f32`; all processors
+    /// get the same numbers (those below 1.2e-38 apart). The VAE is trained in `f32` either way.
+    /// Default `f32`.
     pub encoder_precision: Precision,
 }
 
@@ -54,7 +63,8 @@ impl Default for VaeSection {
 }
 
 impl VaeSection {
-    /// What computes it in a run with these settings: the run's engine, but a U-Net is written for libtorch alone.
+    /// What computes it in a run with these settings: the run's engine, but a U-Net is written for
+    /// libtorch alone.
     pub fn engine(&self, run: &RunSection) -> Engine {
         match self.decoder {
             DecoderName::Plain => run.engine(),

@@ -27,11 +27,17 @@ pub(super) fn checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {
     Ok(checksums)
 }
 
-/// Checks that the files in `folder` are those of `checksums`, and that the run flies through no others.
-pub(super) fn verify(folder: &Path, checksums: &BTreeMap<String, String>, config: &Config) -> Result<(), RunError> {
+/// Checks that the files in `folder` are those of `checksums`, and that the run flies through no
+/// others.
+pub(super) fn verify(
+    folder: &Path,
+    checksums: &BTreeMap<String, String>,
+    config: &Config,
+) -> Result<(), RunError> {
     for path in config.courses.paths() {
         let name = path.file_name().and_then(|name| name.to_str());
-        let is_known = path.parent() == Some(folder) && name.is_some_and(|name| checksums.contains_key(name));
+        let is_known =
+            path.parent() == Some(folder) && name.is_some_and(|name| checksums.contains_key(name));
         // A run that was created without copies vouches for none.
         if !checksums.is_empty() && !is_known {
             return Err(RunError::CourseChanged {

@@ -1,8 +1,10 @@
 //! Who a run is, and which incarnation of its learner is the present one.
 //!
-//! Each start of the learner, the first or one after a death, is an incarnation with a transport of its own: fresh services in a folder and under a prefix that no
-//! incarnation before it had. So nothing that a killed process left half done is ever met again. The learner announces its incarnation by a small file once its
-//! services are open; actors look there, and again whenever they have lost it.
+//! Each start of the learner, the first or one after a death, is an incarnation with a transport of
+//! its own: fresh services in a folder and under a prefix that no incarnation before it had. So
+//! nothing that a killed process left half done is ever met again. The learner announces its
+//! incarnation by a small file once its services are open; actors look there, and again whenever
+//! they have lost it.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -31,12 +33,14 @@ pub struct RunIdentity {
     pub run: RunId,
     /// [`Config::digest`].
     pub config_digest: u64,
-    /// Checksum (xxh3, hexadecimal) of each file in [`courses`](super::RunDirectory::courses) as the run was started with it, by its name.
+    /// Checksum (xxh3, hexadecimal) of each file in [`courses`](super::RunDirectory::courses) as
+    /// the run was started with it, by its name.
     pub courses: BTreeMap<String, String>,
 }
 
-/// One start of a learner: its number among those of its run since the first of the processes that live now was started. A small number, because it
-/// stands twice in the path of a listener's socket.
+/// One start of a learner: its number among those of its run since the first of the processes that
+/// live now was started. A small number, because it stands twice in the path of a listener's
+/// socket.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct LearnerIncarnation(u32);
@@ -57,7 +61,11 @@ impl LearnerIncarnation {
     pub(super) fn parse(name: &str) -> Option<Self> {
         /// No run dies as often; and a listener's socket has room for so many digits.
         const MOST: u32 = 9_999_999;
-        let incarnation = name.parse().ok().filter(|&incarnation| incarnation < MOST).map(Self)?;
+        let incarnation = name
+            .parse()
+            .ok()
+            .filter(|&incarnation| incarnation < MOST)
+            .map(Self)?;
         (incarnation.to_string() == name).then_some(incarnation)
     }
 }
@@ -75,8 +83,8 @@ impl RunIdentity {
         }
     }
 
-    /// Where the run's transport lies; the folder is there while a process of the run incarnations. Short, because a listener's socket below it may have no
-    /// more than 108 characters.
+    /// Where the run's transport lies; the folder is there while a process of the run incarnations.
+    /// Short, because a listener's socket below it may have no more than 108 characters.
     pub fn transport_folder(&self) -> PathBuf {
         super::sweep::MACHINE.transport_folder(self.run)
     }
@@ -96,7 +104,8 @@ impl RunIdentity {
         format!("{}{incarnation}_", self.shared_memory_prefix())
     }
 
-    /// Takes everybody else's rights to the segments of `incarnation` away: iceoryx2 gives one of them, a counter, to all users of the machine.
+    /// Takes everybody else's rights to the segments of `incarnation` away: iceoryx2 gives one of
+    /// them, a counter, to all users of the machine.
     ///
     /// # Errors
     /// When the segments cannot be looked at or changed.
@@ -106,7 +115,10 @@ impl RunIdentity {
     }
 
     /// The shared-memory segments of `incarnation`.
-    pub(crate) fn shared_memory(&self, incarnation: LearnerIncarnation) -> impl Iterator<Item = PathBuf> {
+    pub(crate) fn shared_memory(
+        &self,
+        incarnation: LearnerIncarnation,
+    ) -> impl Iterator<Item = PathBuf> {
         super::sweep::MACHINE.segments(&self.incarnation_prefix(incarnation))
     }
 
@@ -122,7 +134,8 @@ impl RunIdentity {
         super::sweep::supervisor_lock(&self.transport_folder())
     }
 
-    /// What the living learner of this run has announced; `None` when there is none, or it has not opened its services yet. Looking leaves no trace.
+    /// What the living learner of this run has announced; `None` when there is none, or it has not
+    /// opened its services yet. Looking leaves no trace.
     ///
     /// # Errors
     /// [`PlaceError`] when the run belongs to another user, or its folder cannot be read.
@@ -133,7 +146,8 @@ impl RunIdentity {
         Announcement::read(&self.announcement_file())
     }
 
-    /// Whether a learner of this run lives on this machine, its services open or not. Looking leaves no trace.
+    /// Whether a learner of this run lives on this machine, its services open or not. Looking
+    /// leaves no trace.
     ///
     /// # Errors
     /// [`PlaceError`] when the run belongs to another user, or its folder cannot be read.
@@ -142,7 +156,8 @@ impl RunIdentity {
     }
 }
 
-/// What a learner says of its present incarnation: everything in which a process that joins it must not differ.
+/// What a learner says of its present incarnation: everything in which a process that joins it must
+/// not differ.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Announcement {
@@ -196,7 +211,11 @@ impl Announcement {
             if expected == found {
                 Ok(())
             } else {
-                Err(Difference { what, expected, found })
+                Err(Difference {
+                    what,
+                    expected,
+                    found,
+                })
             }
         };
         same(
@@ -205,13 +224,21 @@ impl Announcement {
             mine.protocol_version.to_string(),
         )?;
         same("run", digest(self.run.0), digest(mine.run.0))?;
-        same("configuration", digest(self.config_digest), digest(mine.config_digest))?;
+        same(
+            "configuration",
+            digest(self.config_digest),
+            digest(mine.config_digest),
+        )?;
         same(
             "snapshot layout",
             digest(self.snapshot_layout),
             digest(mine.snapshot_layout),
         )?;
-        same("record layout", self.record_layout.clone(), mine.record_layout)
+        same(
+            "record layout",
+            self.record_layout.clone(),
+            mine.record_layout,
+        )
     }
 
     pub(super) fn read(path: &Path) -> Result<Option<Self>, PlaceError> {
@@ -232,20 +259,34 @@ mod tests {
     #[test]
     fn an_incarnation_is_known_by_the_name_of_its_folder() {
         let incarnation = LearnerIncarnation::after(Some(LearnerIncarnation(41)));
-        assert_eq!(LearnerIncarnation::parse(&incarnation.to_string()), Some(incarnation));
-        for strange in ["", "incarnation", "-1", "+1", "01", "1f", "../1", "4294967296"] {
+        assert_eq!(
+            LearnerIncarnation::parse(&incarnation.to_string()),
+            Some(incarnation)
+        );
+        for strange in [
+            "",
+            "incarnation",
+            "-1",
+            "+1",
+            "01",
+            "1f",
+            "../1",
+            "4294967296",
+        ] {
             assert_eq!(LearnerIncarnation::parse(strange), None, "{strange}");
         }
     }
 
     #[test]
     fn the_transport_leaves_room_for_socket_names() {
-        // folder/prefix<number of a port>.event, ended by a zero byte; the number has up to 39 digits.
+        // folder/prefix<number of a port>.event, ended by a zero byte; the number has up to 39
+        // digits.
         const ROOM: usize = 108 - 1 - "/".len() - ".event".len() - 39;
         let identity = RunIdentity::new(&Config::default(), BTreeMap::new());
         let incarnation = LearnerIncarnation(9999);
         assert!(
-            identity.incarnation_folder(incarnation).as_os_str().len() + identity.incarnation_prefix(incarnation).len()
+            identity.incarnation_folder(incarnation).as_os_str().len()
+                + identity.incarnation_prefix(incarnation).len()
                 <= ROOM
         );
     }
@@ -256,7 +297,9 @@ mod tests {
         let identity = RunIdentity::new(&config, BTreeMap::new());
         let told = Announcement::new(&identity, LearnerIncarnation::after(None), &config);
         assert_eq!(told.check(&identity, &config), Ok(()));
-        let refusal = |identity: &RunIdentity, config: &Config| told.check(identity, config).unwrap_err().to_string();
+        let refusal = |identity: &RunIdentity, config: &Config| {
+            told.check(identity, config).unwrap_err().to_string()
+        };
         let other = |change: fn(&mut RunIdentity)| {
             let mut other = identity.clone();
             change(&mut other);

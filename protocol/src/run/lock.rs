@@ -1,6 +1,8 @@
-//! The locks of a run: exactly one learner, with a transport of its own for each of its incarnations, and exactly one supervisor.
+//! The locks of a run: exactly one learner, with a transport of its own for each of its
+//! incarnations, and exactly one supervisor.
 //!
-//! A lock is taken by two locks, one on the run's directory and one in the transport's folder: a copy of the directory is the same run.
+//! A lock is taken by two locks, one on the run's directory and one in the transport's folder: a
+//! copy of the directory is the same run.
 
 use std::fs::{self, File, TryLockError};
 use std::path::PathBuf;
@@ -11,7 +13,8 @@ use super::place::{HeldLock, Locked, PlaceError, is_locked, lock, make_folder};
 use super::presence::Presence;
 use super::sweep::MACHINE;
 
-/// The learner's lock of a run, taken. To be held as long as the learner lives, and longer than its ports.
+/// The learner's lock of a run, taken. To be held as long as the learner lives, and longer than its
+/// ports.
 #[derive(Debug)]
 pub struct LearnerLock {
     incarnation: LearnerIncarnation,
@@ -50,7 +53,8 @@ pub enum LockError {
 }
 
 impl LearnerLock {
-    /// Takes the lock, removes what dead incarnations of this run left, and begins a new incarnation.
+    /// Takes the lock, removes what dead incarnations of this run left, and begins a new
+    /// incarnation.
     ///
     /// # Errors
     /// [`LockError::Taken`] when another learner of this run incarnations.
@@ -59,10 +63,11 @@ impl LearnerLock {
         let presence = Presence::enter(identity)?;
         let in_transport = take_lock("learner", identity.learner_lock())?;
 
-        // The last incarnation's number stands in both files: the transport's folder may have been removed from under its processes, and of a directory there
-        // may be copies.
-        let incarnation =
-            LearnerIncarnation::after(last_incarnation(&in_transport)?.max(last_incarnation(&in_directory)?));
+        // The last incarnation's number stands in both files: the transport's folder may have been
+        // removed from under its processes, and of a directory there may be copies.
+        let incarnation = LearnerIncarnation::after(
+            last_incarnation(&in_transport)?.max(last_incarnation(&in_directory)?),
+        );
         let words = format!("{} {incarnation}", std::process::id());
         in_transport.write(&words)?;
         in_directory.write(&words)?;
@@ -135,7 +140,8 @@ impl RunDirectory {
 }
 
 impl RunIdentity {
-    /// Tells actors that the services of `announcement`'s incarnation are open. For the learner that holds the lock.
+    /// Tells actors that the services of `announcement`'s incarnation are open. For the learner
+    /// that holds the lock.
     ///
     /// # Errors
     /// [`PlaceError`] when the file cannot be written.
@@ -155,7 +161,10 @@ fn take_lock(who: &'static str, path: PathBuf) -> Result<HeldLock, LockError> {
         Locked::Taken { words } => Err(LockError::Taken {
             who,
             lock: path,
-            pid: words.split_whitespace().next().and_then(|pid| pid.parse().ok()),
+            pid: words
+                .split_whitespace()
+                .next()
+                .and_then(|pid| pid.parse().ok()),
         }),
     }
 }
@@ -171,7 +180,9 @@ fn last_incarnation(lock: &HeldLock) -> Result<Option<LearnerIncarnation>, Place
 
 fn remove_announcement(path: &std::path::Path) -> Result<(), PlaceError> {
     match fs::remove_file(path) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(PlaceError::at(path)(error)),
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(PlaceError::at(path)(error))
+        }
         _ => Ok(()),
     }
 }
@@ -201,7 +212,10 @@ mod tests {
         let refusal = LearnerLock::take(&RunDirectory::new(copied.path()), &identity)
             .unwrap_err()
             .to_string();
-        assert!(refusal.contains("another learner of this run lives"), "{refusal}");
+        assert!(
+            refusal.contains("another learner of this run lives"),
+            "{refusal}"
+        );
         assert!(
             refusal.contains(&identity.learner_lock().display().to_string()),
             "{refusal}"
@@ -224,9 +238,17 @@ mod tests {
         assert!(!run.is_under_way().unwrap());
         let lock = SupervisorLock::take(&run, &identity).unwrap();
         assert!(run.is_under_way().unwrap() && !copy.is_under_way().unwrap());
-        for (other, lock) in [(&run, run.root().to_owned()), (&copy, identity.supervisor_lock())] {
-            let refusal = SupervisorLock::take(other, &identity).unwrap_err().to_string();
-            assert!(refusal.starts_with("another supervisor of this run lives"), "{refusal}");
+        for (other, lock) in [
+            (&run, run.root().to_owned()),
+            (&copy, identity.supervisor_lock()),
+        ] {
+            let refusal = SupervisorLock::take(other, &identity)
+                .unwrap_err()
+                .to_string();
+            assert!(
+                refusal.starts_with("another supervisor of this run lives"),
+                "{refusal}"
+            );
             assert!(refusal.contains(&lock.display().to_string()), "{refusal}");
         }
         drop(lock);
@@ -261,7 +283,10 @@ mod tests {
         identity
             .announce(&Announcement::new(&identity, dead, &Config::default()))
             .unwrap();
-        assert_eq!(identity.present_incarnation().unwrap().unwrap().incarnation, dead);
+        assert_eq!(
+            identity.present_incarnation().unwrap().unwrap().incarnation,
+            dead
+        );
         drop(lock);
         assert!(segment.exists());
 

@@ -1,4 +1,5 @@
-//! A run on this machine: who it is, where everything in its directory lies, who of it lives, and what it leaves in shared memory.
+//! A run on this machine: who it is, where everything in its directory lies, who of it lives, and
+//! what it leaves in shared memory.
 
 mod courses;
 mod identity;
@@ -94,22 +95,31 @@ impl RunDirectory {
         self.logs().join(format!("actor-{actor}.log"))
     }
 
-    /// How the best snapshot flies the suite called `suite`, as `skein-evaluate` tells it; an experiment has it written.
+    /// How the best snapshot flies the suite called `suite`, as `skein-evaluate` tells it; an
+    /// experiment has it written.
     pub fn suite_json(&self, suite: &str) -> PathBuf {
         self.root.join("suites").join(format!("{suite}.json"))
     }
 
-    /// Episodes committed in the newest of the run's checkpoints, by their names; whether one is sound, only reading it can tell.
+    /// Episodes committed in the newest of the run's checkpoints, by their names; whether one is
+    /// sound, only reading it can tell.
     pub fn newest_checkpoint(&self) -> Option<u64> {
-        let episodes = |entry: fs::DirEntry| entry.file_name().to_str()?.strip_prefix("episode-")?.parse().ok();
+        let episodes = |entry: fs::DirEntry| {
+            entry
+                .file_name()
+                .to_str()?
+                .strip_prefix("episode-")?
+                .parse()
+                .ok()
+        };
         fs::read_dir(self.checkpoints())
             .ok()?
             .filter_map(|entry| episodes(entry.ok()?))
             .max()
     }
 
-    /// Creates the directory with its folders, for this user alone, and writes the resolved configuration and a new identity, which vouches for the course
-    /// files that are in it already.
+    /// Creates the directory with its folders, for this user alone, and writes the resolved
+    /// configuration and a new identity, which vouches for the course files that are in it already.
     ///
     /// # Errors
     /// [`RunError`] names the path.
@@ -129,7 +139,8 @@ impl RunDirectory {
             env!("CARGO_PKG_VERSION"),
             config.to_toml()
         );
-        // A power cut shortly after must not leave checkpoints of a run that nobody knows any more: all of it is brought to disk.
+        // A power cut shortly after must not leave checkpoints of a run that nobody knows any more:
+        // all of it is brought to disk.
         durable::replace(&self.config(), text.as_bytes()).map_err(io(self.config()))?;
         let resolved = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
         let courses = courses::checksums(&self.courses()).map_err(io(self.courses()))?;
@@ -145,19 +156,28 @@ impl RunDirectory {
         Ok(identity)
     }
 
-    /// Makes the folders that are not there: copies of a run may lack those that were empty. That of the checkpoints is none of them, because a run without
-    /// any is begun anew.
+    /// Makes the folders that are not there: copies of a run may lack those that were empty. That
+    /// of the checkpoints is none of them, because a run without any is begun anew.
     ///
     /// # Errors
     /// [`RunError`] names the path.
     pub fn make_folders(&self) -> Result<(), RunError> {
-        for folder in [self.logs(), self.tensorboard(), self.snapshots(), self.plots()] {
-            fs::create_dir_all(&folder).map_err(|source| RunError::Io { path: folder, source })?;
+        for folder in [
+            self.logs(),
+            self.tensorboard(),
+            self.snapshots(),
+            self.plots(),
+        ] {
+            fs::create_dir_all(&folder).map_err(|source| RunError::Io {
+                path: folder,
+                source,
+            })?;
         }
         Ok(())
     }
 
-    /// Reads identity and configuration of an existing run; its course files are those it was started with.
+    /// Reads identity and configuration of an existing run; its course files are those it was
+    /// started with.
     ///
     /// # Errors
     /// [`RunError`] names the file and what is wrong with it.
@@ -172,7 +192,8 @@ impl RunDirectory {
             source,
         };
         // First of all: another version's identity may have other parts.
-        let Versioned { protocol_version } = serde_json::from_str(&text).map_err(not_an_identity)?;
+        let Versioned { protocol_version } =
+            serde_json::from_str(&text).map_err(not_an_identity)?;
         if protocol_version != PROTOCOL_VERSION {
             return Err(RunError::OtherVersion {
                 path,
@@ -199,10 +220,13 @@ struct Versioned {
 }
 
 impl RunDirectory {
-    /// In which keys `config` differs from the configuration of the run, if a checkpoint still tells it.
+    /// In which keys `config` differs from the configuration of the run, if a checkpoint still
+    /// tells it.
     fn differences(&self, identity: &RunIdentity, config: &Config) -> String {
         let known = self.newest_checkpoint().and_then(|episodes| {
-            let copy = self.checkpoints().join(format!("episode-{episodes}/config.toml"));
+            let copy = self
+                .checkpoints()
+                .join(format!("episode-{episodes}/config.toml"));
             fs::read_to_string(copy).ok()
         });
         known
@@ -225,7 +249,9 @@ impl RunDirectory {
 fn remedy(error: &std::io::Error) -> &'static str {
     match error.kind() {
         std::io::ErrorKind::NotFound => "; is this the directory of a run?",
-        std::io::ErrorKind::PermissionDenied => "; it belongs to another user, or may not be written",
+        std::io::ErrorKind::PermissionDenied => {
+            "; it belongs to another user, or may not be written"
+        }
         std::io::ErrorKind::ReadOnlyFilesystem => "; copy the run to a disk that can be written",
         _ => "",
     }
@@ -300,7 +326,11 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         run.create(&Config::default()).unwrap();
-        fs::write(run.identity(), r#"{ "protocol_version": 1, "what": "was then" }"#).unwrap();
+        fs::write(
+            run.identity(),
+            r#"{ "protocol_version": 1, "what": "was then" }"#,
+        )
+        .unwrap();
         let error = run.open().unwrap_err().to_string();
         assert!(error.contains("speaks protocol version 1"), "{error}");
         fs::write(run.identity(), "").unwrap();
@@ -327,7 +357,11 @@ mod tests {
         let checkpoint = run.checkpoints().join("episode-20");
         fs::create_dir(&checkpoint).unwrap();
         fs::write(checkpoint.join("config.toml"), before.portable()).unwrap();
-        assert!(refusal().contains("run.seed = 1 there, 2 here"), "{}", refusal());
+        assert!(
+            refusal().contains("run.seed = 1 there, 2 here"),
+            "{}",
+            refusal()
+        );
     }
 
     #[test]
@@ -335,7 +369,10 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         fs::create_dir(run.courses()).unwrap();
-        let (training, gates) = (run.courses().join("training.toml"), run.courses().join("gates.toml"));
+        let (training, gates) = (
+            run.courses().join("training.toml"),
+            run.courses().join("gates.toml"),
+        );
         fs::write(&training, "walls = 5").unwrap();
         fs::write(&gates, "walls = 2").unwrap();
         let mut config = Config::default();
@@ -359,7 +396,8 @@ mod tests {
         fs::write(&gates, "walls = 2").unwrap();
         run.open().unwrap();
 
-        // The configuration's digest is the same wherever the run's directory lies: a course of the same name elsewhere is another one all the same.
+        // The configuration's digest is the same wherever the run's directory lies: a course of the
+        // same name elsewhere is another one all the same.
         let elsewhere = directory.path().join("training.toml");
         fs::copy(&training, &elsewhere).unwrap();
         config.courses.training.clone_from(&elsewhere);
@@ -370,7 +408,10 @@ mod tests {
     #[test]
     fn a_run_can_be_moved() {
         let directory = tempfile::tempdir().unwrap();
-        let (before, after) = (directory.path().join("before"), directory.path().join("after"));
+        let (before, after) = (
+            directory.path().join("before"),
+            directory.path().join("after"),
+        );
         let run = RunDirectory::new(&before);
         run.create(&Config::default()).unwrap();
         fs::rename(&before, &after).unwrap();
@@ -386,7 +427,10 @@ mod tests {
         fs::set_permissions(&open, fs::Permissions::from_mode(0o755)).unwrap();
         for root in [new, open] {
             RunDirectory::new(&root).create(&Config::default()).unwrap();
-            assert_eq!(fs::metadata(&root).unwrap().permissions().mode() & 0o777, 0o700);
+            assert_eq!(
+                fs::metadata(&root).unwrap().permissions().mode() & 0o777,
+                0o700
+            );
         }
     }
 }

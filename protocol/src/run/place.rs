@@ -103,7 +103,8 @@ fn other_user(path: &Path, owner: u32) -> PlaceError {
     }
 }
 
-/// Whether `file` is still what is found at `path`: somebody may have removed it before it was locked.
+/// Whether `file` is still what is found at `path`: somebody may have removed it before it was
+/// locked.
 pub(super) fn is_still_at(file: &File, path: &Path) -> io::Result<bool> {
     let held = file.metadata()?;
     match fs::symlink_metadata(path) {
@@ -114,7 +115,8 @@ pub(super) fn is_still_at(file: &File, path: &Path) -> io::Result<bool> {
     }
 }
 
-/// A lock that one process holds while it lives: the kernel frees it with the process, however that ends. Its file keeps a few words.
+/// A lock that one process holds while it lives: the kernel frees it with the process, however that
+/// ends. Its file keeps a few words.
 #[derive(Debug)]
 pub(super) struct HeldLock {
     file: File,

@@ -15,12 +15,14 @@ use crate::ids::RunId;
 /// How long a folder may be in the process of being removed.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// That a process of a run lives: a shared lock on the run's transport folder, and one on a file of the run in shared memory, for those who have
-/// another `/tmp`.
+/// That a process of a run lives: a shared lock on the run's transport folder, and one on a file of
+/// the run in shared memory, for those who have another `/tmp`.
 ///
-/// Every process of a run holds one, from before it touches anything of the run's transport until after it has let go of it; the kernel frees it with
-/// the process, however that ends. So whoever gets the lock for itself alone knows that no process of the run is left, and may remove what they left
-/// ([`sweep_leftovers`](super::sweep_leftovers)). The lock also keeps systemd's cleaning of `/tmp` away from the folder.
+/// Every process of a run holds one, from before it touches anything of the run's transport until
+/// after it has let go of it; the kernel frees it with the process, however that ends. So whoever
+/// gets the lock for itself alone knows that no process of the run is left, and may remove what
+/// they left ([`sweep_leftovers`](super::sweep_leftovers)). The lock also keeps systemd's cleaning
+/// of `/tmp` away from the folder.
 ///
 /// The last one to go removes the transport.
 #[derive(Debug)]
@@ -39,7 +41,8 @@ struct Held {
 }
 
 impl Held {
-    /// A shared lock on `file`; `None` if somebody holds it alone, or has removed it between opening and locking: then the lock is on nothing.
+    /// A shared lock on `file`; `None` if somebody holds it alone, or has removed it between
+    /// opening and locking: then the lock is on nothing.
     fn shared(file: File, path: &Path) -> Result<Option<Self>, PlaceError> {
         match file.try_lock_shared() {
             Ok(()) => {
@@ -52,8 +55,9 @@ impl Held {
         }
     }
 
-    /// Exchanges the lock for one that nobody shares; whether that was to be had. A lock is not exchanged in one step: it is let go, then another one is
-    /// tried. Whoever enters in between is respected.
+    /// Exchanges the lock for one that nobody shares; whether that was to be had. A lock is not
+    /// exchanged in one step: it is let go, then another one is tried. Whoever enters in between is
+    /// respected.
     fn take_alone(&self) -> bool {
         self.file.unlock().is_ok()
             && self.file.try_lock().is_ok()
@@ -62,8 +66,8 @@ impl Held {
 }
 
 impl Presence {
-    /// Enters the run: makes its transport folder, for this user alone, if it is not there. Whatever this process makes from now on is for its user
-    /// alone.
+    /// Enters the run: makes its transport folder, for this user alone, if it is not there.
+    /// Whatever this process makes from now on is for its user alone.
     ///
     /// # Errors
     /// [`PlaceError::OtherUser`] when the folder is somebody else's.
@@ -78,7 +82,9 @@ impl Presence {
         let deadline = Instant::now() + PATIENCE;
         while Instant::now() < deadline {
             make_folder(&path).map_err(PlaceError::at(&path))?;
-            let Some(folder) = open_folder(&path)? else { continue };
+            let Some(folder) = open_folder(&path)? else {
+                continue;
+            };
             if let Some(folder) = Held::shared(folder, &path)?
                 && let file = open_private(&in_memory).map_err(PlaceError::at(&in_memory))?
                 && let Some(in_memory) = Held::shared(file, &in_memory)?

@@ -1,7 +1,9 @@
-//! Removes what runs leave on the machine when their processes are killed: segments in shared memory, folders of the transport.
+//! Removes what runs leave on the machine when their processes are killed: segments in shared
+//! memory, folders of the transport.
 //!
-//! A run is judged by the lock on its transport folder, see [`Presence`](super::Presence): it is removed only by who holds that lock alone. Only names
-//! of ours are touched, and only what belongs to this user; links are never followed.
+//! A run is judged by the lock on its transport folder, see [`Presence`](super::Presence): it is
+//! removed only by who holds that lock alone. Only names of ours are touched, and only what belongs
+//! to this user; links are never followed.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -37,7 +39,8 @@ pub(super) fn shared_memory_prefix(run: RunId) -> String {
     format!("{SHARED_MEMORY_PREFIX}{:016x}_", run.0)
 }
 
-/// Ends the name of the file in shared memory by which a run's processes are seen where another `/tmp` hides its folder.
+/// Ends the name of the file in shared memory by which a run's processes are seen where another
+/// `/tmp` hides its folder.
 const PRESENCE: &str = ".presence";
 
 /// The learner's lock in a run's folder.
@@ -59,9 +62,11 @@ pub struct Swept {
     pub failures: Vec<String>,
 }
 
-/// Removes the shared memory and the transport folders of all runs of this user in which no process lives, whatever ended them.
+/// Removes the shared memory and the transport folders of all runs of this user in which no process
+/// lives, whatever ended them.
 ///
-/// Never touches anything of a run that lives or starts: every process of a run holds a [`Presence`](super::Presence).
+/// Never touches anything of a run that lives or starts: every process of a run holds a
+/// [`Presence`](super::Presence).
 pub fn sweep_leftovers() -> Swept {
     MACHINE.sweep()
 }
@@ -71,7 +76,8 @@ impl Machine {
         Path::new(self.folders).join(format!("{FOLDER_PREFIX}{:016x}", run.0))
     }
 
-    /// Locked, as the folder is, by every process of the run: containers and services may share the memory and not the folder.
+    /// Locked, as the folder is, by every process of the run: containers and services may share the
+    /// memory and not the folder.
     pub(super) fn presence_file(&self, run: RunId) -> PathBuf {
         Path::new(self.segments).join(format!("{SHARED_MEMORY_PREFIX}{:016x}{PRESENCE}", run.0))
     }
@@ -103,11 +109,13 @@ impl Machine {
         folders.chain(segments).collect()
     }
 
-    /// Removes what is left of `run` if no process of it lives; whether there was anything to remove.
+    /// Removes what is left of `run` if no process of it lives; whether there was anything to
+    /// remove.
     fn sweep_run(&self, run: RunId) -> Result<bool, String> {
         let path = self.transport_folder(run);
         let told = |error: io::Error| format!("{}: {error}", path.display());
-        // Segments alone have no folder by which they could be judged; a process that starts would make it, so it is made.
+        // Segments alone have no folder by which they could be judged; a process that starts would
+        // make it, so it is made.
         make_folder(&path).map_err(told)?;
         let Some(folder) = open_folder(&path).map_err(|error| error.to_string())? else {
             return Ok(false);
@@ -126,12 +134,16 @@ impl Machine {
         };
         self.remove(run);
         if path.exists() {
-            return Err(format!("{}: not all of it could be removed", path.display()));
+            return Err(format!(
+                "{}: not all of it could be removed",
+                path.display()
+            ));
         }
         Ok(true)
     }
 
-    /// The lock of a run's presence in shared memory, had alone; `None` when a process of the run incarnations.
+    /// The lock of a run's presence in shared memory, had alone; `None` when a process of the run
+    /// incarnations.
     fn lock_presence(&self, run: RunId) -> io::Result<Option<File>> {
         let path = self.presence_file(run);
         let presence = open_private(&path)?;
@@ -143,7 +155,8 @@ impl Machine {
     pub(super) fn remove(&self, run: RunId) {
         self.remove_incarnations(run);
         let folder = self.transport_folder(run);
-        // The locks' files come last: by them a folder is known as ours, should this process die on the way.
+        // The locks' files come last: by them a folder is known as ours, should this process die on
+        // the way.
         let [learner, supervisor] = [learner_lock(&folder), supervisor_lock(&folder)];
         for file in [
             folder.join("incarnation.new"),
@@ -158,7 +171,8 @@ impl Machine {
         told(&presence, fs::remove_file(&presence));
     }
 
-    /// Removes all incarnations of `run`: segments and folders. For who holds the lock of its learner.
+    /// Removes all incarnations of `run`: segments and folders. For who holds the lock of its
+    /// learner.
     pub(super) fn remove_incarnations(&self, run: RunId) {
         for segment in self.segments(&shared_memory_prefix(run)) {
             told(&segment, fs::remove_file(&segment));
@@ -178,13 +192,15 @@ impl Machine {
     pub(super) fn segments(&self, prefix: &str) -> impl Iterator<Item = PathBuf> + use<> {
         let (segments, prefix) = (Path::new(self.segments), prefix.to_owned());
         own_entries(segments)
-            .filter(move |(name, about)| about.is_file() && name.as_encoded_bytes().starts_with(prefix.as_bytes()))
+            .filter(move |(name, about)| {
+                about.is_file() && name.as_encoded_bytes().starts_with(prefix.as_bytes())
+            })
             .map(|(name, _)| segments.join(name))
     }
 }
 
-/// Whether a folder is one of this version: empty, or with a lock in it. Those of version 0.1 hold no lock, so that it cannot be told
-/// whether their run incarnations.
+/// Whether a folder is one of this version: empty, or with a lock in it. Those of version 0.1 hold
+/// no lock, so that it cannot be told whether their run incarnations.
 fn is_ours(folder: &Path) -> io::Result<bool> {
     let has_lock = learner_lock(folder).exists() || supervisor_lock(folder).exists();
     Ok(has_lock || fs::read_dir(folder)?.next().is_none())
@@ -248,7 +264,10 @@ mod tests {
         fs::write(incarnation.join("nodes/7/details"), "").unwrap();
         fs::write(folder.join("incarnation"), "{}").unwrap();
         fs::write(learner_lock(&folder), "1\n").unwrap();
-        segment(machine, &format!("{}0123_connection", shared_memory_prefix(RUN)));
+        segment(
+            machine,
+            &format!("{}0123_connection", shared_memory_prefix(RUN)),
+        );
         folder
     }
 

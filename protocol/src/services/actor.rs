@@ -25,7 +25,8 @@ use crate::transition::TransitionRecord;
 
 /// A transition record in shared memory, being written.
 pub type LoanedTransition = iceoryx2::sample_mut::SampleMut<Ipc, TransitionRecord, ()>;
-/// Samples an actor loans at one time: the record being completed and the next one, whose image its reward needs.
+/// Samples an actor loans at one time: the record being completed and the next one, whose image its
+/// reward needs.
 const LOANED_RECORDS: usize = 2;
 /// An actor's ends.
 #[derive(Debug)]
@@ -45,10 +46,12 @@ pub struct ActorPorts {
 }
 
 impl ActorPorts {
-    /// Joins the learner that lives now: opens an actor's ends of every service, on the thread that will use them. Waits for nothing.
+    /// Joins the learner that lives now: opens an actor's ends of every service, on the thread that
+    /// will use them. Waits for nothing.
     ///
     /// # Errors
-    /// [`JoinError::NoLearner`] when there is none to join at this moment; [`JoinError::Difference`] when this process and the learner's do not fit.
+    /// [`JoinError::NoLearner`] when there is none to join at this moment;
+    /// [`JoinError::Difference`] when this process and the learner's do not fit.
     pub fn join(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
         let incarnation = learner_of(identity, config)?.incarnation;
         let ports = Self::open(identity, incarnation, config)?;
@@ -56,7 +59,11 @@ impl ActorPorts {
         Ok(ports)
     }
 
-    fn open(identity: &RunIdentity, incarnation: LearnerIncarnation, config: &Config) -> Result<Self, ServiceError> {
+    fn open(
+        identity: &RunIdentity,
+        incarnation: LearnerIncarnation,
+        config: &Config,
+    ) -> Result<Self, ServiceError> {
         let node = node(identity, incarnation, "actor")?;
         let open = Opener::new(&node, Manner::Join, identity, config)?;
         Ok(Self {
@@ -124,7 +131,8 @@ impl ActorPorts {
         wait(&self.wake, timeout).map_err(failed("wake-actors", "waiting"))
     }
 
-    /// A record in shared memory, to be written in place. It holds whatever was in that memory before.
+    /// A record in shared memory, to be written in place. It holds whatever was in that memory
+    /// before.
     ///
     /// # Errors
     /// [`ServiceError`] when the learner holds all of this actor's memory, which tickets rule out.
@@ -133,8 +141,8 @@ impl ActorPorts {
             .transitions
             .loan_uninit()
             .map_err(failed("transitions", "loaning"))?;
-        // SAFETY: the record is plain data, for which every bit pattern is valid, and the memory is a shared mapping that the operating system
-        // and iceoryx2 have initialised with zeros.
+        // SAFETY: the record is plain data, for which every bit pattern is valid, and the memory is
+        // a shared mapping that the operating system and iceoryx2 have initialised with zeros.
         Ok(unsafe { sample.assume_init() })
     }
 
@@ -143,7 +151,10 @@ impl ActorPorts {
     /// # Errors
     /// [`ServiceError`] when the connection is broken.
     pub fn send_transition(&self, record: LoanedTransition) -> Result<(), ServiceError> {
-        record.send().map(drop).map_err(failed("transitions", "sending"))
+        record
+            .send()
+            .map(drop)
+            .map_err(failed("transitions", "sending"))
     }
 
     /// Sends a heartbeat.
@@ -162,10 +173,17 @@ impl ActorPorts {
     /// # Errors
     /// [`ServiceError`] when the learner's memory cannot be mapped.
     pub fn receive_control(&self) -> Result<Option<Message>, ServiceError> {
-        if let Some(sample) = self.control.receive().map_err(failed("control", "receiving"))? {
+        if let Some(sample) = self
+            .control
+            .receive()
+            .map_err(failed("control", "receiving"))?
+        {
             return Ok(Some(Message::Control(*sample)));
         }
-        let sample = self.segments.receive().map_err(failed("segments", "receiving"))?;
+        let sample = self
+            .segments
+            .receive()
+            .map_err(failed("segments", "receiving"))?;
         Ok(sample.map(|sample| Message::Segment(Box::new(*sample))))
     }
 
@@ -173,10 +191,20 @@ impl ActorPorts {
     ///
     /// # Errors
     /// [`ServiceError`] when the learner's memory cannot be mapped.
-    pub fn receive_snapshot(&self) -> Result<Option<Result<Snapshot, crate::snapshot::SnapshotError>>, ServiceError> {
-        let sample = self.weights.receive().map_err(failed("weights", "receiving"))?;
+    pub fn receive_snapshot(
+        &self,
+    ) -> Result<Option<Result<Snapshot, crate::snapshot::SnapshotError>>, ServiceError> {
+        let sample = self
+            .weights
+            .receive()
+            .map_err(failed("weights", "receiving"))?;
         Ok(sample.map(|sample| {
-            let received = Snapshot::receive(sample.user_header(), sample.payload(), self.run, &self.layout);
+            let received = Snapshot::receive(
+                sample.user_header(),
+                sample.payload(),
+                self.run,
+                &self.layout,
+            );
             let_go(sample.payload());
             received
         }))
@@ -210,6 +238,8 @@ impl ActorPorts {
         self.transitions
             .update_connections()
             .map_err(failed("transitions", "connecting"))?;
-        self.status.update_connections().map_err(failed("status", "connecting"))
+        self.status
+            .update_connections()
+            .map_err(failed("status", "connecting"))
     }
 }

@@ -1,8 +1,9 @@
 //! Takes back what dead processes held.
 //!
-//! iceoryx2 does it for nodes whose process is gone. But where death left a file half made, or half removed, it stops: the slot of a port, of which there
-//! are few, is lost, or files stay behind, with each actor that is killed while it comes or goes. So what is half made is removed before iceoryx2 cleans
-//! up, and what still names a process that is gone is removed after.
+//! iceoryx2 does it for nodes whose process is gone. But where death left a file half made, or half
+//! removed, it stops: the slot of a port, of which there are few, is lost, or files stay behind,
+//! with each actor that is killed while it comes or goes. So what is half made is removed before
+//! iceoryx2 cleans up, and what still names a process that is gone is removed after.
 
 use std::collections::BTreeSet;
 use std::fs::{self, DirEntry};
@@ -17,8 +18,9 @@ use iceoryx2_bb_posix::unique_system_id::UniqueSystemId;
 use super::{Ipc, ServiceError, failed};
 use crate::run::{LearnerIncarnation, RunIdentity};
 
-/// Nobody takes as long to come, from the first file of its node to the lock by which others see that it incarnations. Who was stopped meanwhile finds its files
-/// gone, fails to join, and tries again.
+/// Nobody takes as long to come, from the first file of its node to the lock by which others see
+/// that it incarnations. Who was stopped meanwhile finds its files gone, fails to join, and tries
+/// again.
 const LONGEST_COMING: Duration = Duration::from_secs(10);
 
 /// Takes back what the dead held in the transport of an incarnation.
@@ -36,7 +38,8 @@ impl Reclaimer {
         }
     }
 
-    /// Takes back what the dead held whose nodes lie beside `node`. What cannot be had now is tried again at the next call.
+    /// Takes back what the dead held whose nodes lie beside `node`. What cannot be had now is tried
+    /// again at the next call.
     ///
     /// # Errors
     /// [`ServiceError`] when the nodes cannot be listed.
@@ -61,19 +64,24 @@ impl Reclaimer {
 
     fn reclaim_node(&self, dead: DeadNodeView<Ipc>) {
         let process = process_of(dead.id().value());
-        // Nothing hangs on what is half made: a tag is finished before its service or port is entered, a segment before anybody maps it.
+        // Nothing hangs on what is half made: a tag is finished before its service or port is
+        // entered, a segment before anybody maps it.
         let tags = entries(self.nodes().join(dead.id().value().to_string()));
         let half_made_tags = tags.filter(|tag| mode(tag) & 0o200 != 0);
         let segments = self
             .shared_memory()
             .filter(|path| processes_in(path).any(|of| of == process));
         let half_made_segments = segments.filter(|segment| mode(segment) & 0o400 == 0);
-        half_made_tags.chain(half_made_segments).for_each(|path| remove(&path));
+        half_made_tags
+            .chain(half_made_segments)
+            .for_each(|path| remove(&path));
         let _ = dead.try_remove_stale_resources();
     }
 
     fn nodes(&self) -> PathBuf {
-        self.identity.incarnation_folder(self.incarnation).join("nodes")
+        self.identity
+            .incarnation_folder(self.incarnation)
+            .join("nodes")
     }
 
     /// Listeners' sockets, nodes' locks, and nodes' folders.
@@ -92,12 +100,19 @@ fn process_of(id: u128) -> u32 {
     UniqueSystemId::from(id).pid().value().cast_unsigned()
 }
 
-/// The processes that made the nodes and ports that `path` is called after: two where it is a connection, none where it belongs to all.
+/// The processes that made the nodes and ports that `path` is called after: two where it is a
+/// connection, none where it belongs to all.
 fn processes_in(path: &Path) -> impl Iterator<Item = u32> {
-    /// Ids are large: the incarnation's number, the run's and digests, in hexadecimal, are not taken for one.
+    /// Ids are large: the incarnation's number, the run's and digests, in hexadecimal, are not
+    /// taken for one.
     const DIGITS: std::ops::RangeInclusive<usize> = 20..=39;
-    let name = path.file_name().and_then(std::ffi::OsStr::to_str).unwrap_or_default();
-    let ids = name.split(['_', '.']).filter(|word| DIGITS.contains(&word.len()));
+    let name = path
+        .file_name()
+        .and_then(std::ffi::OsStr::to_str)
+        .unwrap_or_default();
+    let ids = name
+        .split(['_', '.'])
+        .filter(|word| DIGITS.contains(&word.len()));
     ids.filter_map(|word| word.parse().ok()).map(process_of)
 }
 
@@ -146,7 +161,8 @@ mod tests {
     #[test]
     fn what_names_a_process_that_is_gone_is_removed_once_it_is_old_and_nothing_else_is() {
         let run = Run::with(|_| {});
-        let learner = LearnerPorts::open(&run.identity, run.lock.incarnation(), &run.config).unwrap();
+        let learner =
+            LearnerPorts::open(&run.identity, run.lock.incarnation(), &run.config).unwrap();
         let _living = node(&run.identity, run.lock.incarnation(), "living").unwrap();
         learner.maintain().unwrap();
         let incarnation = run.identity.incarnation_folder(run.lock.incarnation());
@@ -173,7 +189,11 @@ mod tests {
                 .join(format!("{prefix}{id}.node_monitor_context")),
             incarnation.join(format!("{prefix}{id}.event")),
             format!("/dev/shm/{prefix}{}_{id}.data", "a".repeat(40)).into(),
-            format!("/dev/shm/{prefix}{}_{living}_{id}.connection", "a".repeat(40)).into(),
+            format!(
+                "/dev/shm/{prefix}{}_{living}_{id}.connection",
+                "a".repeat(40)
+            )
+            .into(),
         ];
         fs::create_dir(&left[0]).unwrap();
         fs::write(left[0].join(format!("{prefix}node.details")), "").unwrap();
@@ -184,7 +204,11 @@ mod tests {
         let with_left = listed();
         assert_eq!(with_left.len(), before.len() + left.len());
         learner.maintain().unwrap();
-        assert_eq!(listed(), with_left, "whoever made them may be about to come");
+        assert_eq!(
+            listed(),
+            with_left,
+            "whoever made them may be about to come"
+        );
         left.iter().for_each(|path| age(path));
         learner.maintain().unwrap();
         assert_eq!(listed(), before);

@@ -7,7 +7,8 @@ use crate::run::{Announcement, Difference, PlaceError, RunIdentity};
 /// Why a process could not join the learner of a run.
 #[derive(Debug, thiserror::Error)]
 pub enum JoinError {
-    /// The run is over, was never started on this machine, or its learner died or has not opened its services yet.
+    /// The run is over, was never started on this machine, or its learner died or has not opened
+    /// its services yet.
     #[error("no learner of run {run:016x} is there", run = .0.run.0)]
     NoLearner(RunIdentity),
     /// There is one that this process does not fit.
@@ -34,7 +35,10 @@ impl JoinError {
 }
 
 /// The learner to join, which this process fits.
-pub(super) fn learner_of(identity: &RunIdentity, config: &Config) -> Result<Announcement, JoinError> {
+pub(super) fn learner_of(
+    identity: &RunIdentity,
+    config: &Config,
+) -> Result<Announcement, JoinError> {
     let learner = identity
         .present_incarnation()?
         .ok_or_else(|| JoinError::NoLearner(identity.clone()))?;

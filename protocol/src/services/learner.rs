@@ -28,7 +28,8 @@ use crate::transition::TransitionRecord;
 /// A transition record in shared memory, received.
 pub type ReceivedTransition = iceoryx2::sample::Sample<Ipc, TransitionRecord, ()>;
 
-/// Snapshots that exist at once in shared memory: the history, one being written, and those that slow readers still hold.
+/// Snapshots that exist at once in shared memory: the history, one being written, and those that
+/// slow readers still hold.
 pub(super) const SNAPSHOT_SLOTS: usize = 8;
 
 /// The learner's ends.
@@ -50,7 +51,8 @@ pub struct LearnerPorts {
     node: Node<Ipc>,
 }
 
-/// Wakes the learner's receiving thread from another thread of the learner: ports belong to the thread that opened them.
+/// Wakes the learner's receiving thread from another thread of the learner: ports belong to the
+/// thread that opened them.
 #[derive(Debug)]
 pub struct LearnerWaker {
     wake_learner: Notifier<Ipc>,
@@ -58,12 +60,16 @@ pub struct LearnerWaker {
 }
 
 impl LearnerPorts {
-    /// Opens the learner's ends of every service for its new `incarnation`, on the thread that will use them, and announces it. For who holds the
-    /// [`LearnerLock`](crate::run::LearnerLock).
+    /// Opens the learner's ends of every service for its new `incarnation`, on the thread that will
+    /// use them, and announces it. For who holds the [`LearnerLock`](crate::run::LearnerLock).
     ///
     /// # Errors
     /// [`JoinError`] says which service and why.
-    pub fn open(identity: &RunIdentity, incarnation: LearnerIncarnation, config: &Config) -> Result<Self, JoinError> {
+    pub fn open(
+        identity: &RunIdentity,
+        incarnation: LearnerIncarnation,
+        config: &Config,
+    ) -> Result<Self, JoinError> {
         let mut ports = Self::create(identity, incarnation, config)?;
         reserve(identity, incarnation)?;
         ports.shared_memory = identity.shared_memory(incarnation).collect();
@@ -72,7 +78,11 @@ impl LearnerPorts {
         Ok(ports)
     }
 
-    fn create(identity: &RunIdentity, incarnation: LearnerIncarnation, config: &Config) -> Result<Self, ServiceError> {
+    fn create(
+        identity: &RunIdentity,
+        incarnation: LearnerIncarnation,
+        config: &Config,
+    ) -> Result<Self, ServiceError> {
         let node = node(identity, incarnation, "learner")?;
         identity
             .close_to_others(incarnation)
@@ -148,7 +158,9 @@ impl LearnerPorts {
     /// # Errors
     /// [`ServiceError`] when an actor's memory cannot be mapped.
     pub fn receive_transition(&self) -> Result<Option<ReceivedTransition>, ServiceError> {
-        self.transitions.receive().map_err(failed("transitions", "receiving"))
+        self.transitions
+            .receive()
+            .map_err(failed("transitions", "receiving"))
     }
 
     /// The next status record, if one has arrived.
@@ -156,11 +168,15 @@ impl LearnerPorts {
     /// # Errors
     /// [`ServiceError`] when an actor's memory cannot be mapped.
     pub fn receive_status(&self) -> Result<Option<StatusRecord>, ServiceError> {
-        let sample = self.status.receive().map_err(failed("status", "receiving"))?;
+        let sample = self
+            .status
+            .receive()
+            .map_err(failed("status", "receiving"))?;
         Ok(sample.map(|sample| *sample))
     }
 
-    /// Sends `message` to the actors connected now; a lost one is made good by the ticket's deadline.
+    /// Sends `message` to the actors connected now; a lost one is made good by the ticket's
+    /// deadline.
     ///
     /// # Errors
     /// [`ServiceError`] when there is no memory to send it in.
@@ -215,10 +231,12 @@ impl LearnerPorts {
             .map_err(failed("wake-actors", "notifying"))
     }
 
-    /// Connects to actors that have come, hands late joiners the newest snapshots, and reclaims what dead processes held. To be called regularly.
+    /// Connects to actors that have come, hands late joiners the newest snapshots, and reclaims
+    /// what dead processes held. To be called regularly.
     ///
     /// # Errors
-    /// [`ServiceError`] when a peer's memory cannot be mapped, or actors can no longer find this learner.
+    /// [`ServiceError`] when a peer's memory cannot be mapped, or actors can no longer find this
+    /// learner.
     pub fn maintain(&self) -> Result<(), ServiceError> {
         self.check_findable()?;
         self.connect()?;
@@ -270,7 +288,8 @@ impl LearnerPorts {
 }
 
 impl LearnerWaker {
-    /// Opens the waker, on the thread that will use it, once the receiving thread has opened its ends.
+    /// Opens the waker, on the thread that will use it, once the receiving thread has opened its
+    /// ends.
     ///
     /// # Errors
     /// [`ServiceError`] says which service and why.

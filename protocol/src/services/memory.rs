@@ -1,7 +1,8 @@
 //! How much shared memory the services take, and that it is there before it is used.
 //!
-//! A segment is as long as its contents may become, but the system gives it memory page by page, as it is touched. If there is none left then, whoever
-//! touches it dies of SIGBUS. So whoever has opened its ends of the services reserves what they may need.
+//! A segment is as long as its contents may become, but the system gives it memory page by page, as
+//! it is touched. If there is none left then, whoever touches it dies of SIGBUS. So whoever has
+//! opened its ends of the services reserves what they may need.
 
 use std::fs::{self, OpenOptions};
 use std::io;
@@ -31,15 +32,18 @@ const SLOT_OVERHEAD: usize = 3 << 10;
 /// Bytes of shared memory that a learner and `actors` actors with `config` take.
 pub fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
     let snapshot = SnapshotLayout::of(config).values() * size_of::<f32>() + SAMPLE_OVERHEAD;
-    let control = control_slots(&config.transport) * (size_of::<ControlRecord>() + SAMPLE_OVERHEAD / 2);
-    let segments = segment_slots(&config.transport) * (size_of::<SegmentRecord>() + SAMPLE_OVERHEAD / 2);
+    let control =
+        control_slots(&config.transport) * (size_of::<ControlRecord>() + SAMPLE_OVERHEAD / 2);
+    let segments =
+        segment_slots(&config.transport) * (size_of::<SegmentRecord>() + SAMPLE_OVERHEAD / 2);
     let slots = config.transport.max_actors * SLOT_OVERHEAD;
     let learner = SNAPSHOT_SLOTS * snapshot + control + segments + slots + LEARNER_OVERHEAD;
     // Episodes of all tickets, and what either side has in hand.
     let records = transition_buffer(&config.transport) + 8;
     // A queue of eight bytes a message there and back, and one byte to say who has it.
     let queues = 2 * 8 * control_buffer(&config.transport) + control_slots(&config.transport);
-    let actor = records * (size_of::<TransitionRecord>() + SAMPLE_OVERHEAD) + queues + ACTOR_OVERHEAD;
+    let actor =
+        records * (size_of::<TransitionRecord>() + SAMPLE_OVERHEAD) + queues + ACTOR_OVERHEAD;
     (learner + actors * actor) as u64
 }
 
@@ -47,7 +51,10 @@ pub fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
 ///
 /// # Errors
 /// [`ServiceError`] when there is not enough.
-pub(super) fn reserve(identity: &RunIdentity, incarnation: LearnerIncarnation) -> Result<(), ServiceError> {
+pub(super) fn reserve(
+    identity: &RunIdentity,
+    incarnation: LearnerIncarnation,
+) -> Result<(), ServiceError> {
     for segment in identity.shared_memory(incarnation) {
         match reserve_segment(&segment) {
             // Its owner has removed it meanwhile.
@@ -58,19 +65,28 @@ pub(super) fn reserve(identity: &RunIdentity, incarnation: LearnerIncarnation) -
     Ok(())
 }
 
-/// Takes the whole pages of `shared`, which lies in a segment, out of this process's memory; they stay in the segment, and come back when they are read.
-/// An actor looks at each snapshot once: if it kept what it has looked at, all of the learner's segment would count as its own.
+/// Takes the whole pages of `shared`, which lies in a segment, out of this process's memory; they
+/// stay in the segment, and come back when they are read. An actor looks at each snapshot once: if
+/// it kept what it has looked at, all of the learner's segment would count as its own.
 pub(super) fn let_go(shared: &[u8]) {
     let page = rustix::param::page_size();
     let skipped = shared.as_ptr().align_offset(page);
-    let Some(pages) = shared.get(skipped..) else { return };
+    let Some(pages) = shared.get(skipped..) else {
+        return;
+    };
     let whole = pages.len() / page * page;
     if whole == 0 {
         return;
     }
-    // SAFETY: these pages lie within `shared`. They are mapped from a file and shared, so the file keeps what is written on them, and whoever reads them again
-    // is given the same bytes.
-    let let_go = unsafe { madvise(pages.as_ptr().cast_mut().cast(), whole, Advice::LinuxDontNeed) };
+    // SAFETY: these pages lie within `shared`. They are mapped from a file and shared, so the file
+    // keeps what is written on them, and whoever reads them again is given the same bytes.
+    let let_go = unsafe {
+        madvise(
+            pages.as_ptr().cast_mut().cast(),
+            whole,
+            Advice::LinuxDontNeed,
+        )
+    };
     if let Err(error) = let_go {
         tracing::debug!(%error, "pages of a snapshot are kept");
     }
@@ -85,7 +101,12 @@ fn reserve_segment(segment: &std::path::Path) -> io::Result<()> {
         return Ok(());
     }
     let file = OpenOptions::new().write(true).open(segment)?;
-    Ok(rustix::fs::fallocate(&file, FallocateFlags::empty(), 0, about.len())?)
+    Ok(rustix::fs::fallocate(
+        &file,
+        FallocateFlags::empty(),
+        0,
+        about.len(),
+    )?)
 }
 
 #[cfg(test)]
@@ -96,7 +117,8 @@ mod tests {
     use super::super::{ActorPorts, LearnerPorts};
     use super::*;
 
-    /// Bytes of shared memory that this process has in its own, of the mapping that `address` lies in.
+    /// Bytes of shared memory that this process has in its own, of the mapping that `address` lies
+    /// in.
     fn resident(address: *const u8) -> usize {
         let maps = fs::read_to_string("/proc/self/smaps").unwrap();
         let number = |text: &str| usize::from_str_radix(text, 16).ok();
@@ -108,7 +130,13 @@ mod tests {
             {
                 is_it = (start..end).contains(&(address as usize));
             } else if is_it && first == "Rss:" {
-                return line.split_whitespace().nth(1).unwrap().parse::<usize>().unwrap() << 10;
+                return line
+                    .split_whitespace()
+                    .nth(1)
+                    .unwrap()
+                    .parse::<usize>()
+                    .unwrap()
+                    << 10;
             }
         }
         panic!("{address:?} is not mapped");
@@ -153,10 +181,13 @@ mod tests {
                 config.transport.max_actors = max_actors;
                 config.sac.hidden_width = width;
             });
-            let learner = LearnerPorts::open(&run.identity, run.lock.incarnation(), &run.config).unwrap();
+            let learner =
+                LearnerPorts::open(&run.identity, run.lock.incarnation(), &run.config).unwrap();
             let taken = || -> u64 {
                 let segments = run.identity.shared_memory(run.lock.incarnation());
-                segments.map(|path| fs::metadata(path).unwrap().blocks() * 512).sum()
+                segments
+                    .map(|path| fs::metadata(path).unwrap().blocks() * 512)
+                    .sum()
             };
             let mut actors = Vec::new();
             for joined in 0..=2 {

@@ -9,13 +9,16 @@
 //! | `weights` | publish-subscribe | learner → actors | snapshots' bytes behind a [`SnapshotHeader`] |
 //! | `wake-learner`, `wake-actors` | event | both | that there is something to read |
 //!
-//! Nothing here blocks and nothing here is trusted to arrive: iceoryx2 loses samples silently when a peer dies or has not connected yet. Tickets bound
-//! what is outstanding, so no buffer can overflow but that of a process that was stopped, which misses what does not fit; an episode with a hole is discarded
-//! and its ticket issued again; every wait has a deadline.
+//! Nothing here blocks and nothing here is trusted to arrive: iceoryx2 loses samples silently when
+//! a peer dies or has not connected yet. Tickets bound what is outstanding, so no buffer can
+//! overflow but that of a process that was stopped, which misses what does not fit; an episode with
+//! a hole is discarded and its ticket issued again; every wait has a deadline.
 //!
-//! Each incarnation of a learner has services of its own, see [`LearnerIncarnation`]. Only the learner creates them; everybody else joins those that it has announced.
+//! Each incarnation of a learner has services of its own, see [`LearnerIncarnation`]. Only the
+//! learner creates them; everybody else joins those that it has announced.
 //!
-//! Services carry protocol version, run, configuration and snapshot layout as attributes: a process that differs in one of them is refused on opening.
+//! Services carry protocol version, run, configuration and snapshot layout as attributes: a process
+//! that differs in one of them is refused on opening.
 
 mod actor;
 mod dead;
@@ -49,7 +52,8 @@ pub use memory::shared_memory_needed;
 
 type Ipc = ipc::Service;
 
-/// Shortest wait for an event: the system counts in microseconds and takes none of them for no limit at all.
+/// Shortest wait for an event: the system counts in microseconds and takes none of them for no
+/// limit at all.
 const SHORTEST_WAIT: Duration = Duration::from_micros(1);
 
 /// What a service could not do.
@@ -67,16 +71,22 @@ pub struct ServiceError {
 }
 
 impl ServiceError {
-    /// Whether trying again cannot help, with this learner or its next incarnation: the two programs differ.
+    /// Whether trying again cannot help, with this learner or its next incarnation: the two
+    /// programs differ.
     fn is_final(&self) -> bool {
         self.cause.contains("Incompatible")
     }
 }
 
-fn failed<E: Debug>(service: &'static str, operation: &'static str) -> impl FnOnce(E) -> ServiceError {
+fn failed<E: Debug>(
+    service: &'static str,
+    operation: &'static str,
+) -> impl FnOnce(E) -> ServiceError {
     move |error| {
         let cause = format!("{error:?}");
-        let remedy = if cause.contains("IncompatibleAttributes") || cause.contains("IncompatibleTypes") {
+        let remedy = if cause.contains("IncompatibleAttributes")
+            || cause.contains("IncompatibleTypes")
+        {
             "; this process and the run differ in program version or configuration: start it from the same build and run directory"
         } else if cause.contains("DoesNotExist") {
             "; the learner of this run has not opened it, or is gone"
@@ -98,26 +108,32 @@ fn failed<E: Debug>(service: &'static str, operation: &'static str) -> impl FnOn
     }
 }
 
-/// iceoryx2's settings for one incarnation of a run's learner. Called before anything else of iceoryx2 is.
-fn transport_config(identity: &RunIdentity, incarnation: LearnerIncarnation) -> Result<IceoryxConfig, ServiceError> {
-    // Everything iceoryx2 would print goes wrong again, with our words, in the errors returned here.
+/// iceoryx2's settings for one incarnation of a run's learner. Called before anything else of
+/// iceoryx2 is.
+fn transport_config(
+    identity: &RunIdentity,
+    incarnation: LearnerIncarnation,
+) -> Result<IceoryxConfig, ServiceError> {
+    // Everything iceoryx2 would print goes wrong again, with our words, in the errors returned
+    // here.
     set_log_level(LogLevel::Fatal);
     let mut config = IceoryxConfig::default();
     let root = identity.incarnation_folder(incarnation);
-    config
-        .global
-        .set_root_path(&Path::new(root.as_os_str().as_bytes()).map_err(failed("all", "setting the root path"))?);
+    config.global.set_root_path(
+        &Path::new(root.as_os_str().as_bytes()).map_err(failed("all", "setting the root path"))?,
+    );
     config.global.prefix = FileName::new(identity.incarnation_prefix(incarnation).as_bytes())
         .map_err(failed("all", "setting the prefix"))?;
-    // The learner alone cleans up after the dead, at its heartbeats. Of an actor that is killed while it does, iceoryx2 could not tell whether it still
-    // does, and nobody would go on with it.
+    // The learner alone cleans up after the dead, at its heartbeats. Of an actor that is killed
+    // while it does, iceoryx2 could not tell whether it still does, and nobody would go on with it.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
     Ok(config)
 }
 
-/// What the records that cross the transport look like; equal in processes that can read each other's.
+/// What the records that cross the transport look like; equal in processes that can read each
+/// other's.
 pub(crate) fn record_layout() -> String {
     format!(
         "transition {} control {} segment {} status {} snapshot header {}",
@@ -129,7 +145,11 @@ pub(crate) fn record_layout() -> String {
     )
 }
 
-fn node(identity: &RunIdentity, incarnation: LearnerIncarnation, name: &str) -> Result<Node<Ipc>, ServiceError> {
+fn node(
+    identity: &RunIdentity,
+    incarnation: LearnerIncarnation,
+    name: &str,
+) -> Result<Node<Ipc>, ServiceError> {
     let config = transport_config(identity, incarnation)?;
     NodeBuilder::new()
         .name(&NodeName::new(name).map_err(failed("all", "naming the node"))?)
@@ -142,7 +162,8 @@ fn node(identity: &RunIdentity, incarnation: LearnerIncarnation, name: &str) -> 
 /// Waits for an event or a signal, not longer than `timeout`.
 fn wait(wake: &Listener<Ipc>, timeout: Duration) -> Result<(), ListenerWaitError> {
     match wake.timed_wait(|_| {}, timeout.max(SHORTEST_WAIT)) {
-        // A process that was stopped and continued, from a terminal say, is interrupted too; whoever waits looks round and waits again.
+        // A process that was stopped and continued, from a terminal say, is interrupted too;
+        // whoever waits looks round and waits again.
         Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
         Err(error) => Err(error),
     }

@@ -16,7 +16,8 @@ use crate::transition::TransitionRecord;
 
 /// Records the learner holds while it looks at them.
 const BORROWED_RECORDS: usize = 2;
-/// Snapshots a late joiner still gets: with policy lag 1 two versions are in use, and an evaluation adds a third.
+/// Snapshots a late joiner still gets: with policy lag 1 two versions are in use, and an evaluation
+/// adds a third.
 pub(super) const SNAPSHOT_HISTORY: usize = 4;
 /// Tickets of segments that may wait for an actor.
 const SEGMENT_BUFFER: usize = 1;
@@ -37,7 +38,8 @@ pub(super) struct Opener<'a> {
     pub(super) actors: usize,
 }
 
-/// Creates or joins a service of the [`Opener`], as its manner says. A macro, because builders of different payloads have no trait in common.
+/// Creates or joins a service of the [`Opener`], as its manner says. A macro, because builders of
+/// different payloads have no trait in common.
 macro_rules! opened {
     ($opener:expr, $service:expr, $builder:expr) => {
         match $opener.manner {
@@ -66,7 +68,9 @@ impl<'a> Opener<'a> {
             ("config", format!("{:016x}", identity.config_digest)),
             ("snapshot-layout", format!("{layout:016x}")),
         ] {
-            let key = key.try_into().map_err(failed("all", "naming an attribute"))?;
+            let key = key
+                .try_into()
+                .map_err(failed("all", "naming an attribute"))?;
             let value = value
                 .as_str()
                 .try_into()
@@ -75,7 +79,8 @@ impl<'a> Opener<'a> {
                 .require(&key, &value)
                 .map_err(failed("all", "setting an attribute"))?;
         }
-        // A restarted actor may come before its dead predecessor's slots are reclaimed; the learner's own waker takes one.
+        // A restarted actor may come before its dead predecessor's slots are reclaimed; the
+        // learner's own waker takes one.
         Ok(Self {
             node,
             manner,
@@ -91,8 +96,10 @@ impl<'a> Opener<'a> {
     pub(super) fn transitions(
         &self,
         config: &Config,
-    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, TransitionRecord, ()>, ServiceError>
-    {
+    ) -> Result<
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, TransitionRecord, ()>,
+        ServiceError,
+    > {
         let name = service_name("transitions")?;
         let builder = || {
             self.node
@@ -102,7 +109,8 @@ impl<'a> Opener<'a> {
                 .max_publishers(self.actors)
                 .max_subscribers(1)
                 .max_nodes(self.nodes())
-                // Every episode an actor holds a ticket for fits whole, so a record is never refused for want of room.
+                // Every episode an actor holds a ticket for fits whole, so a record is never
+                // refused for want of room.
                 .subscriber_max_buffer_size(transition_buffer(&config.transport))
                 .subscriber_max_borrowed_samples(BORROWED_RECORDS)
                 .history_size(0)
@@ -113,8 +121,10 @@ impl<'a> Opener<'a> {
 
     pub(super) fn status(
         &self,
-    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, StatusRecord, ()>, ServiceError>
-    {
+    ) -> Result<
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, StatusRecord, ()>,
+        ServiceError,
+    > {
         let name = service_name("status")?;
         let builder = || {
             self.node
@@ -136,8 +146,10 @@ impl<'a> Opener<'a> {
     pub(super) fn control(
         &self,
         config: &Config,
-    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, ControlRecord, ()>, ServiceError>
-    {
+    ) -> Result<
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, ControlRecord, ()>,
+        ServiceError,
+    > {
         let name = service_name("control")?;
         let builder = || {
             self.node
@@ -156,8 +168,10 @@ impl<'a> Opener<'a> {
 
     pub(super) fn segments(
         &self,
-    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, SegmentRecord, ()>, ServiceError>
-    {
+    ) -> Result<
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, SegmentRecord, ()>,
+        ServiceError,
+    > {
         let name = service_name("segments")?;
         let builder = || {
             self.node
@@ -169,7 +183,8 @@ impl<'a> Opener<'a> {
                 .subscriber_max_buffer_size(SEGMENT_BUFFER)
                 .subscriber_max_borrowed_samples(1)
                 .history_size(0)
-                // One episode is under way in segments at a time, and one segment of it: of tickets for segments the newest counts.
+                // One episode is under way in segments at a time, and one segment of it: of tickets
+                // for segments the newest counts.
                 .enable_safe_overflow(true)
         };
         opened!(self, "segments", builder())
@@ -177,8 +192,10 @@ impl<'a> Opener<'a> {
 
     pub(super) fn weights(
         &self,
-    ) -> Result<iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, [u8], SnapshotHeader>, ServiceError>
-    {
+    ) -> Result<
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, [u8], SnapshotHeader>,
+        ServiceError,
+    > {
         let name = service_name("weights")?;
         let builder = || {
             self.node
@@ -217,23 +234,27 @@ impl<'a> Opener<'a> {
     }
 }
 
-/// Records of an actor that may wait for the learner: every episode it holds a ticket for fits whole.
+/// Records of an actor that may wait for the learner: every episode it holds a ticket for fits
+/// whole.
 pub(super) fn transition_buffer(transport: &TransportSection) -> usize {
     transport.max_records_per_episode * transport.tickets_per_actor
 }
 
-/// Messages that may wait for an actor. All tickets pass by every actor: room for everyone's, some of them twice, while this one flies.
+/// Messages that may wait for an actor. All tickets pass by every actor: room for everyone's, some
+/// of them twice, while this one flies.
 pub(super) fn control_buffer(transport: &TransportSection) -> usize {
     4 * transport.max_actors * transport.tickets_per_actor + 64
 }
 
-/// Messages to actors that exist at once. As a rule all actors are left the same ones; those that were stopped at different times keep what was said then,
-/// up to as many of them as are counted here. If there are more, nothing can be said to anybody, and the learner gives the transport up.
+/// Messages to actors that exist at once. As a rule all actors are left the same ones; those that
+/// were stopped at different times keep what was said then, up to as many of them as are counted
+/// here. If there are more, nothing can be said to anybody, and the learner gives the transport up.
 pub(super) fn control_slots(transport: &TransportSection) -> usize {
     16 * control_buffer(transport)
 }
 
-/// Tickets of segments that exist at once: one that waits for each actor, one that it looks at, and one that is written.
+/// Tickets of segments that exist at once: one that waits for each actor, one that it looks at, and
+/// one that is written.
 pub(super) fn segment_slots(transport: &TransportSection) -> usize {
     2 * transport.max_actors * (SEGMENT_BUFFER + 1) + 1
 }

@@ -85,7 +85,9 @@ fn the_image_written_into_the_loan_is_the_image_received() {
     actor.wake_learner().unwrap();
     learner.wait(Duration::from_secs(1)).unwrap();
     let received = learner.receive_transition().unwrap().unwrap();
-    received.check(&ticket, ActorId(0), ActorIncarnation(1), 0).unwrap();
+    received
+        .check(&ticket, ActorId(0), ActorIncarnation(1), 0)
+        .unwrap();
     assert!(
         received
             .depth
@@ -121,14 +123,23 @@ fn the_largest_episode_of_every_ticket_fits_unread() {
     let run = Run::new();
     let (learner, actor) = (run.learner().unwrap(), run.actor().unwrap());
     learner.maintain().unwrap();
-    let records = run.config.transport.max_records_per_episode * run.config.transport.tickets_per_actor;
+    let records =
+        run.config.transport.max_records_per_episode * run.config.transport.tickets_per_actor;
     for step in 0..records {
         let mut record = actor.loan_transition().unwrap();
-        record.begin(&ticket(run.identity.run), ActorId(0), ActorIncarnation(1), step as u32);
+        record.begin(
+            &ticket(run.identity.run),
+            ActorId(0),
+            ActorIncarnation(1),
+            step as u32,
+        );
         actor.send_transition(record).unwrap();
     }
     for step in 0..records {
-        assert_eq!(learner.receive_transition().unwrap().unwrap().step, step as u32);
+        assert_eq!(
+            learner.receive_transition().unwrap().unwrap().step,
+            step as u32
+        );
     }
 }
 
@@ -149,9 +160,14 @@ fn a_wait_of_no_time_ends() {
 fn a_process_that_was_stopped_and_continued_goes_on() {
     let run = Run::new();
     let (learner, actor) = (run.learner().unwrap(), run.actor().unwrap());
-    for wait in [&|time| learner.wait(time), &|time| actor.wait(time)] as [&dyn Fn(Duration) -> _; 2] {
+    for wait in
+        [&|time| learner.wait(time), &|time| actor.wait(time)] as [&dyn Fn(Duration) -> _; 2]
+    {
         let mut stopper = std::process::Command::new("sh")
-            .args(["-c", "sleep 0.1; kill -STOP $PPID; sleep 0.1; kill -CONT $PPID"])
+            .args([
+                "-c",
+                "sleep 0.1; kill -STOP $PPID; sleep 0.1; kill -CONT $PPID",
+            ])
             .spawn()
             .unwrap();
         wait(Duration::from_secs(1)).unwrap();
@@ -166,7 +182,10 @@ fn an_actor_of_another_configuration_is_refused() {
     run.identity.config_digest ^= 1;
     let refusal = run.actor().unwrap_err();
     assert!(refusal.is_final());
-    assert!(refusal.to_string().contains("differ in configuration"), "{refusal}");
+    assert!(
+        refusal.to_string().contains("differ in configuration"),
+        "{refusal}"
+    );
 }
 
 #[test]
@@ -195,7 +214,10 @@ fn there_is_nobody_to_join_before_the_services_are_open_and_after_the_learner_is
     let learner = run.learner().unwrap();
     assert_eq!(run.actor().unwrap().incarnation(), run.lock.incarnation());
     let Run {
-        identity, config, lock, ..
+        identity,
+        config,
+        lock,
+        ..
     } = run;
     drop((learner, lock));
     assert!(!identity.is_learner_alive().unwrap());

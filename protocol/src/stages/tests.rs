@@ -17,7 +17,9 @@ fn a_thread_names_each_of_its_stages_once_and_threads_do_not_mix() {
         .map(|stage| (stage.thread().name(), stage.name()))
         .collect();
     assert_eq!(names.len(), STAGES);
-    let of_actors = Stage::ALL.iter().filter(|stage| stage.thread() == Thread::Actors);
+    let of_actors = Stage::ALL
+        .iter()
+        .filter(|stage| stage.thread() == Thread::Actors);
     assert_eq!(of_actors.count(), ACTOR_STAGES);
     for (index, stage) in Stage::ALL.iter().enumerate() {
         assert_eq!(*stage as usize, index);
@@ -35,7 +37,13 @@ fn laps_are_a_threads_whole_time() {
     let times = timer.times();
     let total = Duration::from_nanos(times.total_nanos(Thread::Actors));
     assert!(total >= Duration::from_millis(6) && total <= begun.elapsed());
-    assert_eq!((times.of(Stage::Physics).count, times.of(Stage::Camera).count), (2, 1));
+    assert_eq!(
+        (
+            times.of(Stage::Physics).count,
+            times.of(Stage::Camera).count
+        ),
+        (2, 1)
+    );
     assert!(times.of(Stage::Physics).nanos > 4_000_000);
     assert_eq!(times.total_nanos(Thread::Training), 0);
 }
@@ -101,7 +109,10 @@ fn the_table_has_a_row_a_stage_and_the_shares_of_a_thread_sum_to_one() {
         assert_eq!(table.matches(thread.title()).count(), 1, "{table}");
         let own = shares.iter().filter(|(of, _)| *of == thread);
         let sum: f64 = own.map(|(_, share)| share).sum();
-        assert!((sum - 100.0).abs() < 0.05 * STAGES as f64, "{sum} in\n{table}");
+        assert!(
+            (sum - 100.0).abs() < 0.05 * STAGES as f64,
+            "{sum} in\n{table}"
+        );
     }
 }
 

@@ -1,6 +1,7 @@
 //! Holds readers to bounded memory: no input is large, so no single allocation has a reason to be.
 //!
-//! A length that a reader believes before it has seen as many bytes shows here, whether or not the system would have granted the memory.
+//! A length that a reader believes before it has seen as many bytes shows here, whether or not the
+//! system would have granted the memory.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -24,7 +25,10 @@ pub fn forget() {
 /// So that it is reported like any other broken promise.
 pub fn check() {
     let largest = LARGEST.get();
-    assert!(largest <= LARGEST_ALLOCATION, "{largest} bytes were allocated at once");
+    assert!(
+        largest <= LARGEST_ALLOCATION,
+        "{largest} bytes were allocated at once"
+    );
 }
 
 fn note(bytes: usize) {

@@ -1,4 +1,5 @@
-//! Inputs that are kept: found by the long run because they reach what no sample reaches, or because they once broke something.
+//! Inputs that are kept: found by the long run because they reach what no sample reaches, or
+//! because they once broke something.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -6,7 +7,8 @@ use std::path::Path;
 
 use crate::targets::Target;
 
-/// The files in `corpus/<target>/` and `regressions/<target>/` of this package, with their names, in order.
+/// The files in `corpus/<target>/` and `regressions/<target>/` of this package, with their names,
+/// in order.
 ///
 /// # Panics
 /// When they cannot be read.

@@ -37,7 +37,13 @@ const NASTY: [&str; 30] = [
 ];
 
 /// Changes `bytes` in one to eight ways. `words` are put in here and there, and pieces of `other`.
-pub fn mutate(bytes: &mut Vec<u8>, other: &[u8], words: &[Vec<u8>], limit_bytes: usize, rng: &mut impl Rng) {
+pub fn mutate(
+    bytes: &mut Vec<u8>,
+    other: &[u8],
+    words: &[Vec<u8>],
+    limit_bytes: usize,
+    rng: &mut impl Rng,
+) {
     for _ in 0..1 + rng.random_range(0..8_u32) * u32::from(rng.random::<bool>()) {
         change(bytes, other, words, rng);
     }
@@ -55,8 +61,16 @@ fn change(bytes: &mut Vec<u8>, other: &[u8], words: &[Vec<u8>], rng: &mut impl R
         0 => bytes[at] ^= 1 << rng.random_range(0..8_u32),
         1 => bytes[at] = rng.random(),
         2 => {
-            let value: u64 =
-                [0, 1, u64::MAX, u64::MAX >> 1, 1 << 63, 1 << 31, 1 << 32, 255][rng.random_range(0..8_usize)];
+            let value: u64 = [
+                0,
+                1,
+                u64::MAX,
+                u64::MAX >> 1,
+                1 << 63,
+                1 << 31,
+                1 << 32,
+                255,
+            ][rng.random_range(0..8_usize)];
             let width = [1, 2, 4, 8][rng.random_range(0..4_usize)].min(bytes.len() - at);
             bytes[at..at + width].copy_from_slice(&value.to_le_bytes()[..width]);
         }
@@ -79,7 +93,11 @@ fn change(bytes: &mut Vec<u8>, other: &[u8], words: &[Vec<u8>], rng: &mut impl R
         }
         8 => {
             let word = token(bytes, at);
-            replace(bytes, word, NASTY[rng.random_range(0..NASTY.len())].as_bytes());
+            replace(
+                bytes,
+                word,
+                NASTY[rng.random_range(0..NASTY.len())].as_bytes(),
+            );
         }
         _ => bytes.truncate(at),
     }
@@ -103,7 +121,11 @@ fn piece<'a>(bytes: &'a [u8], rng: &mut impl Rng) -> &'a [u8] {
 /// The word or number about `at`.
 fn token(bytes: &[u8], at: usize) -> std::ops::Range<usize> {
     let is_part = |byte: &u8| byte.is_ascii_alphanumeric() || b"_.+-".contains(byte);
-    let before = bytes[..at].iter().rev().take_while(|byte| is_part(byte)).count();
+    let before = bytes[..at]
+        .iter()
+        .rev()
+        .take_while(|byte| is_part(byte))
+        .count();
     let after = bytes[at..].iter().take_while(|byte| is_part(byte)).count();
     at - before..at + after
 }

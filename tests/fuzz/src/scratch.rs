@@ -1,4 +1,5 @@
-//! Folders for readers that take files only, in memory where the machine has it: thousands of files a second are no load for a disk.
+//! Folders for readers that take files only, in memory where the machine has it: thousands of files
+//! a second are no load for a disk.
 
 use std::fs;
 use std::path::Path;
@@ -9,7 +10,8 @@ thread_local! {
     static FOLDER: TempDir = folder();
 }
 
-/// An empty folder that is removed with the value. `launch/fuzz.sh`, whose processes end without a word, names one of its own to remove.
+/// An empty folder that is removed with the value. `launch/fuzz.sh`, whose processes end without a
+/// word, names one of its own to remove.
 pub(crate) fn folder() -> TempDir {
     let memory = Path::new("/dev/shm");
     if std::env::var_os("TMPDIR").is_none() && memory.is_dir() {
@@ -19,7 +21,8 @@ pub(crate) fn folder() -> TempDir {
     }
 }
 
-/// Calls `read` with the thread's folder, in which `files` lie and nothing else that an earlier call did not put there under another name.
+/// Calls `read` with the thread's folder, in which `files` lie and nothing else that an earlier
+/// call did not put there under another name.
 pub(crate) fn with_files<T>(files: &[(&str, &[u8])], read: impl FnOnce(&Path) -> T) -> T {
     FOLDER.with(|folder| {
         for (name, bytes) in files {

@@ -1,4 +1,5 @@
-//! Reads an input as a sequence of choices, for targets that build what bytes alone would hardly ever spell.
+//! Reads an input as a sequence of choices, for targets that build what bytes alone would hardly
+//! ever spell.
 
 /// The rest of an input. When it is used up every choice is zero, so that any bytes are a script.
 pub(crate) struct Script<'a>(&'a [u8]);
@@ -47,7 +48,8 @@ impl<'a> Script<'a> {
         choices[usize::from(self.u8()) % choices.len()]
     }
 
-    /// Mostly a number from `usual`, in 65536 steps; sometimes any float there is, and sometimes one that is known for making trouble.
+    /// Mostly a number from `usual`, in 65536 steps; sometimes any float there is, and sometimes
+    /// one that is known for making trouble.
     pub(crate) fn number(&mut self, usual: std::ops::RangeInclusive<f32>) -> f32 {
         const TROUBLE: [f32; 12] = [
             0.0,

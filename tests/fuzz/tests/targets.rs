@@ -1,6 +1,10 @@
-//! Every target, over its samples, its committed inputs, and what a few seconds of mutation with a fixed seed make of them.
+//! Every target, over its samples, its committed inputs, and what a few seconds of mutation with a
+//! fixed seed make of them.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
@@ -47,7 +51,10 @@ fn drive(name: &str) {
         .map(|(number, sample)| exercise(target, &format!("sample {number}"), sample))
         .collect();
     // What refuses everything tries no promise: the samples are sound.
-    assert!(verdicts.contains(&Verdict::Accepted), "no sample of {name} is accepted");
+    assert!(
+        verdicts.contains(&Verdict::Accepted),
+        "no sample of {name} is accepted"
+    );
     let mut inputs = samples.clone();
     for (file, bytes) in committed(target) {
         exercise(target, &file, &bytes);
@@ -65,9 +72,18 @@ fn drive(name: &str) {
             break;
         }
     }
-    assert!(verdicts.contains(&Verdict::Refused), "everything is accepted by {name}");
-    let accepted = verdicts.iter().filter(|verdict| **verdict == Verdict::Accepted).count();
-    println!("{name}: {accepted} of {} inputs were accepted", verdicts.len());
+    assert!(
+        verdicts.contains(&Verdict::Refused),
+        "everything is accepted by {name}"
+    );
+    let accepted = verdicts
+        .iter()
+        .filter(|verdict| **verdict == Verdict::Accepted)
+        .count();
+    println!(
+        "{name}: {accepted} of {} inputs were accepted",
+        verdicts.len()
+    );
 }
 
 /// What once broke a promise, by its file in `regressions/`, and what is thought of it now.
@@ -75,7 +91,10 @@ fn drive(name: &str) {
 fn recall(name: &str, file: &str, expected: Verdict) {
     let target = TARGETS.iter().find(|target| target.name == name).unwrap();
     let path = format!("regressions/{name}/{file}");
-    let (_, bytes) = committed(target).into_iter().find(|(found, _)| *found == path).unwrap();
+    let (_, bytes) = committed(target)
+        .into_iter()
+        .find(|(found, _)| *found == path)
+        .unwrap();
     assert_eq!(exercise(target, file, &bytes), expected);
 }
 
@@ -91,7 +110,11 @@ fn a_buffer_that_has_counted_to_the_end_is_refused_before_it_counts_on() {
 
 #[test]
 fn returns_near_the_end_of_numbers_are_refused_before_an_axis_is_divided() {
-    recall("report_pictures", "returns_at_the_end_of_numbers", Verdict::Refused);
+    recall(
+        "report_pictures",
+        "returns_at_the_end_of_numbers",
+        Verdict::Refused,
+    );
 }
 
 #[test]

@@ -5,17 +5,20 @@ use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use super::{CameraSettings, DepthCamera, Errors, IMAGE_PIXELS, IMAGE_WIDTH, Instructions, ReferenceCamera};
+use super::{
+    CameraSettings, DepthCamera, Errors, IMAGE_PIXELS, IMAGE_WIDTH, Instructions, ReferenceCamera,
+};
 use crate::course::{Course, GeneratorRanges, test_course};
 
 /// Grey levels by which a pixel may differ: one rounding.
 const ROUNDING: u8 = 1;
 
-/// Pixels about which a silhouette is looked for when the middles disagree: how exactly an edge must lie.
+/// Pixels about which a silhouette is looked for when the middles disagree: how exactly an edge
+/// must lie.
 const SILHOUETTE_PX: f32 = 0.02;
 
-/// Share of the pixels that a silhouette may excuse. An image holds some 500 silhouette pixels, one in 25 of which has its
-/// middle within [`SILHOUETTE_PX`] of the edge; of these, few disagree.
+/// Share of the pixels that a silhouette may excuse. An image holds some 500 silhouette pixels, one
+/// in 25 of which has its middle within [`SILHOUETTE_PX`] of the edge; of these, few disagree.
 const MOST_EXCUSED: usize = IMAGE_PIXELS / 500;
 
 /// How two images of the same pose compare.
@@ -26,7 +29,11 @@ struct Comparison {
     wrong: Vec<(usize, usize, u8, u8)>,
 }
 
-fn compare(course: &Course, settings: &CameraSettings, world_from_body: &Isometry3<f32>) -> Comparison {
+fn compare(
+    course: &Course,
+    settings: &CameraSettings,
+    world_from_body: &Isometry3<f32>,
+) -> Comparison {
     let reference = ReferenceCamera::new(settings, course).unwrap();
     let mut drawn = [0; IMAGE_PIXELS];
     let mut traced = [0; IMAGE_PIXELS];
@@ -49,9 +56,13 @@ fn compare(course: &Course, settings: &CameraSettings, world_from_body: &Isometr
         let around: Vec<u8> = offsets
             .into_iter()
             .flat_map(|down| offsets.map(|right| (right, down)))
-            .map(|(right, down)| reference.grey(&view, column as f32 + 0.5 + right, row as f32 + 0.5 + down))
+            .map(|(right, down)| {
+                reference.grey(&view, column as f32 + 0.5 + right, row as f32 + 0.5 + down)
+            })
             .collect();
-        let (least, most) = around.iter().fold((255, 0), |(l, m), &g| (g.min(l), g.max(m)));
+        let (least, most) = around
+            .iter()
+            .fold((255, 0), |(l, m), &g| (g.min(l), g.max(m)));
         if (least.saturating_sub(ROUNDING)..=most.saturating_add(ROUNDING)).contains(&drawn) {
             comparison.excused += 1;
         } else {
@@ -147,8 +158,16 @@ fn episode_poses_agree_too() {
     let course = test_course();
     for step in 0..40 {
         let phase = step as f32;
-        let turn = UnitQuaternion::from_euler_angles(0.57 * phase.sin(), 0.3 * (1.7 * phase).cos(), 0.05 * phase.sin());
-        let at = Translation3::new(0.5 + 1.24 * phase, 0.8 * (0.7 * phase).sin(), 3.5 + 0.8 * phase.cos());
+        let turn = UnitQuaternion::from_euler_angles(
+            0.57 * phase.sin(),
+            0.3 * (1.7 * phase).cos(),
+            0.05 * phase.sin(),
+        );
+        let at = Translation3::new(
+            0.5 + 1.24 * phase,
+            0.8 * (0.7 * phase).sin(),
+            3.5 + 0.8 * phase.cos(),
+        );
         let pose = Isometry3::from_parts(at, turn);
         let at_wall = course
             .walls()
@@ -156,7 +175,11 @@ fn episode_poses_agree_too() {
             .any(|wall| (wall.x_m() - 0.5..wall.x_m() + 0.5).contains(&at.vector.x));
         if !at_wall {
             let comparison = compare(&course, &CameraSettings::default(), &pose);
-            assert!(comparison.wrong.is_empty(), "step {step}: {:?}", comparison.wrong);
+            assert!(
+                comparison.wrong.is_empty(),
+                "step {step}: {:?}",
+                comparison.wrong
+            );
             assert!(
                 comparison.excused <= MOST_EXCUSED,
                 "step {step}: {} excused",
@@ -168,7 +191,8 @@ fn episode_poses_agree_too() {
 
 #[test]
 fn depth_is_planar_and_in_steps_of_the_range() {
-    // 12 m before the end wall, looking straight at it: the same depth at every pixel that shows it.
+    // 12 m before the end wall, looking straight at it: the same depth at every pixel that shows
+    // it.
     let course = test_course();
     let pose = Isometry3::translation(52.0, 0.0, 3.5);
     let settings = CameraSettings {
@@ -176,7 +200,9 @@ fn depth_is_planar_and_in_steps_of_the_range() {
         ..lens_in_the_middle()
     };
     let mut image = [0; IMAGE_PIXELS];
-    DepthCamera::new(&settings, &course).unwrap().render(&pose, &mut image);
+    DepthCamera::new(&settings, &course)
+        .unwrap()
+        .render(&pose, &mut image);
     let at = |column: usize, row: usize| image[row * IMAGE_WIDTH + column];
     // 255 * 8 m / 10 m = 204; the end wall is 3 / 8 * 64 = 24 pixels wide to each side.
     assert!(
@@ -184,7 +210,8 @@ fn depth_is_planar_and_in_steps_of_the_range() {
         "{:?}",
         &image[36 * IMAGE_WIDTH..37 * IMAGE_WIDTH]
     );
-    // The left border looks along 45 degrees: the side, 3 m away, at a depth of 3 m but for half a pixel.
+    // The left border looks along 45 degrees: the side, 3 m away, at a depth of 3 m but for half a
+    // pixel.
     assert_eq!(at(0, 36), (25.5f32 * 3.0 * 64.0 / 63.5).round() as u8);
     // Up is up: the ceiling, 3.5 m above, and the floor, 3.5 m below, mirror each other.
     assert_eq!(at(64, 0), at(64, 71));
@@ -203,7 +230,11 @@ fn roll_turns_the_image_and_pitch_lifts_it() {
         image
     };
     let level = render(UnitQuaternion::identity());
-    let mut upside_down = render(UnitQuaternion::from_euler_angles(std::f32::consts::PI, 0.0, 0.0));
+    let mut upside_down = render(UnitQuaternion::from_euler_angles(
+        std::f32::consts::PI,
+        0.0,
+        0.0,
+    ));
     upside_down.reverse();
     let off = level
         .iter()
@@ -220,8 +251,8 @@ fn roll_turns_the_image_and_pitch_lifts_it() {
 
 #[test]
 fn nothing_is_near_in_the_middle_of_an_opening() {
-    // With the lens in the plane of a face, the near plane cuts the face all along its hole. Turned in many ways, no pixel of
-    // the line of that cut may show.
+    // With the lens in the plane of a face, the near plane cuts the face all along its hole. Turned
+    // in many ways, no pixel of the line of that cut may show.
     let course = test_course();
     let mut camera = DepthCamera::new(&lens_in_the_middle(), &course).unwrap();
     let mut image = [0; IMAGE_PIXELS];
@@ -256,7 +287,10 @@ fn wider_registers_change_no_bit_of_the_image() {
         let spot = [Spot::BetweenWalls, Spot::Opening][number % 2];
         let view = settings.view(&pose(lens(&course, number % 5, spot, share), quaternion));
         super::draw(&mut camera, &view, Errors::None, &mut portable);
-        for set in Instructions::ALL.into_iter().filter(|set| set.is_available()) {
+        for set in Instructions::ALL
+            .into_iter()
+            .filter(|set| set.is_available())
+        {
             set.draw()(&mut camera, &view, Errors::None, &mut wider);
             assert!(portable == wider, "{set}, {view:?}");
         }

@@ -1,9 +1,10 @@
 //! Fills outlines with planes, keeping what is nearest.
 //!
-//! The depth of a plane is not affine over the image, but its inverse is: `1 / depth = a column + b row + c`. So a surface is
-//! drawn without a division or a texture, and the nearer of two surfaces has the larger inverse. What is inside an
-//! outline is told by parity: each edge flips every pixel to the right of it, in a row of 128 bits at once, so that holes, and
-//! corners that point inwards, need no triangles. Two surfaces that share an edge compute the same pixel for it: no cracks.
+//! The depth of a plane is not affine over the image, but its inverse is: `1 / depth = a column + b
+//! row + c`. So a surface is drawn without a division or a texture, and the nearer of two surfaces
+//! has the larger inverse. What is inside an outline is told by parity: each edge flips every pixel
+//! to the right of it, in a row of 128 bits at once, so that holes, and corners that point inwards,
+//! need no triangles. Two surfaces that share an edge compute the same pixel for it: no cracks.
 
 use super::settings::MIDDLE_PX;
 use super::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
@@ -15,7 +16,8 @@ pub(super) struct ImagePoint {
     pub row: f32,
 }
 
-/// Range over depth as an affine function of the image, about the image's middle: 1 at the range, more when nearer.
+/// Range over depth as an affine function of the image, about the image's middle: 1 at the range,
+/// more when nearer.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Nearness {
     pub per_column: f32,
@@ -45,7 +47,10 @@ const FROM_MIDDLE: [f32; IMAGE_WIDTH] = {
     columns
 };
 
-const _: () = assert!(IMAGE_WIDTH == u128::BITS as usize, "a row is the bits of a u128");
+const _: () = assert!(
+    IMAGE_WIDTH == u128::BITS as usize,
+    "a row is the bits of a u128"
+);
 
 /// The image while it is drawn.
 pub(super) struct Canvas {
@@ -73,10 +78,12 @@ impl Canvas {
         self.nearness.as_flattened_mut().fill(1.0);
     }
 
-    /// Adds an edge to the outline. The edges of an outline form closed loops; their direction does not matter.
+    /// Adds an edge to the outline. The edges of an outline form closed loops; their direction does
+    /// not matter.
     #[inline(always)]
     pub(super) fn add_edge(&mut self, a: ImagePoint, b: ImagePoint) {
-        // From the upper end, whichever way the surface runs along it: neighbours must compute the same.
+        // From the upper end, whichever way the surface runs along it: neighbours must compute the
+        // same.
         let (upper, lower) = if a.row < b.row { (a, b) } else { (b, a) };
         let first = first_at_or_after(upper.row, IMAGE_HEIGHT);
         let end = first_at_or_after(lower.row, IMAGE_HEIGHT);
@@ -145,7 +152,8 @@ fn raise(pixels: &mut [f32], columns: &[f32], at_row: f32, per_column: f32) {
 /// Number of the first pixel whose middle lies at or after `position`, at most `count`.
 #[inline(always)]
 fn first_at_or_after(position: f32, count: usize) -> usize {
-    // Truncation towards zero rounds down here, and up when counted from the far end: `ceil` without its call.
+    // Truncation towards zero rounds down here, and up when counted from the far end: `ceil`
+    // without its call.
     let from_end = count as f32 + 1.0 - (position - 0.5).clamp(0.0, count as f32);
     count + 1 - from_end as usize
 }

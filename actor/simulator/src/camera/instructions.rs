@@ -9,7 +9,8 @@ pub(super) type Draw = fn(&mut DepthCamera, &settings::View, Errors, &mut [u8; I
 
 /// A set of vector instructions that drawing is compiled for.
 ///
-/// The same arithmetic in the same order whichever is chosen: wider registers do not change a bit of the image.
+/// The same arithmetic in the same order whichever is chosen: wider registers do not change a bit
+/// of the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Instructions {
     /// Those that every processor has.
@@ -58,7 +59,8 @@ impl Instructions {
             Self::Portable => draw,
             #[cfg(target_arch = "x86_64")]
             Self::Avx2 => {
-                // SAFETY: the machine has the features that the function is compiled for, as just asked.
+                // SAFETY: the machine has the features that the function is compiled for, as just
+                // asked.
                 |camera, view, errors, image| unsafe { draw_avx2(camera, view, errors, image) }
             }
             #[cfg(target_arch = "x86_64")]
@@ -84,12 +86,22 @@ impl fmt::Display for Instructions {
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-fn draw_avx512(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: &mut [u8; IMAGE_PIXELS]) {
+fn draw_avx512(
+    camera: &mut DepthCamera,
+    view: &settings::View,
+    errors: Errors,
+    image: &mut [u8; IMAGE_PIXELS],
+) {
     draw(camera, view, errors, image);
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn draw_avx2(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: &mut [u8; IMAGE_PIXELS]) {
+fn draw_avx2(
+    camera: &mut DepthCamera,
+    view: &settings::View,
+    errors: Errors,
+    image: &mut [u8; IMAGE_PIXELS],
+) {
     draw(camera, view, errors, image);
 }

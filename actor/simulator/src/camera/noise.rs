@@ -1,7 +1,8 @@
-//! What a stereo camera makes of the scene: noise that grows with depth, shadows beside near objects, patches without a reading.
+//! What a stereo camera makes of the scene: noise that grows with depth, shadows beside near
+//! objects, patches without a reading.
 //!
-//! A pixel's noise is computed from its number and the image's key, many pixels at a time; shadows and patches touch few pixels. All of it together costs
-//! less than drawing the scene.
+//! A pixel's noise is computed from its number and the image's key, many pixels at a time; shadows
+//! and patches touch few pixels. All of it together costs less than drawing the scene.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -16,7 +17,8 @@ pub(super) const NO_READING: u8 = 0;
 /// The nearest reading: what has one is never taken for what has none.
 const NEAREST_READING: f32 = 1.0;
 
-/// Widest shadow, pixels: that of an object 0.2 m away, nearer than which no stereo camera of this kind matches anything.
+/// Widest shadow, pixels: that of an object 0.2 m away, nearer than which no stereo camera of this
+/// kind matches anything.
 const WIDEST_SHADOW_PX: usize = 16;
 
 /// Everything of [`DepthNoiseSettings`] that a pixel needs, in its units.
@@ -51,7 +53,8 @@ impl StereoNoise {
         })
     }
 
-    /// Grey levels of what is seen with errors. `nearness`: range over depth, `[72, 128]`, 1 at the range or farther. `key`: another one, other errors.
+    /// Grey levels of what is seen with errors. `nearness`: range over depth, `[72, 128]`, 1 at the
+    /// range or farther. `key`: another one, other errors.
     #[inline(always)]
     pub(super) fn write(
         &self,
@@ -70,7 +73,13 @@ impl StereoNoise {
 
     /// Noise of one row, the first pixel of which is number `first` of the image.
     #[inline(always)]
-    fn write_row(&self, nearness: &[f32; IMAGE_WIDTH], first: u32, key: u64, pixels: &mut [u8; IMAGE_WIDTH]) {
+    fn write_row(
+        &self,
+        nearness: &[f32; IMAGE_WIDTH],
+        first: u32,
+        key: u64,
+        pixels: &mut [u8; IMAGE_WIDTH],
+    ) {
         let [quadratic, linear, constant] = self.sigma;
         let (low_key, high_key) = (key as u32, (key >> 32) as u32);
         // Loops over arrays of one length, so that they are done in registers full of pixels.
@@ -90,8 +99,9 @@ impl StereoNoise {
 
     /// Takes the readings from what the left lens sees and the right one does not.
     ///
-    /// A point `disparity` pixels farther left in the right image is hidden there when a nearer one, k pixels to its right, lands on it or left of it: when
-    /// the disparity grows by k within k pixels. Half a pixel less, so that a shadow's width is rounded and not cut.
+    /// A point `disparity` pixels farther left in the right image is hidden there when a nearer
+    /// one, k pixels to its right, lands on it or left of it: when the disparity grows by k within
+    /// k pixels. Half a pixel less, so that a shadow's width is rounded and not cut.
     #[inline(always)]
     fn shade_row(&self, nearness: &[f32; IMAGE_WIDTH], pixels: &mut [u8; IMAGE_WIDTH]) {
         let nearest = nearness.iter().copied().fold(1.0, f32::max);
@@ -107,7 +117,10 @@ impl StereoNoise {
         }
         for k in 1..=reach_px {
             let within = k as f32 - 0.5;
-            for (hidden, (left, right)) in hidden_px.iter_mut().zip(nearness.iter().zip(&nearness[k..])) {
+            for (hidden, (left, right)) in hidden_px
+                .iter_mut()
+                .zip(nearness.iter().zip(&nearness[k..]))
+            {
                 let overlap = (right - left) * self.disparity_px - within;
                 *hidden = if overlap > *hidden { overlap } else { *hidden };
             }

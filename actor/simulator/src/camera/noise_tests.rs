@@ -3,7 +3,9 @@
 use nalgebra::Isometry3;
 
 use super::{CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, Instructions};
-use crate::course::{Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout, test_course};
+use crate::course::{
+    Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout, test_course,
+};
 use crate::disturbances::{DepthModel, DepthNoiseSettings};
 
 /// The noise alone: no shadows, no patches.
@@ -16,7 +18,8 @@ fn noise_alone() -> DepthNoiseSettings {
     }
 }
 
-/// A wall 41 m along a corridor so wide that a camera before it sees nothing else around the middle; its opening is far aside.
+/// A wall 41 m along a corridor so wide that a camera before it sees nothing else around the
+/// middle; its opening is far aside.
 fn wide_hall() -> Course {
     Course::new(CourseLayout {
         name: "hall".into(),
@@ -54,19 +57,32 @@ fn lens() -> CameraSettings {
 /// An image of the wall from `depth_m` before it.
 fn facing_wall(noise: &DepthNoiseSettings, depth_m: f32, key: u64) -> Box<[u8; IMAGE_PIXELS]> {
     let mut image = Box::new([0; IMAGE_PIXELS]);
-    let mut camera = DepthCamera::new(&lens(), &wide_hall()).unwrap().with_noise(noise);
-    camera.render_with_noise(&Isometry3::translation(41.0 - depth_m, 0.0, 30.0), key, &mut image);
+    let mut camera = DepthCamera::new(&lens(), &wide_hall())
+        .unwrap()
+        .with_noise(noise);
+    camera.render_with_noise(
+        &Isometry3::translation(41.0 - depth_m, 0.0, 30.0),
+        key,
+        &mut image,
+    );
     image
 }
 
-/// An image from before the first wall of the course with one opening of each kind, `depth_m` before it.
+/// An image from before the first wall of the course with one opening of each kind, `depth_m`
+/// before it.
 fn facing_opening(noise: &DepthNoiseSettings, depth_m: f32, key: u64) -> Box<[u8; IMAGE_PIXELS]> {
     let mut image = Box::new([0; IMAGE_PIXELS]);
     let course = test_course();
     let wall = &course.walls()[0];
     let [y_m, z_m] = wall.safe_point();
-    let mut camera = DepthCamera::new(&lens(), &course).unwrap().with_noise(noise);
-    camera.render_with_noise(&Isometry3::translation(wall.x_m() - depth_m, y_m, z_m), key, &mut image);
+    let mut camera = DepthCamera::new(&lens(), &course)
+        .unwrap()
+        .with_noise(noise);
+    camera.render_with_noise(
+        &Isometry3::translation(wall.x_m() - depth_m, y_m, z_m),
+        key,
+        &mut image,
+    );
     image
 }
 
@@ -79,7 +95,8 @@ fn readings_scatter_by_sigma_around_the_true_depth() {
             .map(|level| f64::from(level) / 255.0 * 20.0)
             .collect();
         let mean = readings.iter().sum::<f64>() / readings.len() as f64;
-        let variance = readings.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / readings.len() as f64;
+        let variance =
+            readings.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / readings.len() as f64;
         // Rounding to whole levels adds a twelfth of a level's square.
         let level_m = 20.0 / 255.0;
         let sigma = f64::from(noise.sigma_m(depth_m));
@@ -96,7 +113,11 @@ fn readings_scatter_by_sigma_around_the_true_depth() {
                 variance.sqrt()
             );
         } else {
-            assert!(variance.sqrt() < level_m, "{depth_m} m: {} m", variance.sqrt());
+            assert!(
+                variance.sqrt() < level_m,
+                "{depth_m} m: {} m",
+                variance.sqrt()
+            );
         }
     }
 }
@@ -115,7 +136,9 @@ fn images_of_two_keys_err_independently_and_of_one_key_alike() {
     let deviation = |key| facing_wall(&noise, 10.0, key).map(|level| f64::from(level) - 127.5);
     let (one, other) = (deviation(1), deviation(2));
     assert!(one == deviation(1));
-    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / IMAGE_PIXELS as f64;
+    let product = |a: &[f64], b: &[f64]| {
+        a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / IMAGE_PIXELS as f64
+    };
     assert!((product(&one, &other) / product(&one, &one)).abs() < 0.04);
     // Nor does a pixel err as its neighbour does, to the right or below.
     for lag in [1, IMAGE_WIDTH] {
@@ -128,7 +151,11 @@ fn images_of_two_keys_err_independently_and_of_one_key_alike() {
 
 #[test]
 fn what_is_out_of_range_stays_so() {
-    assert!(facing_wall(&noise_alone(), 30.0, 1).iter().all(|&level| level == 255));
+    assert!(
+        facing_wall(&noise_alone(), 30.0, 1)
+            .iter()
+            .all(|&level| level == 255)
+    );
 }
 
 #[test]
@@ -142,7 +169,8 @@ fn shadow_lies_left_of_near_edges_and_is_as_wide_as_the_disparities_differ() {
         dropout_share: 0.0,
         ..Default::default()
     };
-    // The opening shows the next wall 10 m behind; at 64 pixels of focal length, 0.2 m between the lenses, 2 m and 12.3 m, the disparities are 6.4 and 1.0 pixels.
+    // The opening shows the next wall 10 m behind; at 64 pixels of focal length, 0.2 m between the
+    // lenses, 2 m and 12.3 m, the disparities are 6.4 and 1.0 pixels.
     let row = IMAGE_HEIGHT / 2;
     let of_row = |image: &[u8; IMAGE_PIXELS]| image[row * IMAGE_WIDTH..][..IMAGE_WIDTH].to_vec();
     let (seen, truth) = (
@@ -152,17 +180,24 @@ fn shadow_lies_left_of_near_edges_and_is_as_wide_as_the_disparities_differ() {
     let lost: Vec<usize> = (0..IMAGE_WIDTH)
         .filter(|&column| seen[column] == 0 && truth[column] != 0)
         .collect();
-    // The opening's right edge, where near begins again. Its left edge casts no shadow: the left lens sees less there than the right one.
+    // The opening's right edge, where near begins again. Its left edge casts no shadow: the left
+    // lens sees less there than the right one.
     let edge = (IMAGE_WIDTH / 2..IMAGE_WIDTH)
         .find(|&column| truth[column] < truth[column - 1] / 2)
         .unwrap();
     let (border, within): (Vec<usize>, Vec<usize>) = lost.iter().partition(|&&column| column < 16);
-    assert!((4..=6).contains(&within.len()), "{within:?}, edge at {edge}");
     assert!(
-        within.iter().all(|&column| column < edge && column + 7 > edge),
+        (4..=6).contains(&within.len()),
         "{within:?}, edge at {edge}"
     );
-    // The left border of the image, which the right lens does not see: 6.4 pixels at 2 m, and more at the side that is nearer.
+    assert!(
+        within
+            .iter()
+            .all(|&column| column < edge && column + 7 > edge),
+        "{within:?}, edge at {edge}"
+    );
+    // The left border of the image, which the right lens does not see: 6.4 pixels at 2 m, and more
+    // at the side that is nearer.
     assert!((5..=8).contains(&border.len()), "{border:?}");
     // Everything else is as it was.
     assert!((0..IMAGE_WIDTH).all(|column| lost.contains(&column) || seen[column] == truth[column]));
@@ -227,7 +262,10 @@ fn instructions_do_not_change_a_bit_of_the_errors() {
     let [mut plain, mut wider] = [[0; IMAGE_PIXELS]; 2];
     camera.draw = super::draw;
     camera.render_with_noise(&pose, 9, &mut plain);
-    for set in Instructions::ALL.into_iter().filter(|set| set.is_available()) {
+    for set in Instructions::ALL
+        .into_iter()
+        .filter(|set| set.is_available())
+    {
         camera.draw = set.draw();
         camera.render_with_noise(&pose, 9, &mut wider);
         assert!(plain == wider, "{set}");

@@ -1,7 +1,7 @@
 //! The depth image, one ray at a time.
 //!
-//! Slow and obviously right: it casts a ray through the middle of each pixel against the course's triangles. The fast
-//! camera is held to it pixel by pixel.
+//! Slow and obviously right: it casts a ray through the middle of each pixel against the course's
+//! triangles. The fast camera is held to it pixel by pixel.
 
 use nalgebra::{Isometry3, Vector3};
 use parry3d::math::Vector;
@@ -25,15 +25,24 @@ impl ReferenceCamera {
     /// [`TriMeshBuilderError`] if the course's surfaces are no triangle mesh.
     pub fn new(settings: &CameraSettings, course: &Course) -> Result<Self, TriMeshBuilderError> {
         let mesh = course.mesh();
-        let vertices = mesh.vertices.iter().map(|v| Vector::new(v.x, v.y, v.z)).collect();
-        let triangles = mesh.triangles().into_iter().map(|(triangle, _)| triangle).collect();
+        let vertices = mesh
+            .vertices
+            .iter()
+            .map(|v| Vector::new(v.x, v.y, v.z))
+            .collect();
+        let triangles = mesh
+            .triangles()
+            .into_iter()
+            .map(|(triangle, _)| triangle)
+            .collect();
         Ok(Self {
             settings: settings.clone(),
             surfaces: TriMesh::new(vertices, triangles)?,
         })
     }
 
-    /// What the camera sees with the body at `world_from_body`: see [`DepthCamera::render`](super::DepthCamera::render).
+    /// What the camera sees with the body at `world_from_body`: see
+    /// [`DepthCamera::render`](super::DepthCamera::render).
     pub fn render(&self, world_from_body: &Isometry3<f32>, image: &mut [u8; IMAGE_PIXELS]) {
         let view = self.settings.view(world_from_body);
         for (number, pixel) in image.iter_mut().enumerate() {
@@ -49,10 +58,14 @@ impl ReferenceCamera {
         (255.0 * share.min(1.0)).round() as u8
     }
 
-    /// Depth of the first surface that faces the camera beyond the near distance; infinite if there is none in range.
+    /// Depth of the first surface that faces the camera beyond the near distance; infinite if there
+    /// is none in range.
     fn depth_m(&self, view: &View, column: f32, row: f32) -> f32 {
         let focal = self.settings.focal_px();
-        let [across, along] = [(column - MIDDLE_PX[0]) / focal, (row - MIDDLE_PX[1]) / focal];
+        let [across, along] = [
+            (column - MIDDLE_PX[0]) / focal,
+            (row - MIDDLE_PX[1]) / focal,
+        ];
         // One unit of this direction is one metre of depth, so the time of impact is the depth.
         let direction = view.forward + view.right * across + view.down * along;
         let begin = view.eye + direction * self.settings.near_m;
@@ -61,6 +74,8 @@ impl ReferenceCamera {
         let left_m = self.settings.range_m - self.settings.near_m;
         self.surfaces
             .cast_local_ray_with_culling(&ray, left_m, RayCullingMode::IgnoreBackfaces)
-            .map_or(f32::INFINITY, |hit| self.settings.near_m + hit.time_of_impact)
+            .map_or(f32::INFINITY, |hit| {
+                self.settings.near_m + hit.time_of_impact
+            })
     }
 }

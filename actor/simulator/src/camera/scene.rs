@@ -101,14 +101,28 @@ impl Part {
         let first = used.clone().min().unwrap_or(0);
         let end = used.max().map_or(0, |last| last + 1);
         let vertices = mesh.vertices[first as usize..end as usize].to_vec();
-        let least = vertices.iter().copied().reduce(|a, b| a.inf(&b)).unwrap_or_default();
-        let most = vertices.iter().copied().reduce(|a, b| a.sup(&b)).unwrap_or_default();
+        let least = vertices
+            .iter()
+            .copied()
+            .reduce(|a, b| a.inf(&b))
+            .unwrap_or_default();
+        let most = vertices
+            .iter()
+            .copied()
+            .reduce(|a, b| a.sup(&b))
+            .unwrap_or_default();
         let nowhere = Seen {
             at_m: Vector3::zeros(),
-            image: ImagePoint { column: 0.0, row: 0.0 },
+            image: ImagePoint {
+                column: 0.0,
+                row: 0.0,
+            },
         };
         Self {
-            faces: surfaces.iter().map(|surface| Face::new(surface, first)).collect(),
+            faces: surfaces
+                .iter()
+                .map(|surface| Face::new(surface, first))
+                .collect(),
             middle: nalgebra::center(&least, &most),
             half_size: (most - least) / 2.0,
             seen: vec![nowhere; vertices.len()],
@@ -168,7 +182,8 @@ impl Face {
         }
     }
 
-    /// Adds to the canvas what of the face's edges lies beyond the near distance, and what closes them there.
+    /// Adds to the canvas what of the face's edges lies beyond the near distance, and what closes
+    /// them there.
     ///
     /// `cuts`: scratch memory.
     #[inline(always)]
@@ -205,14 +220,17 @@ impl Face {
 
 /// Closes an outline along the near plane.
 ///
-/// The cuts lie on one line, and the face between every other two of them. Closing each loop by itself would lay edges of the rim
-/// and of the hole over each other, which cancel only as far as their arithmetic agrees: a slit of near pixels remained.
+/// The cuts lie on one line, and the face between every other two of them. Closing each loop by
+/// itself would lay edges of the rim and of the hole over each other, which cancel only as far as
+/// their arithmetic agrees: a slit of near pixels remained.
 fn close_along_cuts(cuts: &mut [ImagePoint], canvas: &mut Canvas) {
     let extent = |along: fn(&ImagePoint) -> f32| {
         let (least, most) = cuts
             .iter()
             .map(along)
-            .fold((f32::INFINITY, f32::NEG_INFINITY), |(l, m), at| (l.min(at), m.max(at)));
+            .fold((f32::INFINITY, f32::NEG_INFINITY), |(l, m), at| {
+                (l.min(at), m.max(at))
+            });
         most - least
     };
     let steep = extent(|cut| cut.row) > extent(|cut| cut.column);
@@ -233,7 +251,8 @@ impl Eye {
         }
     }
 
-    /// Where the way from `beyond` to `before` meets the near plane. Both faces at an edge ask with the same two points.
+    /// Where the way from `beyond` to `before` meets the near plane. Both faces at an edge ask with
+    /// the same two points.
     #[inline(always)]
     fn cross_near_plane(&self, beyond: Vector3<f32>, before: Vector3<f32>) -> ImagePoint {
         let share = (beyond.z - self.near_m) / (beyond.z - before.z);
@@ -244,8 +263,8 @@ impl Eye {
     /// Of a plane with the world normal `normal`, `above_m` metres above which the lens is.
     #[inline(always)]
     fn nearness(&self, normal: Vector3<f32>, above_m: f32) -> Nearness {
-        // A point of the plane: normal . (p - eye) = -above. With p - eye = depth * (column / focal, row / focal, 1) in the
-        // optical frame, 1 / depth is affine in the image.
+        // A point of the plane: normal . (p - eye) = -above. With p - eye = depth * (column /
+        // focal, row / focal, 1) in the optical frame, 1 / depth is affine in the image.
         let scaled = self.camera_from_world * normal * (-self.range_m / above_m);
         Nearness {
             per_column: scaled.x / self.focal_px,

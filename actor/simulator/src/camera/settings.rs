@@ -9,14 +9,17 @@ use super::{IMAGE_HEIGHT, IMAGE_WIDTH};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraSettings {
-    /// Angle between the image's left and right border, degrees. Pixels are square. Source: AirSim's default, 90.
+    /// Angle between the image's left and right border, degrees. Pixels are square. Source:
+    /// AirSim's default, 90.
     pub horizontal_fov_deg: f32,
-    /// Depth that is shown as 255, metres: whatever is farther looks the same. Two walls ahead are seen at 20 m; 8 bits are
-    /// then 8 cm each. The paper does not give it.
+    /// Depth that is shown as 255, metres: whatever is farther looks the same. Two walls ahead are
+    /// seen at 20 m; 8 bits are then 8 cm each. The paper does not give it.
     pub range_m: f32,
-    /// Depth below which nothing is seen, metres. The lens sits inside the body, which would have collided before.
+    /// Depth below which nothing is seen, metres. The lens sits inside the body, which would have
+    /// collided before.
     pub near_m: f32,
-    /// Lens in the body frame (forward, left, up), metres. The default lies inside the body of every vehicle preset.
+    /// Lens in the body frame (forward, left, up), metres. The default lies inside the body of
+    /// every vehicle preset.
     pub mount_m: [f32; 3],
     /// How far the optical axis points above the body's forward axis, degrees.
     pub mount_pitch_deg: f32,
@@ -58,7 +61,8 @@ impl CameraSettings {
         let bounds = [
             ("horizontal_fov_deg", self.horizontal_fov_deg, 10.0, 150.0),
             ("near_m", self.near_m, 0.001, 1.0),
-            // An 8-bit step of 4 m would show nothing; a range within the near distance nothing at all.
+            // An 8-bit step of 4 m would show nothing; a range within the near distance nothing at
+            // all.
             ("range_m", self.range_m, 2.0 * self.near_m, 1000.0),
             ("mount_m[0]", x, -2.0, 2.0),
             ("mount_m[1]", y, -2.0, 2.0),
@@ -79,8 +83,8 @@ impl CameraSettings {
         Ok(())
     }
 
-    /// Distance of the image plane in pixels: a point at `(right, down, forward)` falls `focal * right / forward` pixels
-    /// to the right of the image's middle.
+    /// Distance of the image plane in pixels: a point at `(right, down, forward)` falls `focal *
+    /// right / forward` pixels to the right of the image's middle.
     pub(super) fn focal_px(&self) -> f32 {
         IMAGE_WIDTH as f32 / 2.0 / (self.horizontal_fov_deg.to_radians() / 2.0).tan()
     }
@@ -114,7 +118,11 @@ pub(super) struct View {
 impl View {
     /// World vector to the optical frame.
     pub(super) fn camera_from_world(&self) -> Matrix3<f32> {
-        Matrix3::from_rows(&[self.right.transpose(), self.down.transpose(), self.forward.transpose()])
+        Matrix3::from_rows(&[
+            self.right.transpose(),
+            self.down.transpose(),
+            self.forward.transpose(),
+        ])
     }
 }
 

@@ -1,13 +1,15 @@
 //! What a layout must satisfy to be a course.
 //!
-//! Every rule exists because the episode would otherwise be impossible or the numbers meaningless; each names what to change.
+//! Every rule exists because the episode would otherwise be impossible or the numbers meaningless;
+//! each names what to change.
 
 use super::{
-    BODY_CLEARANCE_M, Course, CourseFault, DRONE_WIDTH_M, FRAME_M, MAX_CORNERS, MAX_WALLS, Place, Shape, Wall,
-    WallLabel, WallLayout, polygon,
+    BODY_CLEARANCE_M, Course, CourseFault, DRONE_WIDTH_M, FRAME_M, MAX_CORNERS, MAX_WALLS, Place,
+    Shape, Wall, WallLabel, WallLayout, polygon,
 };
 
-/// Way flown at 1 m/s before a sidestep has settled, metres: three time constants of the slowest vehicle (0.9 s) and half its length.
+/// Way flown at 1 m/s before a sidestep has settled, metres: three time constants of the slowest
+/// vehicle (0.9 s) and half its length.
 const SETTLING_M: f32 = 3.2;
 
 /// Largest length that any key may hold, metres.
@@ -46,7 +48,11 @@ pub(super) fn corridor_and_start(course: &Course) -> Result<(), CourseFault> {
 
 /// The wall, if it can be flown through by itself and after the walls already in the course.
 pub(super) fn next_wall(course: &Course, candidate: WallLayout) -> Result<Wall, CourseFault> {
-    if course.walls.iter().any(|wall| wall.label == candidate.label) {
+    if course
+        .walls
+        .iter()
+        .any(|wall| wall.label == candidate.label)
+    {
         return Err(CourseFault::RepeatedWall {
             wall: candidate.label,
             key: "order",
@@ -167,7 +173,8 @@ fn outline(course: &Course, candidate: &WallLayout) -> Result<Vec<[f32; 2]>, Cou
     }
 }
 
-/// There is way enough to sidestep from the opening before, and from the start area, to this opening.
+/// There is way enough to sidestep from the opening before, and from the start area, to this
+/// opening.
 fn reachable(course: &Course, wall: &Wall) -> Result<(), CourseFault> {
     let before = course.walls.last();
     let start = course.start;
@@ -199,7 +206,13 @@ fn reachable(course: &Course, wall: &Wall) -> Result<(), CourseFault> {
     Ok(())
 }
 
-fn in_range(place: Place, key: &'static str, value: f32, least: f32, most: f32) -> Result<(), CourseFault> {
+fn in_range(
+    place: Place,
+    key: &'static str,
+    value: f32,
+    least: f32,
+    most: f32,
+) -> Result<(), CourseFault> {
     // Written so that a NaN is refused as well.
     if (least..=most).contains(&value) {
         Ok(())

@@ -64,7 +64,9 @@ pub enum CourseFault {
         needed: &'static str,
     },
     /// A length smaller than the drone.
-    #[error("wall {wall}: key {key} = {value_m} m is narrower than the drone ({DRONE_WIDTH_M} m): enlarge the opening")]
+    #[error(
+        "wall {wall}: key {key} = {value_m} m is narrower than the drone ({DRONE_WIDTH_M} m): enlarge the opening"
+    )]
     NarrowerThanDrone {
         /// The wall.
         wall: WallLabel,
@@ -152,7 +154,9 @@ pub enum CourseFault {
         needed_m: f32,
     },
     /// `order` names a wall that is not there.
-    #[error("course: key order names wall {wall}, which no [[wall]] defines: correct the order or add the wall")]
+    #[error(
+        "course: key order names wall {wall}, which no [[wall]] defines: correct the order or add the wall"
+    )]
     UnknownWall {
         /// The label.
         wall: WallLabel,
@@ -166,7 +170,9 @@ pub enum CourseFault {
         key: &'static str,
     },
     /// As many places as walls are needed.
-    #[error("course: key order has {order} walls and wall_x_m {places} places: give as many of each")]
+    #[error(
+        "course: key order has {order} walls and wall_x_m {places} places: give as many of each"
+    )]
     OrderLength {
         /// Length of `order`.
         order: usize,

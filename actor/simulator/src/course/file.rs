@@ -1,14 +1,18 @@
 //! Courses as TOML files.
 //!
-//! Walls are defined once, each under its label; `order` puts them into the corridor at the places `wall_x_m`. So a
-//! rearranged course is a changed line of data. A file that is refused is refused by file, wall and key.
+//! Walls are defined once, each under its label; `order` puts them into the corridor at the places
+//! `wall_x_m`. So a rearranged course is a changed line of data. A file that is refused is refused
+//! by file, wall and key.
 
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
 use super::whereabouts::Whereabouts;
-use super::{Corridor, Course, CourseFault, CourseLayout, Opening, Place, Shape, StartArea, WallLabel, WallLayout};
+use super::{
+    Corridor, Course, CourseFault, CourseLayout, Opening, Place, Shape, StartArea, WallLabel,
+    WallLayout,
+};
 use crate::text::read_text;
 
 /// Why a course file cannot be flown.
@@ -31,7 +35,8 @@ pub enum CourseError {
         place: Place,
         /// The line, from 1.
         line: usize,
-        /// Which key, and what is wrong, on one line; the parser's own error draws a picture over several.
+        /// Which key, and what is wrong, on one line; the parser's own error draws a picture over
+        /// several.
         message: String,
     },
     /// The file says something that cannot be flown.
@@ -65,10 +70,12 @@ impl Course {
     pub fn parse(text: &str, path: impl AsRef<Path>) -> Result<Self, CourseError> {
         let path = path.as_ref();
         let file: CourseFile = toml::from_str(text).map_err(|error| refused(path, text, &error))?;
-        file.layout().and_then(Self::new).map_err(|source| CourseError::Fault {
-            path: path.to_owned(),
-            source,
-        })
+        file.layout()
+            .and_then(Self::new)
+            .map_err(|source| CourseError::Fault {
+                path: path.to_owned(),
+                source,
+            })
     }
 }
 

@@ -1,8 +1,8 @@
 //! Random courses from a seed.
 //!
-//! What generalises is diversity in training, not more training: a policy that meets random openings cannot learn an order
-//! by heart. An opening is drawn by the free space it leaves: of whatever
-//! shape, a disc of that radius fits.
+//! What generalises is diversity in training, not more training: a policy that meets random
+//! openings cannot learn an order by heart. An opening is drawn by the free space it leaves: of
+//! whatever shape, a disc of that radius fits.
 
 mod corners;
 
@@ -11,7 +11,8 @@ use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    BODY_CLEARANCE_M, Corridor, Course, CourseFault, Opening, Shape, StartArea, WallLabel, WallLayout, check, polygon,
+    BODY_CLEARANCE_M, Corridor, Course, CourseFault, Opening, Shape, StartArea, WallLabel,
+    WallLayout, check, polygon,
 };
 
 /// What random courses are drawn from. Pairs are the least and the largest value, drawn uniformly.
@@ -26,7 +27,9 @@ pub struct GeneratorRanges {
     pub wall_x_m: Vec<f32>,
     /// Thickness of every wall, metres.
     pub wall_thickness_m: f32,
-    /// Kinds of openings, each as likely to be drawn; where one cannot be flown from the wall before, or does not fit, all is drawn anew, so that kinds which need more room come up less often. Default: the families for training, [`GeneratedShape::TRAINED`].
+    /// Kinds of openings, each as likely to be drawn; where one cannot be flown from the wall
+    /// before, or does not fit, all is drawn anew, so that kinds which need more room come up less
+    /// often. Default: the families for training, [`GeneratedShape::TRAINED`].
     pub shapes: Vec<GeneratedShape>,
     /// Radius of the widest circle inside an opening, metres: at least [`BODY_CLEARANCE_M`].
     pub clearance_m: [f32; 2],
@@ -36,10 +39,12 @@ pub struct GeneratorRanges {
 
 /// A kind of opening that the generator draws.
 ///
-/// Some families are for training, the others are held out, so that flying them shows what an agent makes of shapes that it never met: [`GeneratedShape::TRAINED`],
-/// [`GeneratedShape::HELD_OUT`], [`GeneratedShape::UNTRIED`]. `shapes` decides which are drawn; by default those of training. Neighbours remain: a square on its corner is a diamond of equal
-/// diagonals, a polygon of eight corners is near a circle, a T has an inner corner
-/// as an L and a cross have, and a keyhole, like an L, is widest away from its middle.
+/// Some families are for training, the others are held out, so that flying them shows what an agent
+/// makes of shapes that it never met: [`GeneratedShape::TRAINED`], [`GeneratedShape::HELD_OUT`],
+/// [`GeneratedShape::UNTRIED`]. `shapes` decides which are drawn; by default those of training.
+/// Neighbours remain: a square on its corner is a diamond of equal diagonals, a polygon of eight
+/// corners is near a circle, a T has an inner corner as an L and a cross have, and a keyhole, like
+/// an L, is widest away from its middle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum GeneratedShape {
@@ -63,13 +68,16 @@ pub enum GeneratedShape {
     T,
     /// Four to seven points, notches of 0.55 to 0.75 of the radius between them.
     Star,
-    /// Nine to fourteen corners around a centre, each at 0.4 to 1 of the radius: bays and points wherever they come to lie.
+    /// Nine to fourteen corners around a centre, each at 0.4 to 1 of the radius: bays and points
+    /// wherever they come to lie.
     Blob,
-    /// A head of six to nine corners with a slot at one side, 0.4 to 0.65 as wide as the head: what is widest is not in the middle.
+    /// A head of six to nine corners with a slot at one side, 0.4 to 0.65 as wide as the head: what
+    /// is widest is not in the middle.
     Keyhole,
     /// What a disc leaves of another that lies 0.9 to 1.3 of the radius beside it.
     Crescent,
-    /// Three beams of 0.36 to 0.44 of the width, 0.8 to 1 as high as it is wide: what is widest are its corners.
+    /// Three beams of 0.36 to 0.44 of the width, 0.8 to 1 as high as it is wide: what is widest are
+    /// its corners.
     U,
 }
 
@@ -85,10 +93,18 @@ impl GeneratedShape {
         Self::Keyhole,
     ];
 
-    /// Families that training never shows: those of the gates in `configs/courses/non_rectangular.toml`.
-    pub const HELD_OUT: [Self; 5] = [Self::Circle, Self::Triangle, Self::Diamond, Self::Cross, Self::L];
+    /// Families that training never shows: those of the gates in
+    /// `configs/courses/non_rectangular.toml`.
+    pub const HELD_OUT: [Self; 5] = [
+        Self::Circle,
+        Self::Triangle,
+        Self::Diamond,
+        Self::Cross,
+        Self::L,
+    ];
 
-    /// Families that nothing was ever tuned on. How a policy fared on the gates' families was looked at while `configs/generalist.toml` was made; on these, only once it was finished.
+    /// Families that nothing was ever tuned on. How a policy fared on the gates' families was
+    /// looked at while `configs/generalist.toml` was made; on these, only once it was finished.
     pub const UNTRIED: [Self; 2] = [Self::Crescent, Self::U];
 
     /// Its name in the configuration.
@@ -145,7 +161,8 @@ pub enum RangesError {
 }
 
 impl Default for GeneratorRanges {
-    /// Five walls as in the paper's corridor, with the free space of the shipped courses, of the shapes that are for training.
+    /// Five walls as in the paper's corridor, with the free space of the shipped courses, of the
+    /// shapes that are for training.
     fn default() -> Self {
         Self {
             corridor: Corridor::default(),
@@ -180,7 +197,12 @@ impl Course {
     }
 
     /// Draws walls until one can be flown after those already there.
-    fn add_random_wall(&mut self, x_m: f32, ranges: &GeneratorRanges, rng: &mut impl Rng) -> Result<(), RangesError> {
+    fn add_random_wall(
+        &mut self,
+        x_m: f32,
+        ranges: &GeneratorRanges,
+        rng: &mut impl Rng,
+    ) -> Result<(), RangesError> {
         /// With the default ranges about every third try fits.
         const TRIES: u32 = 1000;
 
@@ -188,7 +210,11 @@ impl Course {
         let mut tries = 0;
         loop {
             let opening = ranges.draw_opening(rng);
-            match self.add_wall(WallLayout { label, x_m, opening }) {
+            match self.add_wall(WallLayout {
+                label,
+                x_m,
+                opening,
+            }) {
                 Ok(()) => return Ok(()),
                 Err(last) if tries == TRIES => {
                     return Err(RangesError::NothingFits { wall: label, last });
@@ -229,7 +255,10 @@ impl GeneratorRanges {
         let (half_y, height) = (self.corridor.width_m / 2.0, self.corridor.height_m);
         Opening {
             shape: kind.draw(clearance_m, rng),
-            centre_m: [rng.random_range(-half_y..=half_y), rng.random_range(0.0..=height)],
+            centre_m: [
+                rng.random_range(-half_y..=half_y),
+                rng.random_range(0.0..=height),
+            ],
             rotation_deg: rng.random_range(self.rotation_deg[0]..=self.rotation_deg[1]),
         }
     }
@@ -328,7 +357,11 @@ mod tests {
             let course = Course::generate(seed, &ranges).unwrap();
             assert_eq!(course.walls().len(), 5);
             for wall in course.walls() {
-                assert!((0.89..=1.16).contains(&wall.clearance_m()), "{}", wall.clearance_m());
+                assert!(
+                    (0.89..=1.16).contains(&wall.clearance_m()),
+                    "{}",
+                    wall.clearance_m()
+                );
             }
             outlines.push(course.walls()[0].outline().to_vec());
         }

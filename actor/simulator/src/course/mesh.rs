@@ -1,7 +1,8 @@
 //! Every surface of a course, once: what the camera sees is what the body hits.
 //!
-//! A surface is flat and one-sided: its normal points into the free space. Neighbouring surfaces share their vertices, so
-//! that an edge is the same two numbers on both sides and no crack can open between them.
+//! A surface is flat and one-sided: its normal points into the free space. Neighbouring surfaces
+//! share their vertices, so that an edge is the same two numbers on both sides and no crack can
+//! open between them.
 
 use earcut::Earcut;
 use nalgebra::{Point3, Vector3};
@@ -15,7 +16,8 @@ pub enum SurfaceKind {
     Corridor,
     /// The wall at the corridor's end: the destination.
     EndWall,
-    /// A wall with an opening, by its place in course order from 0: front, back and the inside of its opening.
+    /// A wall with an opening, by its place in course order from 0: front, back and the inside of
+    /// its opening.
     Wall(usize),
 }
 
@@ -24,7 +26,8 @@ pub enum SurfaceKind {
 pub struct Surface {
     /// What it belongs to.
     pub kind: SurfaceKind,
-    /// Closed loops of vertex numbers: the outer rim and, in a wall, the hole. They do not touch each other.
+    /// Closed loops of vertex numbers: the outer rim and, in a wall, the hole. They do not touch
+    /// each other.
     pub loops: Vec<Vec<u32>>,
     /// Unit vector into the free space, world frame.
     pub normal: Vector3<f32>,
@@ -54,7 +57,8 @@ impl Mesh {
         mesh
     }
 
-    /// Triangles as vertex numbers, counter-clockwise seen from the free side, each with the number of its surface.
+    /// Triangles as vertex numbers, counter-clockwise seen from the free side, each with the number
+    /// of its surface.
     #[must_use]
     pub fn triangles(&self) -> Vec<([u32; 3], usize)> {
         let mut earcut = Earcut::new();
@@ -71,7 +75,9 @@ impl Mesh {
                 })
                 .take(surface.loops.len() - 1)
                 .collect();
-            let flat = rim.iter().map(|&v| surface.flatten(self.vertices[v as usize]));
+            let flat = rim
+                .iter()
+                .map(|&v| surface.flatten(self.vertices[v as usize]));
             earcut.earcut(flat, &holes, &mut corners);
             for &[a, b, c] in corners.as_chunks::<3>().0 {
                 let [a, b, c] = [a, b, c].map(|corner| rim[corner as usize]);
@@ -93,10 +99,15 @@ impl Mesh {
         let last = self.add_ring(corridor.length_m, &rim_of(course));
         self.add_surface(SurfaceKind::Corridor, vec![first.clone()], Vector3::x());
         self.add_surface(SurfaceKind::EndWall, vec![last.clone()], -Vector3::x());
-        // The rim runs along the floor, up the left side, back along the ceiling, down the right side.
+        // The rim runs along the floor, up the left side, back along the ceiling, down the right
+        // side.
         let inwards = [Vector3::z(), -Vector3::y(), -Vector3::z(), Vector3::y()];
         for (side, inward) in inwards.into_iter().enumerate() {
-            self.add_surface(SurfaceKind::Corridor, vec![band(&first, &last, side)], inward);
+            self.add_surface(
+                SurfaceKind::Corridor,
+                vec![band(&first, &last, side)],
+                inward,
+            );
         }
     }
 
@@ -135,7 +146,8 @@ impl Mesh {
 }
 
 impl Surface {
-    /// The point in two coordinates of the surface, leaving out the axis that the normal is nearest to.
+    /// The point in two coordinates of the surface, leaving out the axis that the normal is nearest
+    /// to.
     fn flatten(&self, point: Point3<f32>) -> [f32; 2] {
         match self.normal.iamax() {
             0 => [point.y, point.z],
@@ -186,9 +198,17 @@ mod tests {
             // From inside a quad or the corner of a ring, a small step must end in air.
             let at = match surface.loops.len() {
                 1 => within + surface.normal * 0.05,
-                _ => mesh.vertices[ring[0] as usize].coords + surface.normal * 0.05 + Vector3::new(0.0, 0.05, 0.05),
+                _ => {
+                    mesh.vertices[ring[0] as usize].coords
+                        + surface.normal * 0.05
+                        + Vector3::new(0.0, 0.05, 0.05)
+                }
             };
-            assert!((0.0..=corridor.length_m).contains(&at.x) && at.y.abs() <= 3.0 && (0.0..=7.0).contains(&at.z));
+            assert!(
+                (0.0..=corridor.length_m).contains(&at.x)
+                    && at.y.abs() <= 3.0
+                    && (0.0..=7.0).contains(&at.z)
+            );
             let in_wall = course.walls().iter().any(|wall| {
                 (wall.x_m()..wall.x_m() + course.wall_thickness_m()).contains(&at.x)
                     && super::super::polygon::signed_distance(wall.outline(), [at.y, at.z]) < 0.0

@@ -1,10 +1,11 @@
 //! The corridor, its walls and their openings, in episode order.
 //!
-//! A [`Course`] that exists can be flown: [`Course::new`] refuses everything else with the wall, the key and the remedy, so
-//! neither the physics nor the camera has to ask again. The same [`Mesh`] of surfaces is what the drone sees and what it
-//! hits.
+//! A [`Course`] that exists can be flown: [`Course::new`] refuses everything else with the wall,
+//! the key and the remedy, so neither the physics nor the camera has to ask again. The same
+//! [`Mesh`] of surfaces is what the drone sees and what it hits.
 //!
-//! World frame: x forward along the corridor from 0, y to the left from the middle, z up from the floor; metres.
+//! World frame: x forward along the corridor from 0, y to the left from the middle, z up from the
+//! floor; metres.
 
 mod check;
 mod fault;
@@ -27,11 +28,13 @@ pub use generator::{GeneratedShape, GeneratorRanges, RangesError};
 pub use mesh::{Mesh, Surface, SurfaceKind};
 pub use opening::{CIRCLE_SIDES, Opening, Shape};
 
-/// Width and length of the drone's body, metres. Source: AirSim's generic quadrotor mesh, 0.98 x 0.98 x 0.29 m.
+/// Width and length of the drone's body, metres. Source: AirSim's generic quadrotor mesh, 0.98 x
+/// 0.98 x 0.29 m.
 pub const DRONE_WIDTH_M: f32 = 0.98;
 
-/// Radius about an opening's safe point that must be free, metres: half the diagonal of the drone's cross-section
-/// 0.98 x 0.29 m, which is 0.511 m however the body rolls, and 0.14 m for the policy's error.
+/// Radius about an opening's safe point that must be free, metres: half the diagonal of the drone's
+/// cross-section 0.98 x 0.29 m, which is 0.511 m however the body rolls, and 0.14 m for the
+/// policy's error.
 pub const BODY_CLEARANCE_M: f32 = 0.65;
 
 /// Least width of the frame that remains around an opening, metres.
@@ -77,7 +80,8 @@ impl Default for Corridor {
     }
 }
 
-/// Where episodes begin: this far behind the previous wall's front face, in the middle of the corridor, give or take.
+/// Where episodes begin: this far behind the previous wall's front face, in the middle of the
+/// corridor, give or take.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StartArea {
@@ -90,7 +94,8 @@ pub struct StartArea {
 }
 
 impl Default for StartArea {
-    /// 1.5 m clears a wall of 0.3 m by more than the drone's half length; 0.5 m makes every episode another episode.
+    /// 1.5 m clears a wall of 0.3 m by more than the drone's half length; 0.5 m makes every episode
+    /// another episode.
     fn default() -> Self {
         Self {
             offset_m: 1.5,
@@ -153,7 +158,12 @@ impl Course {
     /// # Errors
     /// The first [`CourseFault`] found, from the corridor to the walls in episode order.
     pub fn new(layout: CourseLayout) -> Result<Self, CourseFault> {
-        let mut course = Self::without_walls(layout.name, layout.corridor, layout.start, layout.wall_thickness_m)?;
+        let mut course = Self::without_walls(
+            layout.name,
+            layout.corridor,
+            layout.start,
+            layout.wall_thickness_m,
+        )?;
         check::wall_count(layout.walls.len())?;
         for wall in layout.walls {
             course.add_wall(wall)?;
@@ -186,20 +196,29 @@ impl Course {
         Ok(())
     }
 
-    /// The same walls at the same places, in another order: `order` holds the place, from 0, of the wall that comes first, second, and so on.
+    /// The same walls at the same places, in another order: `order` holds the place, from 0, of the
+    /// wall that comes first, second, and so on.
     ///
     /// # Errors
-    /// The first [`CourseFault`], from the first wall on: not every order leaves way enough from one opening to the next.
+    /// The first [`CourseFault`], from the first wall on: not every order leaves way enough from
+    /// one opening to the next.
     ///
     /// # Panics
     /// If `order` is no permutation of the walls' places.
     pub fn reordered(&self, order: &[usize]) -> Result<Self, CourseFault> {
-        assert_eq!(order.len(), self.walls.len(), "an order names each wall once");
-        let walls = order.iter().zip(&self.walls).map(|(&from, place)| WallLayout {
-            label: self.walls[from].label,
-            x_m: place.x_m,
-            opening: self.walls[from].opening.clone(),
-        });
+        assert_eq!(
+            order.len(),
+            self.walls.len(),
+            "an order names each wall once"
+        );
+        let walls = order
+            .iter()
+            .zip(&self.walls)
+            .map(|(&from, place)| WallLayout {
+                label: self.walls[from].label,
+                x_m: place.x_m,
+                opening: self.walls[from].opening.clone(),
+            });
         Self::new(CourseLayout {
             name: self.name.clone(),
             corridor: self.corridor,
@@ -246,11 +265,16 @@ impl Course {
         self.walls.len() as u8
     }
 
-    /// Draws where an episode of `level` (1 = before the first wall) begins, in the world frame, metres.
+    /// Draws where an episode of `level` (1 = before the first wall) begins, in the world frame,
+    /// metres.
     ///
     /// # Errors
     /// [`NoSuchLevel`] if the course has fewer walls.
-    pub fn start_position(&self, level: u8, rng: &mut impl Rng) -> Result<Point3<f32>, NoSuchLevel> {
+    pub fn start_position(
+        &self,
+        level: u8,
+        rng: &mut impl Rng,
+    ) -> Result<Point3<f32>, NoSuchLevel> {
         let levels = self.levels();
         if !(1..=levels).contains(&level) {
             return Err(NoSuchLevel { level, levels });

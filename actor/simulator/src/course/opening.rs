@@ -4,15 +4,18 @@
 
 use super::polygon;
 
-/// Sides of the regular polygon that stands for a circle: it deviates from the true circle by 0.5 % of the radius.
+/// Sides of the regular polygon that stands for a circle: it deviates from the true circle by 0.5 %
+/// of the radius.
 pub const CIRCLE_SIDES: usize = 32;
 
-/// An opening in a wall's plane. Coordinates are `[y, z]` in metres, as in the world frame: y to the left, z up.
+/// An opening in a wall's plane. Coordinates are `[y, z]` in metres, as in the world frame: y to
+/// the left, z up.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Opening {
     /// What is cut out.
     pub shape: Shape,
-    /// Where the middle of the shape's bounding box lies (the origin of `points_m` for a polygon), `[y, z]` in metres.
+    /// Where the middle of the shape's bounding box lies (the origin of `points_m` for a polygon),
+    /// `[y, z]` in metres.
     pub centre_m: [f32; 2],
     /// Turn about the centre from y towards z, degrees.
     pub rotation_deg: f32,
@@ -56,7 +59,8 @@ pub enum Shape {
         /// Thickness of both beams.
         arm_m: f32,
     },
-    /// An upright beam at the least y and a level one at the bottom, as the letter reads with y to the right.
+    /// An upright beam at the least y and a level one at the bottom, as the letter reads with y to
+    /// the right.
     L {
         /// Along y.
         width_m: f32,
@@ -123,7 +127,11 @@ impl Shape {
                 height_m,
                 arm_m,
             } => {
-                vec![("width_m", width_m), ("height_m", height_m), ("arm_m", arm_m)]
+                vec![
+                    ("width_m", width_m),
+                    ("height_m", height_m),
+                    ("arm_m", arm_m),
+                ]
             }
             Self::Polygon { .. } => Vec::new(),
         }
@@ -153,7 +161,10 @@ impl Shape {
                 *height_m *= factor;
                 *arm_m *= factor;
             }
-            Self::Polygon { points_m } => points_m.iter_mut().flatten().for_each(|value| *value *= factor),
+            Self::Polygon { points_m } => points_m
+                .iter_mut()
+                .flatten()
+                .for_each(|value| *value *= factor),
         }
         self
     }
@@ -168,7 +179,10 @@ impl Shape {
             Self::Circle { diameter_m } => (0..CIRCLE_SIDES)
                 .map(|side| {
                     let angle = side as f32 / CIRCLE_SIDES as f32 * std::f32::consts::TAU;
-                    [diameter_m / 2.0 * angle.cos(), diameter_m / 2.0 * angle.sin()]
+                    [
+                        diameter_m / 2.0 * angle.cos(),
+                        diameter_m / 2.0 * angle.sin(),
+                    ]
                 })
                 .collect(),
             Self::Triangle { width_m, height_m } => {
@@ -237,7 +251,9 @@ mod tests {
     fn areas_are_those_of_the_textbook() {
         for turn in [0.0, 33.0, -190.0] {
             let (width_m, height_m, arm_m) = (3.0, 2.0, 0.5);
-            let near = |got: f32, expected: f32| assert!((got - expected).abs() < 1e-4, "{got} {expected}");
+            let near = |got: f32, expected: f32| {
+                assert!((got - expected).abs() < 1e-4, "{got} {expected}")
+            };
             near(area(Shape::Rectangle { width_m, height_m }, turn), 6.0);
             near(area(Shape::Triangle { width_m, height_m }, turn), 3.0);
             near(area(Shape::Diamond { width_m, height_m }, turn), 3.0);

@@ -1,11 +1,14 @@
 //! Simple polygons in a wall's plane: orientation, self-intersection, and the widest free spot.
 //!
-//! Points are `[y, z]` in metres. Everything here is plain arithmetic on a handful of points, so it is written out rather
-//! than brought in.
+//! Points are `[y, z]` in metres. Everything here is plain arithmetic on a handful of points, so it
+//! is written out rather than brought in.
 
 /// Twice-signed area halved: positive when the points run counter-clockwise.
 pub(crate) fn signed_area(points: &[[f32; 2]]) -> f32 {
-    edges(points).map(|([ay, az], [by, bz])| ay * bz - by * az).sum::<f32>() * 0.5
+    edges(points)
+        .map(|([ay, az], [by, bz])| ay * bz - by * az)
+        .sum::<f32>()
+        * 0.5
 }
 
 /// The area's centre of gravity. `points`: a polygon of non-zero area.
@@ -20,7 +23,8 @@ pub(crate) fn centroid(points: &[[f32; 2]]) -> [f32; 2] {
     [sum[0] * scale, sum[1] * scale]
 }
 
-/// The first pair of edges (by number) that touch although they are not neighbours, or that fold back on each other.
+/// The first pair of edges (by number) that touch although they are not neighbours, or that fold
+/// back on each other.
 pub(crate) fn self_intersection(points: &[[f32; 2]]) -> Option<(usize, usize)> {
     let sides: Vec<_> = edges(points).collect();
     let count = sides.len();
@@ -57,8 +61,9 @@ pub(crate) fn signed_distance(points: &[[f32; 2]], point: [f32; 2]) -> f32 {
 
 /// Centre of the widest circle that fits inside, and its radius in metres, to a millimetre.
 ///
-/// Where several circles are equally wide (a long rectangle), the one nearest the centroid wins: an opening is flown
-/// through its middle. Squares are quartered as long as a better centre can lie in them.
+/// Where several circles are equally wide (a long rectangle), the one nearest the centroid wins: an
+/// opening is flown through its middle. Squares are quartered as long as a better centre can lie in
+/// them.
 pub(crate) fn widest_circle(points: &[[f32; 2]]) -> ([f32; 2], f32) {
     /// Metres of clearance given up for each metre nearer to the centroid.
     const PULL_TO_CENTROID: f32 = 0.02;
@@ -80,7 +85,10 @@ pub(crate) fn widest_circle(points: &[[f32; 2]]) -> ([f32; 2], f32) {
     let mut squares = vec![middle];
     while !squares.is_empty() {
         let scored: Vec<_> = squares.into_iter().map(|at| (at, score(at))).collect();
-        best = scored.iter().copied().fold(best, |a, b| if b.1 > a.1 { b } else { a });
+        best = scored
+            .iter()
+            .copied()
+            .fold(best, |a, b| if b.1 > a.1 { b } else { a });
         let corner_gains = half_side * std::f32::consts::SQRT_2 * STEEPEST;
         half_side /= 2.0;
         squares = scored
@@ -151,7 +159,10 @@ mod tests {
     fn widest_circle_of_a_square_is_its_incircle() {
         let (centre, radius) = widest_circle(&SQUARE);
         assert!((radius - 1.0).abs() < 2e-3, "{radius}");
-        assert!((centre[0] - 1.0).hypot(centre[1] - 1.0) < 2e-3, "{centre:?}");
+        assert!(
+            (centre[0] - 1.0).hypot(centre[1] - 1.0) < 2e-3,
+            "{centre:?}"
+        );
     }
 
     #[test]
@@ -162,11 +173,21 @@ mod tests {
 
     #[test]
     fn widest_circle_of_an_l_lies_in_its_corner() {
-        let l = [[0.0, 0.0], [3.0, 0.0], [3.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]];
+        let l = [
+            [0.0, 0.0],
+            [3.0, 0.0],
+            [3.0, 1.0],
+            [1.0, 1.0],
+            [1.0, 3.0],
+            [0.0, 3.0],
+        ];
         let (centre, radius) = widest_circle(&l);
         // The circle touches both outer sides and the inner corner: r = (1 - r) * sqrt 2.
         let expected = 2f32.sqrt() / (1.0 + 2f32.sqrt());
-        assert!((radius - expected).abs() < 5e-3, "{radius} against {expected}");
+        assert!(
+            (radius - expected).abs() < 5e-3,
+            "{radius} against {expected}"
+        );
         assert!((centre[0] - centre[1]).abs() < 5e-3);
     }
 

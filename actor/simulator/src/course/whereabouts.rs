@@ -1,6 +1,7 @@
 //! Says where in a course file the parser stumbled: line, wall and key.
 //!
-//! The parser knows a byte, its user thinks in walls. Lines are looked at, not tables: a file that is no TOML still has walls and keys.
+//! The parser knows a byte, its user thinks in walls. Lines are looked at, not tables: a file that
+//! is no TOML still has walls and keys.
 
 use std::ops::Range;
 
@@ -22,7 +23,11 @@ impl Whereabouts {
     pub(super) fn of(span: Range<usize>, text: &str) -> Self {
         // What the whole file lacks is reported at its first byte, whatever stands there.
         let whole_file = span == (0..0);
-        let line = 1 + text.bytes().take(span.start).filter(|byte| *byte == b'\n').count();
+        let line = 1 + text
+            .bytes()
+            .take(span.start)
+            .filter(|byte| *byte == b'\n')
+            .count();
         let (mut table, mut label, mut key) = ("", None, None);
         for (number, text) in (1..).zip(text.lines().map(str::trim_start)) {
             if let Some(header) = header(text) {
@@ -108,7 +113,12 @@ length_m = "long"
 
     #[test]
     fn walls_are_known_by_labels_before_and_after_the_fault() {
-        assert_found("0.0\npoints", 7, Place::Wall(WallLabel(4)), Some("centre_m"));
+        assert_found(
+            "0.0\npoints",
+            7,
+            Place::Wall(WallLabel(4)),
+            Some("centre_m"),
+        );
         assert_found("seven", 14, Place::Course, Some("label"));
         assert_found("[[wall\n", 15, Place::Wall(WallLabel(8)), None);
     }

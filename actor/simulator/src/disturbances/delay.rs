@@ -2,7 +2,8 @@
 
 use std::collections::VecDeque;
 
-/// Holds each action back for a number of control periods. Until the first one arrives, nothing is commanded sideways or up.
+/// Holds each action back for a number of control periods. Until the first one arrives, nothing is
+/// commanded sideways or up.
 #[derive(Debug, Clone)]
 pub(crate) struct Delay {
     on_the_way: VecDeque<[f32; 2]>,

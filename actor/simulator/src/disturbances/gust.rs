@@ -6,11 +6,12 @@ use rand_pcg::Pcg64Mcg;
 
 use super::{GustSettings, standard_normal};
 
-/// The gusts of one episode: a first-order Gauss-Markov process along each axis of the world, which is what Dryden's model of turbulence is along the
-/// direction of episode.
+/// The gusts of one episode: a first-order Gauss-Markov process along each axis of the world, which
+/// is what Dryden's model of turbulence is along the direction of episode.
 ///
-/// With φ = exp(−Δt / τ), a step is f ← φ f + rms √(1 − φ²) n: the force keeps its rms whatever the step's length, and its correlation over a time t is
-/// exp(−t / τ). Source: MIL-F-8785C, section 3.7; the discrete form is in every text on it.
+/// With φ = exp(−Δt / τ), a step is f ← φ f + rms √(1 − φ²) n: the force keeps its rms whatever the
+/// step's length, and its correlation over a time t is exp(−t / τ). Source: MIL-F-8785C, section
+/// 3.7; the discrete form is in every text on it.
 #[derive(Debug, Clone)]
 pub(crate) struct Gust {
     rng: Pcg64Mcg,
@@ -22,7 +23,8 @@ pub(crate) struct Gust {
 }
 
 impl Gust {
-    /// The gusts of the episode seeded `seed`, in the middle of which it begins; `None` in calm air.
+    /// The gusts of the episode seeded `seed`, in the middle of which it begins; `None` in calm
+    /// air.
     pub(crate) fn new(settings: &GustSettings, dt_secs: f32, seed: u64) -> Option<Self> {
         if settings.force_rms_n == 0.0 {
             return None;
@@ -63,7 +65,12 @@ mod tests {
 
     const DT_SECS: f32 = 0.005;
 
-    fn forces(force_rms_n: f32, correlation_secs: f32, seed: u64, steps: usize) -> Vec<Vector3<f32>> {
+    fn forces(
+        force_rms_n: f32,
+        correlation_secs: f32,
+        seed: u64,
+        steps: usize,
+    ) -> Vec<Vector3<f32>> {
         let settings = GustSettings {
             force_rms_n,
             correlation_secs,

@@ -1,8 +1,11 @@
-//! What an episode meets that the policy did not ask for: a noisy depth camera, gusts, late commands, a drone of another mass.
+//! What an episode meets that the policy did not ask for: a noisy depth camera, gusts, late
+//! commands, a drone of another mass.
 //!
-//! Each can be switched on alone, all are off by default, and off they change no bit of an episode. What is drawn is drawn from a generator that
-//! [`Simulator::reset`](crate::simulator::Simulator::reset) takes, so that a disturbed episode is as repeatable as a calm one. Draws do not shift each other:
-//! the mass of an episode is the same whether or not there are gusts.
+//! Each can be switched on alone, all are off by default, and off they change no bit of an episode.
+//! What is drawn is drawn from a generator that
+//! [`Simulator::reset`](crate::simulator::Simulator::reset) takes, so that a disturbed episode is
+//! as repeatable as a calm one. Draws do not shift each other: the mass of an episode is the same
+//! whether or not there are gusts.
 
 mod delay;
 mod gust;
@@ -16,7 +19,9 @@ use rand::{Rng, RngExt};
 pub(crate) use delay::Delay;
 pub(crate) use gust::Gust;
 pub(crate) use normal::{mix, scrambled, standard_normal};
-pub use settings::{DepthModel, DepthNoiseSettings, DisturbanceFault, DisturbanceSettings, GustSettings};
+pub use settings::{
+    DepthModel, DepthNoiseSettings, DisturbanceFault, DisturbanceSettings, GustSettings,
+};
 
 /// What was drawn for one episode.
 #[derive(Debug, Clone, Copy, PartialEq)]

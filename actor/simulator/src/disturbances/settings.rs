@@ -9,14 +9,17 @@ use crate::vehicle::{Preset, VehicleSettings};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DisturbanceSettings {
-    /// Share of episodes that are disturbed, 0 to 1, drawn for each; the others are calm in every respect. A policy that met nothing but disturbed episodes would know no calm
-    /// ones. Default 1.
+    /// Share of episodes that are disturbed, 0 to 1, drawn for each; the others are calm in every
+    /// respect. A policy that met nothing but disturbed episodes would know no calm ones. Default
+    /// 1.
     pub share: f32,
-    /// Largest deviation of an episode's mass from the nominal one, as a share of it, 0 to 0.5; drawn uniformly for each episode. Inertia goes along; rotors and
-    /// controller know nothing of it and begin trimmed for the nominal mass. Default 0.
+    /// Largest deviation of an episode's mass from the nominal one, as a share of it, 0 to 0.5;
+    /// drawn uniformly for each episode. Inertia goes along; rotors and controller know nothing of
+    /// it and begin trimmed for the nominal mass. Default 0.
     pub mass_spread: f32,
-    /// Control periods from an action to its effect, 0 to 8; until the first takes effect nothing is commanded sideways or up. Counted in periods, because
-    /// nothing is decided or seen between two of them. Default 0.
+    /// Control periods from an action to its effect, 0 to 8; until the first takes effect nothing
+    /// is commanded sideways or up. Counted in periods, because nothing is decided or seen between
+    /// two of them. Default 0.
     pub latency_periods: u32,
     /// Gusts.
     pub gust: GustSettings,
@@ -24,14 +27,18 @@ pub struct DisturbanceSettings {
     pub depth: DepthNoiseSettings,
 }
 
-/// A random force on the body's centre of mass, along each axis of the world by itself: a first-order Gauss-Markov process.
+/// A random force on the body's centre of mass, along each axis of the world by itself: a
+/// first-order Gauss-Markov process.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GustSettings {
-    /// Root mean square along each axis, N, 0 to 10. Default 0: calm air. Air that moves at 0.28 m/s rms, a draughty hall, comes to 0.15 N on a quadrotor of 1 kg whose
-    /// rotors drag at 0.54 N per m/s (Faessler, Franchi, Scaramuzza, RA-L 2018); by the drag of the `airsim` preset itself it takes a wind of 4.7 m/s.
+    /// Root mean square along each axis, N, 0 to 10. Default 0: calm air. Air that moves at 0.28
+    /// m/s rms, a draughty hall, comes to 0.15 N on a quadrotor of 1 kg whose rotors drag at 0.54 N
+    /// per m/s (Faessler, Franchi, Scaramuzza, RA-L 2018); by the drag of the `airsim` preset
+    /// itself it takes a wind of 4.7 m/s.
     pub force_rms_n: f32,
-    /// Time after which 1/e of a gust is left, s, 0.01 to 60. Default 1: as slow as the vehicle itself, where it disturbs most.
+    /// Time after which 1/e of a gust is left, s, 0.01 to 60. Default 1: as slow as the vehicle
+    /// itself, where it disturbs most.
     pub correlation_secs: f32,
 }
 
@@ -42,37 +49,47 @@ pub enum DepthModel {
     /// Not at all.
     #[default]
     Off,
-    /// As a stereo camera's: noise that grows with the square of the depth, and pixels without a reading.
+    /// As a stereo camera's: noise that grows with the square of the depth, and pixels without a
+    /// reading.
     Stereo,
 }
 
-/// A stereo camera's errors. The numbers' defaults are those of an Intel RealSense D435; they act when `model` is `stereo`.
+/// A stereo camera's errors. The numbers' defaults are those of an Intel RealSense D435; they act
+/// when `model` is `stereo`.
 ///
-/// The noise of a reading at depth d has the standard deviation σ = a d² + b d + c, one pixel independent of the other: an image pixel here covers six of the
-/// camera's, about the width over which its matching correlates them. What lies at the range or farther stays so.
+/// The noise of a reading at depth d has the standard deviation σ = a d² + b d + c, one pixel
+/// independent of the other: an image pixel here covers six of the camera's, about the width over
+/// which its matching correlates them. What lies at the range or farther stays so.
 ///
-/// A pixel without a reading is 0, as RealSense's own images have it. Farthest would be the other choice; but it would draw openings into walls, and 0 cannot be
-/// mistaken: the body keeps every surface farther off than that, and a noisy reading is never less than 1.
+/// A pixel without a reading is 0, as RealSense's own images have it. Farthest would be the other
+/// choice; but it would draw openings into walls, and 0 cannot be mistaken: the body keeps every
+/// surface farther off than that, and a noisy reading is never less than 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DepthNoiseSettings {
     /// Whether any of this acts. Default `off`.
     pub model: DepthModel,
-    /// a, 1/m. Default 0.003949. Source of a, b and c: Ahn, Chae, Shin, Nam, Hong, "Analysis and Noise Modeling of the Intel RealSense D435 for Mobile Robots",
-    /// UR 2019. Intel's own formula, subpixel · d² / (focal length · baseline), gives 0.0038 with its usual 0.08 pixels, 424 pixels and 0.05 m. Both were measured up to some
-    /// metres; beyond the camera's nominal 10 m they are an extrapolation.
+    /// a, 1/m. Default 0.003949. Source of a, b and c: Ahn, Chae, Shin, Nam, Hong, "Analysis and
+    /// Noise Modeling of the Intel RealSense D435 for Mobile Robots", UR 2019. Intel's own formula,
+    /// subpixel · d² / (focal length · baseline), gives 0.0038 with its usual 0.08 pixels, 424
+    /// pixels and 0.05 m. Both were measured up to some metres; beyond the camera's nominal 10 m
+    /// they are an extrapolation.
     pub sigma_quadratic_per_m: f32,
     /// b. Default 0.0007278.
     pub sigma_linear: f32,
     /// c, metres. Default 0.001063.
     pub sigma_constant_m: f32,
-    /// Distance between the two lenses, metres, 0 to 0.5. Default 0.05. What the left one sees and the right one does not has no reading: a band at the left edge of every
-    /// near object, and of the image, focal length · baseline · (1 / near − 1 / far) pixels wide. 0: no such bands. Source: Intel, D400 series data sheet, "invalid depth band".
+    /// Distance between the two lenses, metres, 0 to 0.5. Default 0.05. What the left one sees and
+    /// the right one does not has no reading: a band at the left edge of every near object, and of
+    /// the image, focal length · baseline · (1 / near − 1 / far) pixels wide. 0: no such bands.
+    /// Source: Intel, D400 series data sheet, "invalid depth band".
     pub baseline_m: f32,
-    /// Share of the image without a reading in patches anywhere (reflections, no texture), 0 to 0.5; patches that overlap count each. Default 0.02: twice what the data sheet allows on a white wall, a fill
-    /// rate of 99 %.
+    /// Share of the image without a reading in patches anywhere (reflections, no texture), 0 to
+    /// 0.5; patches that overlap count each. Default 0.02: twice what the data sheet allows on a
+    /// white wall, a fill rate of 99 %.
     pub dropout_share: f32,
-    /// Largest side of such a patch, pixels, 1 to 64; each side is drawn uniformly from 1 up. Default 12: a tenth of the image's width.
+    /// Largest side of such a patch, pixels, 1 to 64; each side is drawn uniformly from 1 up.
+    /// Default 12: a tenth of the image's width.
     pub dropout_patch_px: u32,
 }
 
@@ -136,7 +153,11 @@ impl DisturbanceSettings {
     ///
     /// # Errors
     /// The first [`DisturbanceFault`].
-    pub fn check(&self, vehicle: &VehicleSettings, camera: &CameraSettings) -> Result<(), DisturbanceFault> {
+    pub fn check(
+        &self,
+        vehicle: &VehicleSettings,
+        camera: &CameraSettings,
+    ) -> Result<(), DisturbanceFault> {
         let Self { gust, depth, .. } = self;
         for (key, value, least, most, consequence) in [
             ("share", self.share, 0.0, 1.0, "it is a share of episodes"),
@@ -220,7 +241,8 @@ impl DisturbanceSettings {
 }
 
 impl DepthNoiseSettings {
-    /// σ is a standard deviation everywhere up to the range: a number, not below 0, nor larger than the range.
+    /// σ is a standard deviation everywhere up to the range: a number, not below 0, nor larger than
+    /// the range.
     fn check_sigma(&self, range_m: f32) -> Result<(), DisturbanceFault> {
         for (key, value) in [
             ("depth.sigma_quadratic_per_m", self.sigma_quadratic_per_m),
@@ -239,7 +261,8 @@ impl DepthNoiseSettings {
             ));
         }
         // The vertex of the parabola, where σ is least or greatest, and both ends.
-        let vertex_m = (-self.sigma_linear / (2.0 * self.sigma_quadratic_per_m)).clamp(0.0, range_m);
+        let vertex_m =
+            (-self.sigma_linear / (2.0 * self.sigma_quadratic_per_m)).clamp(0.0, range_m);
         let depths_m = [0.0, range_m, if vertex_m.is_nan() { 0.0 } else { vertex_m }];
         match depths_m
             .into_iter()
@@ -261,5 +284,9 @@ impl DepthNoiseSettings {
 }
 
 fn fault(key: &'static str, value: f32, problem: String) -> DisturbanceFault {
-    DisturbanceFault { key, value, problem }
+    DisturbanceFault {
+        key,
+        value,
+        problem,
+    }
 }

@@ -1,4 +1,5 @@
-//! Disturbed episodes: what each disturbance does to the drone, and that none does anything when it is off.
+//! Disturbed episodes: what each disturbance does to the drone, and that none does anything when it
+//! is off.
 
 use std::sync::Arc;
 
@@ -77,12 +78,17 @@ fn disturbed_episode_is_a_function_of_its_seeds_whatever_was_flown_before() {
 #[test]
 fn share_of_episodes_is_disturbed_and_the_others_are_calm_in_every_respect() {
     let actions = [[0.5, 0.2]; 4];
-    let now_and_then = DisturbanceSettings { share: 0.3, ..stormy() };
+    let now_and_then = DisturbanceSettings {
+        share: 0.3,
+        ..stormy()
+    };
     let mut simulators = [DisturbanceSettings::default(), stormy(), now_and_then]
         .map(|disturbances| simulator(Preset::Airsim, disturbances));
     let mut disturbed = 0;
     for seed in 0..100 {
-        let [calm, stormy, found] = simulators.each_mut().map(|simulator| flown(simulator, seed, &actions));
+        let [calm, stormy, found] = simulators
+            .each_mut()
+            .map(|simulator| flown(simulator, seed, &actions));
         assert!(found == calm || found == stormy, "seed {seed}");
         disturbed += usize::from(found == stormy);
     }
@@ -102,11 +108,16 @@ fn calm_settings_leave_no_trace_of_the_disturbances_generator() {
     }
 }
 
-/// The oracle's episodes from seed 1 to where they leave the last wall behind, as they were before there were disturbances: then, episodes were equal bit for bit.
-/// Here positions are held to a millimetre and sums to a part in 10,000, because mathematical functions may differ in the last bit from one system's library to another's.
+/// The oracle's episodes from seed 1 to where they leave the last wall behind, as they were before
+/// there were disturbances: then, episodes were equal bit for bit. Here positions are held to a
+/// millimetre and sums to a part in 10,000, because mathematical functions may differ in the last
+/// bit from one system's library to another's.
 #[test]
 fn undisturbed_episodes_are_those_from_before_there_were_disturbances() {
-    let course = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/courses/training.toml");
+    let course = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../configs/courses/training.toml"
+    );
     let course = Arc::new(Course::load(course).unwrap());
     for (preset, steps, end_m, grey) in RECORDED {
         let settings = SimulatorSettings {
@@ -126,21 +137,46 @@ fn undisturbed_episodes_are_those_from_before_there_were_disturbances() {
         }
         let end = simulator.state().position_m.coords;
         assert_eq!(flown, steps, "{preset:?}");
-        assert!((end - Vector3::from(end_m)).norm() < 1e-3, "{preset:?}: {end}");
+        assert!(
+            (end - Vector3::from(end_m)).norm() < 1e-3,
+            "{preset:?}: {end}"
+        );
         assert!((sum / grey - 1.0).abs() < 1e-4, "{preset:?}: {sum}");
     }
 }
 
 /// Steps, position at the end in metres, sum of all pixels.
 const RECORDED: [(Preset, u32, [f32; 3], f64); 3] = [
-    (Preset::Airsim, 100, [50.321_125, 1.700_952, 2.916_062], 60_939_195.0),
-    (Preset::Hummingbird, 99, [50.454_193, 1.691_67, 2.912_474], 60_432_945.0),
-    (Preset::Point, 99, [50.704_067, 1.689_485, 2.905_335], 60_359_220.0),
+    (
+        Preset::Airsim,
+        100,
+        [50.321_125, 1.700_952, 2.916_062],
+        60_939_195.0,
+    ),
+    (
+        Preset::Hummingbird,
+        99,
+        [50.454_193, 1.691_67, 2.912_474],
+        60_432_945.0,
+    ),
+    (
+        Preset::Point,
+        99,
+        [50.704_067, 1.689_485, 2.905_335],
+        60_359_220.0,
+    ),
 ];
 
 #[test]
 fn latency_shifts_the_answer_by_exactly_its_periods() {
-    let actions = [[0.8, -0.4], [-0.3, 0.6], [0.1, 0.1], [1.0, 0.0], [0.0, 0.5], [0.2, 0.0]];
+    let actions = [
+        [0.8, -0.4],
+        [-0.3, 0.6],
+        [0.1, 0.1],
+        [1.0, 0.0],
+        [0.0, 0.5],
+        [0.2, 0.0],
+    ];
     let late = |latency_periods, actions: &[[f32; 2]]| {
         let disturbances = DisturbanceSettings {
             latency_periods,
@@ -168,7 +204,8 @@ fn what_was_on_its_way_does_not_reach_the_next_episode() {
     assert!(first == flown(&mut used, 1, &[[0.0, 0.0]; 2]));
 }
 
-/// A drone `factor` times as heavy as nominal, hovering: how far it has risen after each period, metres, and how fast it rises at last, m/s.
+/// A drone `factor` times as heavy as nominal, hovering: how far it has risen after each period,
+/// metres, and how fast it rises at last, m/s.
 fn hover(preset: Preset, factor: f32) -> (Vec<f32>, f32) {
     let mut simulator = simulator(
         preset,
@@ -191,7 +228,10 @@ fn hover(preset: Preset, factor: f32) -> (Vec<f32>, f32) {
         .unwrap();
     let seen = flown(&mut simulator, seed, &[[0.0, 0.0]; 14]);
     let start_m = seen[0].0.position_m.z;
-    let rises = seen.iter().map(|(state, _)| state.position_m.z - start_m).collect();
+    let rises = seen
+        .iter()
+        .map(|(state, _)| state.position_m.z - start_m)
+        .collect();
     (rises, seen.last().unwrap().0.velocity_mps.z)
 }
 
@@ -222,7 +262,10 @@ fn masses_are_spread_evenly_over_the_range_and_do_not_depend_on_gusts() {
     assert!(factors.iter().all(|factor| (0.8..=1.2).contains(factor)));
     for quarter in 0..4 {
         let from = 0.8 + 0.1 * quarter as f32;
-        let share = factors.iter().filter(|&&f| f >= from && f < from + 0.1).count();
+        let share = factors
+            .iter()
+            .filter(|&&f| f >= from && f < from + 0.1)
+            .count();
         assert!((900..1100).contains(&share), "{share} of 4000 from {from}");
     }
     let first = Drawn::draw(&calm, &mut Pcg64Mcg::seed_from_u64(0)).mass_factor;
@@ -284,15 +327,24 @@ fn what_is_out_of_bounds_or_would_do_nothing_is_refused_by_key() {
     for (text, told) in [
         ("mass_spread = 0.6", "mass_spread = 0.6 is outside 0 to 0.5"),
         ("mass_spread = nan", "mass_spread = NaN"),
-        ("latency_periods = 9", "latency_periods = 9 is outside 0 to 8"),
+        (
+            "latency_periods = 9",
+            "latency_periods = 9 is outside 0 to 8",
+        ),
         ("gust.force_rms_n = -1.0", "gust.force_rms_n = -1"),
         ("gust.correlation_secs = 0.0", "gust.correlation_secs = 0"),
         ("depth.baseline_m = 1.0", "depth.baseline_m = 1"),
         ("depth.dropout_share = 0.9", "depth.dropout_share = 0.9"),
         ("depth.dropout_patch_px = 0", "depth.dropout_patch_px = 0"),
-        ("depth.sigma_constant_m = inf", "depth.sigma_constant_m = inf"),
+        (
+            "depth.sigma_constant_m = inf",
+            "depth.sigma_constant_m = inf",
+        ),
         ("depth.sigma_linear = -0.1", "makes the noise at"),
-        ("depth.sigma_quadratic_per_m = 1.0", "makes the noise at 20 m 400"),
+        (
+            "depth.sigma_quadratic_per_m = 1.0",
+            "makes the noise at 20 m 400",
+        ),
     ] {
         let told_is = refusal(text, Preset::Airsim).unwrap_err();
         assert!(told_is.contains(told), "{told_is}");
@@ -304,7 +356,10 @@ fn what_is_out_of_bounds_or_would_do_nothing_is_refused_by_key() {
         assert!(told.contains("vehicle.preset = \"point\""), "{told}");
     }
     assert_eq!(
-        refusal("latency_periods = 1\ndepth.model = \"stereo\"", Preset::Point),
+        refusal(
+            "latency_periods = 1\ndepth.model = \"stereo\"",
+            Preset::Point
+        ),
         Ok(())
     );
     let unknown = toml::from_str::<DisturbanceSettings>("gust.rms = 1.0").unwrap_err();

@@ -3,10 +3,12 @@
 use crate::course::{Course, Wall};
 use crate::vehicle::VehicleState;
 
-/// A wall is behind the drone once its tail has left the opening; m from the drone's centre to its tail, with some to spare.
+/// A wall is behind the drone once its tail has left the opening; m from the drone's centre to its
+/// tail, with some to spare.
 const TAIL_M: f32 = 0.6;
 
-/// What the simulator knows of a moment and no camera sees: for whoever judges a policy in training, never for the policy.
+/// What the simulator knows of a moment and no camera sees: for whoever judges a policy in
+/// training, never for the policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GroundTruth {
     /// The next two walls that the drone has not left entirely.
@@ -23,7 +25,8 @@ pub struct GroundTruth {
     pub gust_n: [f32; 3],
 }
 
-/// An opening, seen from the drone. Behind the last wall there is the end wall, to be touched anywhere: an opening as wide as the corridor.
+/// An opening, seen from the drone. Behind the last wall there is the end wall, to be touched
+/// anywhere: an opening as wide as the corridor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ahead {
     /// Forward to the wall's front face, m; negative inside and behind.
@@ -95,7 +98,10 @@ impl Ahead {
 }
 
 /// The walls that the drone has not left entirely, the next one first.
-pub(crate) fn walls_ahead<'a>(course: &'a Course, state: &VehicleState) -> impl Iterator<Item = &'a Wall> {
+pub(crate) fn walls_ahead<'a>(
+    course: &'a Course,
+    state: &VehicleState,
+) -> impl Iterator<Item = &'a Wall> {
     let tail_m = state.position_m.x - TAIL_M;
     course
         .walls()
@@ -117,7 +123,10 @@ mod tests {
         let [y_m, z_m] = walls[0].safe_point();
         let before = VehicleState::at_rest(Point3::new(walls[0].x_m() - 4.0, y_m - 1.0, z_m + 0.5));
         let [next, after] = Ahead::next_two(&course, &before);
-        assert_eq!((next.distance_m, next.clearance_m), (4.0, walls[0].clearance_m()));
+        assert_eq!(
+            (next.distance_m, next.clearance_m),
+            (4.0, walls[0].clearance_m())
+        );
         assert!((next.offset_m[0] - 1.0).abs() < 1e-5 && (next.offset_m[1] + 0.5).abs() < 1e-5);
         let behind_first = after.distance_m - next.distance_m;
         let expected = walls.get(1).map_or(course.corridor().length_m, Wall::x_m) - walls[0].x_m();
@@ -129,7 +138,10 @@ mod tests {
         let [next, after] = Ahead::next_two(&course, &behind);
         assert_eq!(next, after);
         assert_eq!(next.distance_m, course.corridor().length_m - behind_all);
-        assert_eq!(next.offset_m, [-1.0, course.corridor().height_m / 2.0 - 2.0]);
+        assert_eq!(
+            next.offset_m,
+            [-1.0, course.corridor().height_m / 2.0 - 2.0]
+        );
     }
 
     #[test]

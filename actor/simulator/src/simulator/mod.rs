@@ -1,7 +1,9 @@
-//! One episode at a time through a course: [`Simulator::reset`] starts it, [`Simulator::step`] lets one control period pass.
+//! One episode at a time through a course: [`Simulator::reset`] starts it, [`Simulator::step`] lets
+//! one control period pass.
 //!
-//! An episode is a pure function of course, settings, start, disturbances and actions. Numbers that are not finite never get further than the
-//! step they appear in: it returns [`SimulationError::NonFinite`] and the episode is over.
+//! An episode is a pure function of course, settings, start, disturbances and actions. Numbers that
+//! are not finite never get further than the step they appear in: it returns
+//! [`SimulationError::NonFinite`] and the episode is over.
 
 mod ground_truth;
 mod report;
@@ -47,7 +49,8 @@ pub struct Simulator {
 struct Episode {
     phase: Phase,
     steps: u32,
-    /// Walls of the course whose back face the drone's centre has left behind, those before its start included.
+    /// Walls of the course whose back face the drone's centre has left behind, those before its
+    /// start included.
     walls_behind: usize,
     walls_behind_at_start: usize,
     /// The drone's mass, by its nominal one.
@@ -75,12 +78,16 @@ impl Simulator {
         }
         let (physics_steps, dt_secs) = settings.vehicle.physics_steps();
         let vehicle = Vehicle::trimmed(&settings.vehicle);
-        let world = World::new(&course, vehicle.body(), dt_secs).map_err(|source| SimulatorError::Mesh {
-            course: course.name().to_owned(),
-            source,
+        let world = World::new(&course, vehicle.body(), dt_secs).map_err(|source| {
+            SimulatorError::Mesh {
+                course: course.name().to_owned(),
+                source,
+            }
         })?;
         let camera = DepthCamera::new(&settings.camera, &course)?;
-        settings.disturbances.check(&settings.vehicle, &settings.camera)?;
+        settings
+            .disturbances
+            .check(&settings.vehicle, &settings.camera)?;
         Ok(Self {
             camera: camera.with_noise(&settings.disturbances.depth),
             course,
@@ -105,12 +112,18 @@ impl Simulator {
         })
     }
 
-    /// Starts an episode: hovering at the start of `level` (1 = before the first wall), jittered by `start` as the course says. Everything that disturbs the episode
-    /// is drawn from `disturbances`; in calm settings it has no influence.
+    /// Starts an episode: hovering at the start of `level` (1 = before the first wall), jittered by
+    /// `start` as the course says. Everything that disturbs the episode is drawn from
+    /// `disturbances`; in calm settings it has no influence.
     ///
     /// # Errors
     /// [`NoSuchLevel`] if the course has fewer walls.
-    pub fn reset(&mut self, level: u8, start: &mut impl Rng, disturbances: &mut impl Rng) -> Result<(), NoSuchLevel> {
+    pub fn reset(
+        &mut self,
+        level: u8,
+        start: &mut impl Rng,
+        disturbances: &mut impl Rng,
+    ) -> Result<(), NoSuchLevel> {
         let position_m = self.course.start_position(level, start)?;
         let drawn = Drawn::draw(&self.disturbances, disturbances);
         self.vehicle = self.pristine_vehicle.clone();
@@ -140,13 +153,15 @@ impl Simulator {
         Ok(())
     }
 
-    /// Flies one control period with `action` = `[v_y, v_z]`, m/s in the heading frame, each clamped to [-1, 1]. With latency, `action` is what takes effect later.
+    /// Flies one control period with `action` = `[v_y, v_z]`, m/s in the heading frame, each
+    /// clamped to [-1, 1]. With latency, `action` is what takes effect later.
     ///
-    /// The episode ends within the step at the physics step that touches something; the state is then the one at that moment.
+    /// The episode ends within the step at the physics step that touches something; the state is
+    /// then the one at that moment.
     ///
     /// # Errors
-    /// [`SimulationError::NonFinite`] names what is NaN or infinite, be it the action or the physics, and ends the episode;
-    /// [`SimulationError::NotFlying`] after an episode's end.
+    /// [`SimulationError::NonFinite`] names what is NaN or infinite, be it the action or the
+    /// physics, and ends the episode; [`SimulationError::NotFlying`] after an episode's end.
     pub fn step(&mut self, action: [f32; 2]) -> Result<StepReport, SimulationError> {
         if self.episode.phase == Phase::Over {
             return Err(SimulationError::NotFlying);
@@ -173,7 +188,8 @@ impl Simulator {
         })
     }
 
-    /// Draws what the depth camera sees now into `image`, row by row from the top. Its errors belong to the step: looking twice shows the same ones.
+    /// Draws what the depth camera sees now into `image`, row by row from the top. Its errors
+    /// belong to the step: looking twice shows the same ones.
     pub fn render(&mut self, image: &mut [u8; IMAGE_PIXELS]) {
         let pose = self.world.state().pose();
         match self.episode.depth_seed {
@@ -203,7 +219,10 @@ impl Simulator {
             to_end_m: corridor.length_m - x_m,
             mass_factor: self.episode.mass_factor,
             latency_periods: self.commands.periods() as f32,
-            gust_n: self.gust.as_ref().map_or([0.0; 3], |gust| gust.force_n().into()),
+            gust_n: self
+                .gust
+                .as_ref()
+                .map_or([0.0; 3], |gust| gust.force_n().into()),
         }
     }
 
@@ -234,9 +253,14 @@ impl Simulator {
         Ok(Vector3::new(self.forward_speed_mps, left, up))
     }
 
-    fn fly_until_contact(&mut self, velocity_mps: &Vector3<f32>) -> Result<Contact, SimulationError> {
+    fn fly_until_contact(
+        &mut self,
+        velocity_mps: &Vector3<f32>,
+    ) -> Result<Contact, SimulationError> {
         for _ in 0..self.physics_steps {
-            let actuation = self.vehicle.actuate(&self.world.state(), velocity_mps, self.dt_secs);
+            let actuation = self
+                .vehicle
+                .actuate(&self.world.state(), velocity_mps, self.dt_secs);
             let gust_n = self.gust.as_mut().map(Gust::advance);
             self.world.advance(&actuation, gust_n);
 

@@ -10,7 +10,9 @@ pub enum Outcome {
     Collided,
     /// The body touched the corridor's end wall, the destination: a terminal state.
     ReachedEnd,
-    /// The episode was broken off after [`SimulatorSettings::max_steps`](super::SimulatorSettings::max_steps): not a terminal state, the drone still flies.
+    /// The episode was broken off after
+    /// [`SimulatorSettings::max_steps`](super::SimulatorSettings::max_steps): not a terminal state,
+    /// the drone still flies.
     TimedOut,
 }
 
@@ -26,7 +28,8 @@ pub enum LevelUp {
 /// What a body that collided has hit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Obstacle {
-    /// A wall or the edge of its opening, by its place in course order from 1. What touches a wall and the corridor has hit the wall.
+    /// A wall or the edge of its opening, by its place in course order from 1. What touches a wall
+    /// and the corridor has hit the wall.
     Wall(u8),
     /// A side of the corridor, its floor or its ceiling.
     Corridor,
@@ -45,7 +48,8 @@ pub struct StepReport {
     pub hit: Option<Obstacle>,
 }
 
-/// Why a step failed. The episode is over then; [`Simulator::reset`](super::Simulator::reset) starts another.
+/// Why a step failed. The episode is over then; [`Simulator::reset`](super::Simulator::reset)
+/// starts another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum SimulationError {
     /// A number became NaN or infinite.

@@ -17,14 +17,18 @@ pub struct SimulatorSettings {
     pub vehicle: VehicleSettings,
     /// Its depth camera.
     pub camera: CameraSettings,
-    /// Size of the reward terms. The simulator itself gives no reward: see [`crate::reward::RewardTerms`].
+    /// Size of the reward terms. The simulator itself gives no reward: see
+    /// [`crate::reward::RewardTerms`].
     pub reward: RewardSettings,
-    /// Ranges that random courses are drawn from, for whoever trains on them: see [`Course::generate`](crate::course::Course::generate).
+    /// Ranges that random courses are drawn from, for whoever trains on them: see
+    /// [`Course::generate`](crate::course::Course::generate).
     pub generator: GeneratorRanges,
-    /// What disturbs episodes: noise in the image, gusts, latency, another mass. All off by default.
+    /// What disturbs episodes: noise in the image, gusts, latency, another mass. All off by
+    /// default.
     pub disturbances: DisturbanceSettings,
-    /// Steps after which an episode is broken off as [`Outcome::TimedOut`](super::Outcome::TimedOut). Default 160: the corridor takes 120 steps of 0.5 s at
-    /// 1 m/s, and a third is added.
+    /// Steps after which an episode is broken off as
+    /// [`Outcome::TimedOut`](super::Outcome::TimedOut). Default 160: the corridor takes 120 steps
+    /// of 0.5 s at 1 m/s, and a third is added.
     pub max_steps: u32,
 }
 
@@ -57,7 +61,9 @@ pub enum SimulatorError {
     #[error(transparent)]
     Disturbances(#[from] DisturbanceFault),
     /// No episode could ever begin.
-    #[error("[simulator] max_steps = 0: every episode would be over before its first step; give it at least 1")]
+    #[error(
+        "[simulator] max_steps = 0: every episode would be over before its first step; give it at least 1"
+    )]
     NoSteps,
     /// The course's surfaces are not a mesh.
     #[error("course \"{course}\": its surfaces make no collision mesh")]

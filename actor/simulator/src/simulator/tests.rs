@@ -33,7 +33,9 @@ fn fly(
     seed: u64,
     policy: impl Fn(&Course, &VehicleState) -> [f32; 2],
 ) -> Vec<(VehicleState, StepReport)> {
-    simulator.reset(level, &mut rng(seed), &mut rng(!seed)).unwrap();
+    simulator
+        .reset(level, &mut rng(seed), &mut rng(!seed))
+        .unwrap();
     let mut steps = Vec::new();
     loop {
         let action = policy(simulator.course(), &simulator.state());
@@ -86,7 +88,10 @@ fn whole_course_passes_every_wall_once_and_reaches_the_end() {
             "{preset:?} at {}",
             state.position_m
         );
-        assert_eq!((last.walls_passed, simulator.level(), last.hit), (5, 6, None));
+        assert_eq!(
+            (last.walls_passed, simulator.level(), last.hit),
+            (5, 6, None)
+        );
         assert_eq!(
             steps
                 .iter()
@@ -126,7 +131,10 @@ fn straight_episode_ends_at_the_first_wall_with_the_nose_on_it() {
     // The test course's first opening is off the middle.
     let steps = fly(&mut simulator(Preset::Point), 1, 1, |_, _| [0.0, 0.0]);
     let (state, last) = steps.last().unwrap();
-    assert_eq!((last.outcome, last.walls_passed), (Some(Outcome::Collided), 0));
+    assert_eq!(
+        (last.outcome, last.walls_passed),
+        (Some(Outcome::Collided), 0)
+    );
     assert_eq!(last.hit, Some(Obstacle::Wall(1)));
     let nose_m = state.position_m.x + 0.49;
     assert!((10.0..10.01).contains(&nose_m), "{nose_m}");
@@ -158,7 +166,10 @@ fn step_limit_breaks_the_episode_off_as_timed_out() {
     let mut simulator = Simulator::new(Arc::new(test_course()), &settings).unwrap();
     let steps = fly(&mut simulator, 1, 1, |_, _| [0.0, 0.0]);
     assert_eq!(steps.len(), 3);
-    assert_eq!((steps[2].1.outcome, steps[2].1.hit), (Some(Outcome::TimedOut), None));
+    assert_eq!(
+        (steps[2].1.outcome, steps[2].1.hit),
+        (Some(Outcome::TimedOut), None)
+    );
     assert_eq!(simulator.step([0.0, 0.0]), Err(SimulationError::NotFlying));
 }
 
@@ -197,7 +208,11 @@ fn physics_that_is_not_a_number_ends_the_episode_with_an_error() {
         }
         let error = simulator.step([0.0, 0.0]);
         let what = "the body's pose or velocity";
-        assert_eq!(error, Err(SimulationError::NonFinite { what, step: 1 }), "{preset:?}");
+        assert_eq!(
+            error,
+            Err(SimulationError::NonFinite { what, step: 1 }),
+            "{preset:?}"
+        );
         // A new episode starts clean.
         assert!(!fly(&mut simulator, 1, 1, Oracle::act).is_empty());
     }
@@ -241,7 +256,9 @@ fn settings_out_of_bounds_are_refused_by_key() {
 
 #[test]
 fn level_beyond_the_course_is_refused() {
-    let error = simulator(Preset::Point).reset(6, &mut rng(1), &mut rng(2)).unwrap_err();
+    let error = simulator(Preset::Point)
+        .reset(6, &mut rng(1), &mut rng(2))
+        .unwrap_err();
     assert_eq!((error.level, error.levels), (6, 5));
 }
 
@@ -265,7 +282,11 @@ fn the_ground_truth_tells_what_disturbs_an_episode_and_nothing_of_the_kind_in_a_
     );
     assert_eq!(disturbed.latency_periods, 2.0);
     let deviation = (disturbed.mass_factor - 1.0).abs();
-    assert!(deviation > 0.001 && deviation <= 0.2, "{}", disturbed.mass_factor);
+    assert!(
+        deviation > 0.001 && deviation <= 0.2,
+        "{}",
+        disturbed.mass_factor
+    );
     assert!(
         disturbed.gust_n.iter().all(|force_n| *force_n != 0.0),
         "{:?}",

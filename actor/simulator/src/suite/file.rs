@@ -59,7 +59,9 @@ pub enum EntryFault {
     #[error("another entry has this name: reports could not tell them apart")]
     RepeatedName,
     /// No courses, or of several kinds.
-    #[error("names its courses by {0} of the keys course, orders_of and generated: give it exactly one")]
+    #[error(
+        "names its courses by {0} of the keys course, orders_of and generated: give it exactly one"
+    )]
     Courses(usize),
     /// A seed without anything to generate.
     #[error("has first_seed, but nothing generated: leave it out, or add generated")]
@@ -135,7 +137,8 @@ impl Suite {
         Self::parse(&text, path)
     }
 
-    /// Reads a suite from the text of a suite file. `path` is named in errors, and course files are looked for from its folder.
+    /// Reads a suite from the text of a suite file. `path` is named in errors, and course files are
+    /// looked for from its folder.
     ///
     /// # Errors
     /// As [`Suite::load`].
@@ -169,11 +172,19 @@ impl Suite {
     }
 
     /// The next entry, if it can be flown beside those already there.
-    fn entry(&self, written: EntryFile, episodes: Option<u64>, folder: &Path) -> Result<SuiteEntry, EntryFault> {
+    fn entry(
+        &self,
+        written: EntryFile,
+        episodes: Option<u64>,
+        folder: &Path,
+    ) -> Result<SuiteEntry, EntryFault> {
         if self.entries.iter().any(|entry| entry.name == written.name) {
             return Err(EntryFault::RepeatedName);
         }
-        let episodes = written.episodes.or(episodes).ok_or(EntryFault::NoEpisodes)?;
+        let episodes = written
+            .episodes
+            .or(episodes)
+            .ok_or(EntryFault::NoEpisodes)?;
         if !(1..=MOST_EPISODES).contains(&episodes) {
             return Err(EntryFault::Episodes(episodes));
         }
@@ -191,7 +202,9 @@ fn courses(written: &EntryFile, folder: &Path) -> Result<EntryCourses, EntryFaul
         return Err(EntryFault::SeedOfNothing);
     }
     match (&written.course, &written.orders_of, &written.generated) {
-        (Some(file), None, None) => Ok(EntryCourses::Listed(vec![Arc::new(Course::load(folder.join(file))?)])),
+        (Some(file), None, None) => Ok(EntryCourses::Listed(vec![Arc::new(Course::load(
+            folder.join(file),
+        )?)])),
         (None, Some(file), None) => all_orders(&folder.join(file)).map(EntryCourses::Listed),
         (None, None, Some(ranges)) => {
             let first_seed = written.first_seed.unwrap_or(0);
@@ -203,7 +216,9 @@ fn courses(written: &EntryFile, folder: &Path) -> Result<EntryCourses, EntryFaul
             })
         }
         (course, orders_of, generated) => Err(EntryFault::Courses(
-            usize::from(course.is_some()) + usize::from(orders_of.is_some()) + usize::from(generated.is_some()),
+            usize::from(course.is_some())
+                + usize::from(orders_of.is_some())
+                + usize::from(generated.is_some()),
         )),
     }
 }
@@ -233,7 +248,12 @@ fn all_orders(path: &Path) -> Result<Vec<Arc<Course>>, EntryFault> {
 
 /// The parser's refusal on one line; its own draws a picture over several.
 fn located(text: &str, error: &toml::de::Error) -> String {
-    let before = text.get(..error.span().unwrap_or_default().start).unwrap_or("");
+    let before = text
+        .get(..error.span().unwrap_or_default().start)
+        .unwrap_or("");
     let line = before.matches('\n').count() + 1;
-    format!("line {line}: {}", error.message().trim_end().replace('\n', " "))
+    format!(
+        "line {line}: {}",
+        error.message().trim_end().replace('\n', " ")
+    )
 }

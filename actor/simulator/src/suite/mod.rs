@@ -1,7 +1,9 @@
 //! Evaluation suites: what a policy is put to, entry by entry.
 //!
-//! An entry names courses (a file, all orders of a file's walls, or generated ones), how many episodes are spread over them, and what disturbs them. A suite says all of it
-//! by itself, so that two policies that were trained on different courses, and with different disturbances, are put to the same.
+//! An entry names courses (a file, all orders of a file's walls, or generated ones), how many
+//! episodes are spread over them, and what disturbs them. A suite says all of it by itself, so that
+//! two policies that were trained on different courses, and with different disturbances, are put to
+//! the same.
 
 mod file;
 #[cfg(test)]
@@ -56,7 +58,8 @@ pub enum EntryCourses {
 }
 
 impl EntryCourses {
-    /// Number of the course that episode `episode`, from 0, flies: two episodes with one number fly one course.
+    /// Number of the course that episode `episode`, from 0, flies: two episodes with one number fly
+    /// one course.
     #[must_use]
     pub fn number_of(&self, episode: u64) -> u64 {
         match self {
@@ -79,12 +82,14 @@ impl EntryCourses {
     }
 }
 
-/// All orders of `count` things, the first of which leaves everything where it is. However few are taken from the beginning, they are spread over all: in lexicographic
-/// order, the first 24 of 120 would all begin alike.
+/// All orders of `count` things, the first of which leaves everything where it is. However few are
+/// taken from the beginning, they are spread over all: in lexicographic order, the first 24 of 120
+/// would all begin alike.
 fn orders(count: usize) -> Vec<Vec<usize>> {
     let lexicographic = all_orders(count);
     let length = lexicographic.len();
-    // Steps of about the golden section of the way, which meet every order once when their length and the number of orders have no common factor.
+    // Steps of about the golden section of the way, which meet every order once when their length
+    // and the number of orders have no common factor.
     let step = (length * 618 / 1000..)
         .find(|&step| common_factor(step, length) == 1)
         .unwrap_or(1);
@@ -104,8 +109,11 @@ fn all_orders(count: usize) -> Vec<Vec<usize>> {
         all = all
             .into_iter()
             .flat_map(|begun: Vec<usize>| {
-                let free = (0..count).filter(|next| !begun.contains(next)).collect::<Vec<_>>();
-                free.into_iter().map(move |next| [begun.as_slice(), &[next]].concat())
+                let free = (0..count)
+                    .filter(|next| !begun.contains(next))
+                    .collect::<Vec<_>>();
+                free.into_iter()
+                    .map(move |next| [begun.as_slice(), &[next]].concat())
             })
             .collect();
     }

@@ -15,7 +15,11 @@ fn generalist() -> Suite {
 }
 
 fn entry<'a>(suite: &'a Suite, name: &str) -> &'a SuiteEntry {
-    suite.entries.iter().find(|entry| entry.name == name).unwrap()
+    suite
+        .entries
+        .iter()
+        .find(|entry| entry.name == name)
+        .unwrap()
 }
 
 fn labels(course: &Course) -> Vec<u32> {
@@ -41,7 +45,9 @@ fn generalist_suite_is_six_thousand_episodes() {
         ref depth,
     } = disturbed[0].disturbances;
     assert_eq!((share, mass_spread, latency_periods), (1.0, 0.2, 1));
-    assert!(gust.force_rms_n > 0.0 && depth.dropout_share > 0.0 && depth.sigma_quadratic_per_m > 0.0);
+    assert!(
+        gust.force_rms_n > 0.0 && depth.dropout_share > 0.0 && depth.sigma_quadratic_per_m > 0.0
+    );
 }
 
 #[test]
@@ -57,14 +63,20 @@ fn all_orders_are_flown_alike_often_and_the_first_is_the_files_own() {
     // Few episodes are spread over all orders, too.
     for first in 1..=5 {
         let begun = flown[..20].iter().filter(|order| order[0] == first).count();
-        assert!((3..=5).contains(&begun), "{begun} of 20 begin with wall {first}");
+        assert!(
+            (3..=5).contains(&begun),
+            "{begun} of 20 begin with wall {first}"
+        );
     }
     // A wall keeps its opening wherever it stands.
     let training = Course::load(configs().join("courses/training.toml")).unwrap();
     for episode in [1, 77, 119] {
         let course = orders.courses.of_episode(episode).unwrap();
         for (wall, place) in course.walls().iter().zip(training.walls()) {
-            let same = training.walls().iter().find(|other| other.label() == wall.label());
+            let same = training
+                .walls()
+                .iter()
+                .find(|other| other.label() == wall.label());
             assert_eq!(wall.opening(), same.unwrap().opening());
             assert_eq!(wall.x_m(), place.x_m());
         }
@@ -88,7 +100,11 @@ fn held_out_courses_hold_only_held_out_shapes_with_the_disc_they_name() {
         for episode in 0..100 {
             let course = held_out.courses.of_episode(episode).unwrap();
             for wall in course.walls() {
-                assert!((wall.clearance_m() - radius_m).abs() < 0.003, "{}", wall.clearance_m());
+                assert!(
+                    (wall.clearance_m() - radius_m).abs() < 0.003,
+                    "{}",
+                    wall.clearance_m()
+                );
                 assert!(!matches!(
                     wall.opening().shape,
                     Shape::Rectangle { .. } | Shape::Polygon { .. }
@@ -103,10 +119,17 @@ fn held_out_courses_hold_only_held_out_shapes_with_the_disc_they_name() {
 #[test]
 fn non_rectangular_gates_are_of_the_held_out_families() {
     let gates = Course::load(configs().join("courses/non_rectangular.toml")).unwrap();
-    let names: HashSet<_> = gates.walls().iter().map(|wall| wall.opening().shape.name()).collect();
+    let names: HashSet<_> = gates
+        .walls()
+        .iter()
+        .map(|wall| wall.opening().shape.name())
+        .collect();
     assert_eq!(
         names,
-        GeneratedShape::HELD_OUT.iter().map(|shape| shape.name()).collect()
+        GeneratedShape::HELD_OUT
+            .iter()
+            .map(|shape| shape.name())
+            .collect()
     );
 }
 
@@ -126,9 +149,14 @@ fn what_cannot_be_flown_is_refused_by_file_entry_and_key() {
             refusal("name = \"x\"\nflihgts = 2\n"),
             "line 2: unknown field `flihgts`",
         ),
-        (of_entry(""), "entry \"one\": names its courses by 0 of the keys"),
         (
-            of_entry("course = \"../courses/training.toml\"\norders_of = \"../courses/training.toml\""),
+            of_entry(""),
+            "entry \"one\": names its courses by 0 of the keys",
+        ),
+        (
+            of_entry(
+                "course = \"../courses/training.toml\"\norders_of = \"../courses/training.toml\"",
+            ),
             "names its courses by 2 of the keys",
         ),
         (of_entry("course = \"none.toml\""), "none.toml"),
@@ -144,7 +172,10 @@ fn what_cannot_be_flown_is_refused_by_file_entry_and_key() {
             of_entry("generated.clearance_m = [0.3, 0.3]"),
             "clearance_m = [0.3, 0.3]",
         ),
-        (of_entry("generated.shapes = [\"heart\"]"), "unknown variant `heart`"),
+        (
+            of_entry("generated.shapes = [\"heart\"]"),
+            "unknown variant `heart`",
+        ),
         (
             of_entry("course = \"../courses/training.toml\"\ndisturbances.mass = 1.0"),
             "unknown field `mass`",
@@ -156,7 +187,9 @@ fn what_cannot_be_flown_is_refused_by_file_entry_and_key() {
             "another entry has this name",
         ),
         (
-            refusal("name = \"x\"\n[[entry]]\nname = \"one\"\ncourse = \"../courses/training.toml\""),
+            refusal(
+                "name = \"x\"\n[[entry]]\nname = \"one\"\ncourse = \"../courses/training.toml\"",
+            ),
             "has no episodes",
         ),
     ] {

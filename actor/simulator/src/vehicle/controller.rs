@@ -1,7 +1,8 @@
-//! Cascade episode controller: velocity → tilt → body rates → rotor commands, and climb → throttle.
+//! Cascade flight controller: velocity → tilt → body rates → rotor commands, and climb → throttle.
 //!
-//! The structure is SimpleFlight's. One departure: velocity errors are taken in the heading frame (yawed, but level), where
-//! SimpleFlight takes them in the tilted body frame; at the few degrees flown here the two agree to second order.
+//! The structure is SimpleFlight's. One departure: velocity errors are taken in the heading frame
+//! (yawed, but level), where SimpleFlight takes them in the tilted body frame; at the few degrees
+//! flown here the two agree to second order.
 
 use nalgebra::Vector3;
 
@@ -42,23 +43,28 @@ impl Cascade {
 
     fn throttle(&mut self, gains: &Gains, climb_error_mps: f32, dt_secs: f32) -> f32 {
         // Clamped, so that a long saturation cannot wind it up.
-        self.throttle_integral =
-            (self.throttle_integral + gains.throttle_per_m * climb_error_mps * dt_secs).clamp(0.0, 1.0);
-        (self.throttle_integral + gains.throttle_per_mps * climb_error_mps).clamp(gains.throttle_min, 1.0)
+        self.throttle_integral = (self.throttle_integral
+            + gains.throttle_per_m * climb_error_mps * dt_secs)
+            .clamp(0.0, 1.0);
+        (self.throttle_integral + gains.throttle_per_mps * climb_error_mps)
+            .clamp(gains.throttle_min, 1.0)
     }
 }
 
-/// Roll, pitch and yaw asked for. Rolling left side up moves the drone to the right (−y), pitching nose down moves it forward.
+/// Roll, pitch and yaw asked for. Rolling left side up moves the drone to the right (−y), pitching
+/// nose down moves it forward.
 fn attitude_target_rad(gains: &Gains, error_mps: &Vector3<f32>) -> Vector3<f32> {
-    let tilt = |error_mps: f32| (gains.tilt_per_mps * error_mps).clamp(-gains.tilt_limit_rad, gains.tilt_limit_rad);
+    let tilt = |error_mps: f32| {
+        (gains.tilt_per_mps * error_mps).clamp(-gains.tilt_limit_rad, gains.tilt_limit_rad)
+    };
     Vector3::new(-tilt(error_mps.y), tilt(error_mps.x), 0.0)
 }
 
 fn turn_command(gains: &Gains, state: &VehicleState, target_rad: &Vector3<f32>) -> Vector3<f32> {
     let (roll, pitch, yaw) = state.world_from_body.euler_angles();
     let limit = gains.rate_limit_radps;
-    let rate_target =
-        (target_rad - Vector3::new(roll, pitch, yaw)).map(|e| (gains.rate_per_rad * e).clamp(-limit, limit));
+    let rate_target = (target_rad - Vector3::new(roll, pitch, yaw))
+        .map(|e| (gains.rate_per_rad * e).clamp(-limit, limit));
     (rate_target - state.body_rates_radps).map(|e| (gains.command_per_radps * e).clamp(-1.0, 1.0))
 }
 

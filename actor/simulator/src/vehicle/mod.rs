@@ -1,8 +1,10 @@
-//! The drone: what it is (presets), how it is commanded, and what it exerts on its body at each physics step.
+//! The drone: what it is (presets), how it is commanded, and what it exerts on its body at each
+//! physics step.
 //!
-//! Three presets share one interface. `airsim` and `hummingbird` are quadrotors whose controller turns a velocity command into
-//! tilt, tilt into torques and torques into rotor thrust; `point` follows the command with a plain first-order lag.
-//! Nothing here integrates motion: that is rapier's part, in `world.rs`.
+//! Three presets share one interface. `airsim` and `hummingbird` are quadrotors whose controller
+//! turns a velocity command into tilt, tilt into torques and torques into rotor thrust; `point`
+//! follows the command with a plain first-order lag. Nothing here integrates motion: that is
+//! rapier's part, in `world.rs`.
 
 mod airframe;
 mod controller;
@@ -20,7 +22,8 @@ pub(crate) use airframe::GRAVITY_MPS2;
 use controller::Cascade;
 use rotors::Rotors;
 
-/// Where the drone is and how it moves. World frame: x along the corridor, y left, z up. Body frame: x forward, y left, z up.
+/// Where the drone is and how it moves. World frame: x along the corridor, y left, z up. Body
+/// frame: x forward, y left, z up.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VehicleState {
     /// Centre of mass, world frame, m.
@@ -49,7 +52,8 @@ impl VehicleState {
         Isometry3::from_parts(Translation3::from(self.position_m), self.world_from_body)
     }
 
-    /// Velocity in the heading frame: x where the nose points, y left of it, z up, m/s. What a real drone knows of itself.
+    /// Velocity in the heading frame: x where the nose points, y left of it, z up, m/s. What a real
+    /// drone knows of itself.
     pub fn heading_velocity_mps(&self) -> Vector3<f32> {
         let (_, _, yaw) = self.world_from_body.euler_angles();
         UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -yaw) * self.velocity_mps
@@ -117,7 +121,8 @@ impl Vehicle {
         }
     }
 
-    /// Mass and size of its body. The point drone borrows AirSim's: its size decides what it touches, its mass decides nothing.
+    /// Mass and size of its body. The point drone borrows AirSim's: its size decides what it
+    /// touches, its mass decides nothing.
     pub(crate) fn body(&self) -> BodyProperties {
         let airframe = match self {
             Self::Quadrotor { airframe, .. } => airframe,
@@ -131,7 +136,12 @@ impl Vehicle {
     }
 
     /// Lets controller and rotors work for `dt_secs` towards `velocity_mps` (heading frame).
-    pub(crate) fn actuate(&mut self, state: &VehicleState, velocity_mps: &Vector3<f32>, dt_secs: f32) -> Actuation {
+    pub(crate) fn actuate(
+        &mut self,
+        state: &VehicleState,
+        velocity_mps: &Vector3<f32>,
+        dt_secs: f32,
+    ) -> Actuation {
         match self {
             Self::Quadrotor {
                 airframe,
@@ -149,7 +159,9 @@ impl Vehicle {
             Self::Point { time_constant_secs } => {
                 // The lag's exact answer over one step, so that the step's length does not show.
                 let reached = 1.0 - (-dt_secs / *time_constant_secs).exp();
-                Actuation::Velocity(state.velocity_mps + (velocity_mps - state.velocity_mps) * reached)
+                Actuation::Velocity(
+                    state.velocity_mps + (velocity_mps - state.velocity_mps) * reached,
+                )
             }
         }
     }
@@ -157,7 +169,9 @@ impl Vehicle {
 
 /// Quadratic drag, body frame, N.
 fn drag_n(airframe: &Airframe, state: &VehicleState) -> Vector3<f32> {
-    let velocity_mps = state.world_from_body.inverse_transform_vector(&state.velocity_mps);
+    let velocity_mps = state
+        .world_from_body
+        .inverse_transform_vector(&state.velocity_mps);
     -airframe
         .drag_n_per_mps2
         .component_mul(&velocity_mps.map(|v| v * v.abs()))
@@ -186,9 +200,14 @@ mod tests {
             velocity_mps: Vector3::new(2.0, 0.0, -1.0),
             ..VehicleState::at_rest(Point3::origin())
         };
-        assert!((drag_n(&Airframe::AIRSIM, &state) - Vector3::new(-0.0264, 0.0, 0.1347)).norm() < 1e-5);
+        assert!(
+            (drag_n(&Airframe::AIRSIM, &state) - Vector3::new(-0.0264, 0.0, 0.1347)).norm() < 1e-5
+        );
         // Nose straight down: what was forward is now up for the body.
         state.world_from_body = UnitQuaternion::from_euler_angles(0.0, FRAC_PI_2, 0.0);
-        assert!((drag_n(&Airframe::AIRSIM, &state) - Vector3::new(-0.0066, 0.0, -4.0 * 0.1347)).norm() < 1e-5);
+        assert!(
+            (drag_n(&Airframe::AIRSIM, &state) - Vector3::new(-0.0066, 0.0, -4.0 * 0.1347)).norm()
+                < 1e-5
+        );
     }
 }

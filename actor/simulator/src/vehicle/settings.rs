@@ -6,9 +6,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
-    /// AirSim's generic quadrotor with its SimpleFlight controller: 1 kg, 0.98 m across, sluggish (lateral time constant 0.9 s).
+    /// AirSim's generic quadrotor with its SimpleFlight controller: 1 kg, 0.98 m across, sluggish
+    /// (lateral time constant 0.9 s).
     Airsim,
-    /// AscTec Hummingbird with a quicker controller: 0.5 kg, 0.44 m across, lateral time constant 0.4 s.
+    /// AscTec Hummingbird with a quicker controller: 0.5 kg, 0.44 m across, lateral time constant
+    /// 0.4 s.
     Hummingbird,
     /// No attitude, only a first-order velocity lag, in AirSim's collision body.
     Point,
@@ -20,9 +22,11 @@ pub enum Preset {
 pub struct VehicleSettings {
     /// Which drone flies. Default `airsim`, the paper's.
     pub preset: Preset,
-    /// Time between two actions, s. Default 0.5: within the 0.5 to 1 s that the paper's step counts allow.
+    /// Time between two actions, s. Default 0.5: within the 0.5 to 1 s that the paper's step counts
+    /// allow.
     pub control_period_secs: f32,
-    /// Least rate of physics and episode controller, Hz, 200 to 10,000. Default 200. Rounded up to whole steps per control period.
+    /// Least rate of physics and flight controller, Hz, 200 to 10,000. Default 200. Rounded up to
+    /// whole steps per control period.
     pub physics_hz: f32,
     /// Forward velocity commanded throughout an episode, m/s. Default 1, as in the paper.
     pub forward_speed_mps: f32,
@@ -62,7 +66,7 @@ impl VehicleSettings {
                 self.physics_hz,
                 200.0,
                 10_000.0,
-                "the episode controller would be unstable, or a step take for ever",
+                "the flight controller would be unstable, or a step take for ever",
             ),
             (
                 "forward_speed_mps",
@@ -97,7 +101,9 @@ impl VehicleSettings {
     /// Physics steps in one control period, and the length of one, s.
     pub(crate) fn physics_steps(&self) -> (u32, f32) {
         // The small subtraction keeps 0.5 s · 200 Hz at 100 steps where the product rounds up.
-        let steps = (self.control_period_secs * self.physics_hz - 1e-3).ceil().max(1.0);
+        let steps = (self.control_period_secs * self.physics_hz - 1e-3)
+            .ceil()
+            .max(1.0);
         (steps as u32, self.control_period_secs / steps)
     }
 }

@@ -1,7 +1,8 @@
 //! The drones' answers to steps of the command, against values derived by hand.
 //!
-//! Lateral: velocity error e asks for tilt k·e, the tilt follows with rate a, and tilt θ accelerates by g·θ. So the closed loop is
-//! s² + a·s + a·g·k = 0; for its poles p < q the step response is 1 − (q·exp(−p·t) − p·exp(−q·t)) / (q − p).
+//! Lateral: velocity error e asks for tilt k·e, the tilt follows with rate a, and tilt θ
+//! accelerates by g·θ. So the closed loop is s² + a·s + a·g·k = 0; for its poles p < q the step
+//! response is 1 − (q·exp(−p·t) − p·exp(−q·t)) / (q − p).
 
 use nalgebra::{Point3, Vector3};
 
@@ -9,7 +10,8 @@ use super::{Preset, Vehicle, VehicleSettings, VehicleState};
 use crate::course::test_course;
 use crate::world::World;
 
-/// States after every physics step of an episode under constant `velocity_mps` from hover at mid-height. Walls do not act.
+/// States after every physics step of an episode under constant `velocity_mps` from hover at
+/// mid-height. Walls do not act.
 fn fly(preset: Preset, velocity_mps: Vector3<f32>, secs: f32) -> (f32, Vec<VehicleState>) {
     let settings = VehicleSettings {
         preset,
@@ -32,13 +34,17 @@ fn fly(preset: Preset, velocity_mps: Vector3<f32>, secs: f32) -> (f32, Vec<Vehic
 /// Time at which the lateral velocity first passes 63.2 % of a step to 1 m/s, s.
 fn lateral_rise_secs(preset: Preset) -> f32 {
     let (dt_secs, states) = fly(preset, Vector3::new(1.0, 1.0, 0.0), 4.0);
-    let risen = states.iter().position(|s| s.velocity_mps.y >= 0.632).unwrap();
+    let risen = states
+        .iter()
+        .position(|s| s.velocity_mps.y >= 0.632)
+        .unwrap();
     (risen + 1) as f32 * dt_secs
 }
 
 #[test]
 fn airsim_answers_sideways_in_0_92_s() {
-    // k = 0.2 · π/5.5, a = 6.25: poles 1.46 and 4.79 per s, mean lag 1/(g·k) = 0.89 s, 63.2 % after 0.92 s.
+    // k = 0.2 · π/5.5, a = 6.25: poles 1.46 and 4.79 per s, mean lag 1/(g·k) = 0.89 s, 63.2 % after
+    // 0.92 s.
     let rise_secs = lateral_rise_secs(Preset::Airsim);
     assert!((rise_secs - 0.924).abs() < 0.03, "{rise_secs}");
 }
@@ -96,15 +102,19 @@ fn airsim_falls_short_of_its_forward_command_by_what_drag_takes() {
 fn hovering_forward_holds_altitude() {
     for preset in [Preset::Airsim, Preset::Hummingbird, Preset::Point] {
         let (_, states) = fly(preset, Vector3::new(1.0, 0.0, 0.0), 50.0);
-        let worst = states.iter().map(|s| (s.position_m.z - 3.5).abs()).fold(0.0, f32::max);
+        let worst = states
+            .iter()
+            .map(|s| (s.position_m.z - 3.5).abs())
+            .fold(0.0, f32::max);
         assert!(worst < 0.03, "{preset:?} left its altitude by {worst} m");
     }
 }
 
 #[test]
 fn airsim_climb_is_limited_by_its_rotors_then_overshoots_by_its_integral() {
-    // Full thrust lifts 16.72 N − 9.81 N on 1 kg: 6.9 m/s². The error of some 0.09 m accumulated while rising is worth 9 % of
-    // throttle, which at P = 1 per m/s is as many per cent of overshoot, decaying with P / I = 1 s.
+    // Full thrust lifts 16.72 N − 9.81 N on 1 kg: 6.9 m/s². The error of some 0.09 m accumulated
+    // while rising is worth 9 % of throttle, which at P = 1 per m/s is as many per cent of
+    // overshoot, decaying with P / I = 1 s.
     let (dt_secs, states) = fly(Preset::Airsim, Vector3::new(0.0, 0.0, 1.0), 4.0);
     let climb = |secs: f32| states[(secs / dt_secs) as usize].velocity_mps.z;
     assert!((climb(0.08) - 6.9 * 0.08).abs() < 0.06, "{}", climb(0.08));
@@ -126,7 +136,8 @@ fn tilt_limit_is_respected_and_used() {
 
 #[test]
 fn yaw_stays_zero_whatever_the_policy_does() {
-    // Rolling and pitching at once turns the nose by at most half the product of the two tilts; the controller takes it back.
+    // Rolling and pitching at once turns the nose by at most half the product of the two tilts; the
+    // controller takes it back.
     for (preset, tilt_rad) in [(Preset::Airsim, 0.114_f32), (Preset::Hummingbird, 0.255)] {
         for command in [
             Vector3::new(1.0, 1.0, 1.0),
@@ -148,7 +159,13 @@ fn yaw_stays_zero_whatever_the_policy_does() {
 #[test]
 fn yaw_knocked_off_by_tilting_both_ways_to_the_limit_comes_back() {
     let (_, states) = fly(Preset::Airsim, Vector3::new(8.0, 8.0, 1.0), 20.0);
-    let yaw_deg = states.last().unwrap().world_from_body.euler_angles().2.to_degrees();
+    let yaw_deg = states
+        .last()
+        .unwrap()
+        .world_from_body
+        .euler_angles()
+        .2
+        .to_degrees();
     assert!(yaw_deg.abs() < 0.1, "{yaw_deg}");
 }
 
@@ -157,5 +174,7 @@ fn tilting_left_moves_left() {
     let (_, states) = fly(Preset::Airsim, Vector3::new(0.0, 1.0, 0.0), 0.4);
     let state = states.last().unwrap();
     let up_in_world = state.world_from_body * Vector3::z();
-    assert!(up_in_world.y > 0.05 && state.velocity_mps.y > 0.05 && state.velocity_mps.x.abs() < 0.01);
+    assert!(
+        up_in_world.y > 0.05 && state.velocity_mps.y > 0.05 && state.velocity_mps.x.abs() < 0.01
+    );
 }

@@ -1,4 +1,5 @@
-//! `skein-bench`: tells which benchmarks there are, and sets what they measured in a table. `launch/bench.sh` runs them in between.
+//! `skein-bench`: tells which benchmarks there are, and sets what they measured in a table.
+//! `launch/bench.sh` runs them in between.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -62,7 +63,9 @@ struct Results<'a> {
 
 fn main() -> ExitCode {
     let done = match Cli::parse().command {
-        Command::List { only, growth } => list(&only, if growth { When::Growth } else { When::Always }),
+        Command::List { only, growth } => {
+            list(&only, if growth { When::Growth } else { When::Always })
+        }
         Command::Core => core(),
         Command::Table {
             directory,
@@ -70,7 +73,11 @@ fn main() -> ExitCode {
             quick,
             pictures,
         } => {
-            let judging = if quick { Judging::Nothing } else { Judging::Times };
+            let judging = if quick {
+                Judging::Nothing
+            } else {
+                Judging::Times
+            };
             tell(&directory, &only, judging, pictures.as_deref())
         }
     };
@@ -90,7 +97,10 @@ fn list(only: &[String], when: When) -> Result<()> {
         .find(|name| benches.iter().all(|bench| bench.name != **name))
     {
         let names: Vec<_> = benches.into_iter().map(|bench| bench.name).collect();
-        bail!("no benchmark is called {unknown}; there are {}", names.join(", "));
+        bail!(
+            "no benchmark is called {unknown}; there are {}",
+            names.join(", ")
+        );
     }
     for bench in benches {
         let wanted = match only {
@@ -113,12 +123,20 @@ fn core() -> Result<()> {
     Ok(())
 }
 
-fn tell(directory: &Path, only: &[String], judging: Judging, pictures: Option<&Path>) -> Result<()> {
+fn tell(
+    directory: &Path,
+    only: &[String],
+    judging: Judging,
+    pictures: Option<&Path>,
+) -> Result<()> {
     let wanted = |figure: &str| only.is_empty() || only.iter().any(|name| name == bench_of(figure));
     let Catalogue { rows, growths, .. } = Catalogue::load();
     let figures = Figures::read(directory)?;
     if figures.is_empty() {
-        bail!("{} holds no figures: run launch/bench.sh", directory.display());
+        bail!(
+            "{} holds no figures: run launch/bench.sh",
+            directory.display()
+        );
     }
     let machine = Machine::with(Core::best_of(&directory.join("machine.jsonl")));
     let rows: Vec<Row> = rows
@@ -145,7 +163,9 @@ fn tell(directory: &Path, only: &[String], judging: Judging, pictures: Option<&P
     write("table.json", serde_json::to_string_pretty(&results)?)?;
     let growths: Vec<Growth> = growths
         .into_iter()
-        .filter(|growth| pictures.is_some() && growth.series.iter().all(|series| wanted(&series.of)))
+        .filter(|growth| {
+            pictures.is_some() && growth.series.iter().all(|series| wanted(&series.of))
+        })
         .collect();
     if let Some(folder) = pictures {
         draw(&growths, &figures, folder)?;
@@ -162,7 +182,9 @@ fn tell(directory: &Path, only: &[String], judging: Judging, pictures: Option<&P
 /// What is to be known of the table's times.
 fn note(judging: Judging, figures: &Figures) -> String {
     match (judging, figures.most_disturbed()) {
-        (Judging::Nothing, _) => "Run to see that the benchmarks work: these times mean nothing.".to_owned(),
+        (Judging::Nothing, _) => {
+            "Run to see that the benchmarks work: these times mean nothing.".to_owned()
+        }
         (Judging::Times, None) => {
             "What needs processes is a median of 15 starts, or a mean over two seconds.".to_owned()
         }

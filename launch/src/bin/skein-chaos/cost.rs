@@ -1,4 +1,5 @@
-//! What it costs to survive: the same training with checkpoints and without, in turn, and what the receiving thread takes.
+//! What it costs to survive: the same training with checkpoints and without, in turn, and what the
+//! receiving thread takes.
 
 use anyhow::{Context, Result};
 use skein_protocol::config::Config;
@@ -20,7 +21,8 @@ pub(crate) struct Cost {
 }
 
 impl Cost {
-    /// Trains by `recipe` so many times with checkpoints and so many times without, in turn. `train` trains in the folder it is given the name of.
+    /// Trains by `recipe` so many times with checkpoints and so many times without, in turn.
+    /// `train` trains in the folder it is given the name of.
     ///
     /// # Errors
     /// When a training fails, or the configuration cannot be read.
@@ -32,8 +34,10 @@ impl Cost {
         let config = Config::load(&recipe.config, &recipe.overrides)?;
         let mut bare = recipe.clone();
         // Beyond the last episode: one is written at the end all the same, as in the others.
-        bare.overrides
-            .push(format!("checkpoints.every_episodes={}", config.run.episodes + 1));
+        bare.overrides.push(format!(
+            "checkpoints.every_episodes={}",
+            config.run.episodes + 1
+        ));
         let mut cost = Self {
             every_episodes: config.checkpoints.every_episodes,
             with: Vec::new(),
@@ -56,13 +60,22 @@ impl Cost {
         let slower = with / without - 1.0;
         let cpu = |name: &'static str| {
             median_of(&self.with, move |summary| {
-                summary.thread_cpu_secs.get(name).copied().unwrap_or_default()
+                summary
+                    .thread_cpu_secs
+                    .get(name)
+                    .copied()
+                    .unwrap_or_default()
             })
         };
         let all: f64 = median_of(&self.with, |summary| summary.thread_cpu_secs.values().sum());
-        let waits = median_of(&self.with, |summary| summary.stages.of(Stage::Checkpoint).secs());
+        let waits = median_of(&self.with, |summary| {
+            summary.stages.of(Stage::Checkpoint).secs()
+        });
         let receives = cpu("receiver") / all;
-        println!("Cost, medians of {} trainings each, seconds:", self.with.len());
+        println!(
+            "Cost, medians of {} trainings each, seconds:",
+            self.with.len()
+        );
         println!(
             "  {:<44} {with:8.2}",
             format!("with a checkpoint each {} episodes", self.every_episodes)
@@ -70,14 +83,22 @@ impl Cost {
         println!("  {:<44} {without:8.2}", "without");
         println!("  {:<44} {:7.2} %", "slower by", slower * 100.0);
         println!("  {:<44} {waits:8.2}", "training waited for checkpoints");
-        println!("  {:<44} {:8.2}", "processor time of writing them", cpu("checkpoints"));
+        println!(
+            "  {:<44} {:8.2}",
+            "processor time of writing them",
+            cpu("checkpoints")
+        );
         println!(
             "  {:<44} {:8.2}",
             "processor time of assembling episodes",
             cpu("receiver")
         );
         println!("  {:<44} {all:8.2}", "processor time of the learner");
-        println!("  {:<44} {:7.2} %", "assembling, of the learner's", receives * 100.0);
+        println!(
+            "  {:<44} {:7.2} %",
+            "assembling, of the learner's",
+            receives * 100.0
+        );
         slower.max(0.0) + receives < TOLERANCE
     }
 }

@@ -1,4 +1,5 @@
-//! `skein-chaos`: trains a run in peace and once more under fire, and tells whether it made a difference.
+//! `skein-chaos`: trains a run in peace and once more under fire, and tells whether it made a
+//! difference.
 
 mod cost;
 mod plan;
@@ -33,7 +34,8 @@ use soak::Soak;
 use stage::{Recipe, Stage};
 use storm::{Calm, Spared, Storm};
 
-/// Kills, freezes, attaches and detaches the processes of a training at random, and compares what it learned with an undisturbed one.
+/// Kills, freezes, attaches and detaches the processes of a training at random, and compares what
+/// it learned with an undisturbed one.
 #[derive(Debug, Parser)]
 #[command(version)]
 struct Arguments {
@@ -48,7 +50,8 @@ struct Arguments {
     /// Change one setting of the config; may be repeated.
     #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
     overrides: Vec<String>,
-    /// Compare with this finished run and train by its configuration, instead of training in peace first.
+    /// Compare with this finished run and train by its configuration, instead of training in peace
+    /// first.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["config", "overrides"])]
     calm: Option<PathBuf>,
     /// Where everything goes; must be new or empty.
@@ -66,7 +69,8 @@ struct Arguments {
     /// Learners to kill.
     #[arg(long, value_name = "N", default_value_t = 5)]
     learner_kills: u32,
-    /// Supervisors to kill, every other one together with all other processes; the run is resumed each time.
+    /// Supervisors to kill, every other one together with all other processes; the run is resumed
+    /// each time.
     #[arg(long, value_name = "N", default_value_t = 2)]
     supervisor_kills: u32,
     /// Processes to stop with SIGSTOP and to continue later, half of them too late.
@@ -75,10 +79,12 @@ struct Arguments {
     /// Times to attach one or two actors, and to take them away.
     #[arg(long, value_name = "N", default_value_t = 3)]
     attachments: u32,
-    /// Instead of all that, train for so long with actors coming and going, and look for anything that grows.
+    /// Instead of all that, train for so long with actors coming and going, and look for anything
+    /// that grows.
     #[arg(long, value_name = "MINUTES", conflicts_with_all = ["calm", "points"])]
     soak: Option<f64>,
-    /// Instead of all that, train so many times with checkpoints and so many times without, and tell what they cost.
+    /// Instead of all that, train so many times with checkpoints and so many times without, and
+    /// tell what they cost.
     #[arg(long, value_name = "TIMES", conflicts_with_all = ["calm", "points", "soak"], value_parser = clap::value_parser!(u32).range(1..))]
     cost: Option<u32>,
     /// Instead of all that, let a process die at each of the named points of the programs.
@@ -86,12 +92,12 @@ struct Arguments {
     points: bool,
 }
 
-/// What a soak sets, unless it is set otherwise: a run that outlasts it, and a replay buffer that is full, both parts of it, while it is still warming
-/// up.
+/// What a soak sets, unless it is set otherwise: a run that outlasts it, and a replay buffer that
+/// is full, both parts of it, while it is still warming up.
 const SOAK_SETTINGS: [&str; 2] = ["run.episodes=100000000", "replay.capacity=8192"];
 
-/// What a death at each point sets, unless it is set otherwise: a checkpoint after each epoch, so that the points of writing one are passed soon after
-/// each death.
+/// What a death at each point sets, unless it is set otherwise: a checkpoint after each epoch, so
+/// that the points of writing one are passed soon after each death.
 const POINTS_SETTINGS: [&str; 1] = ["checkpoints.every_episodes=1"];
 
 /// How it went.
@@ -106,7 +112,11 @@ enum Verdict {
 impl Verdict {
     #[allow(clippy::fn_params_excessive_bools)] // the condition is the point
     fn of(all_is_well: bool) -> Self {
-        if all_is_well { Self::Passed } else { Self::Failed }
+        if all_is_well {
+            Self::Passed
+        } else {
+            Self::Failed
+        }
     }
 }
 
@@ -159,7 +169,10 @@ fn disturb(arguments: &Arguments, folder: &Path) -> Result<Verdict> {
 
     let faults = arguments.points.then(|| folder.join("faults"));
     let stage = Stage::new(folder, "disturbed", faults.clone())?;
-    eprintln!("skein-chaos: the same under fire, in {}", stage.run.root().display());
+    eprintln!(
+        "skein-chaos: the same under fire, in {}",
+        stage.run.root().display()
+    );
     let started = Instant::now();
     let mut storm = start(&stage, &recipe, arguments.actors, Spared::Nobody)?;
     let all_done = match faults {
@@ -177,7 +190,10 @@ fn disturb(arguments: &Arguments, folder: &Path) -> Result<Verdict> {
     report::durations(started.elapsed().as_secs_f64(), summary.wall_secs);
 
     if stage.run.open()?.0.config_digest != identity.config_digest {
-        bail!("{} was trained by another configuration", calm.root().display());
+        bail!(
+            "{} was trained by another configuration",
+            calm.root().display()
+        );
     }
     let same = report::comparison(&compare(&calm, &stage.run));
     let clean = report::leftovers(&leftovers(&stage.run));
@@ -203,16 +219,28 @@ fn soak(arguments: &Arguments, folder: &Path, length: Duration) -> Result<Verdic
 }
 
 fn start<'a>(stage: &'a Stage, recipe: &Recipe, actors: u32, spared: Spared) -> Result<Storm<'a>> {
-    let recorder =
-        Recorder::create(&stage.folder().join("disturbances.jsonl")).context("cannot write the recording")?;
-    Ok(Storm::new(stage, stage.start(recipe, actors)?, recorder, spared))
+    let recorder = Recorder::create(&stage.folder().join("disturbances.jsonl"))
+        .context("cannot write the recording")?;
+    Ok(Storm::new(
+        stage,
+        stage.start(recipe, actors)?,
+        recorder,
+        spared,
+    ))
 }
 
 /// The undisturbed run, and how to train the same.
 fn calm_run(arguments: &Arguments, folder: &Path) -> Result<(RunDirectory, Recipe)> {
     let Some(calm) = &arguments.calm else {
-        let recipe = arguments.recipe(if arguments.points { &POINTS_SETTINGS } else { &[] })?;
-        return Ok((train_in_peace(folder, "calm", &recipe, arguments.actors)?, recipe));
+        let recipe = arguments.recipe(if arguments.points {
+            &POINTS_SETTINGS
+        } else {
+            &[]
+        })?;
+        return Ok((
+            train_in_peace(folder, "calm", &recipe, arguments.actors)?,
+            recipe,
+        ));
     };
     let calm = calm
         .canonicalize()
@@ -237,7 +265,10 @@ fn new_folder(path: &Path) -> Result<PathBuf> {
 
 fn train_in_peace(folder: &Path, name: &str, recipe: &Recipe, actors: u32) -> Result<RunDirectory> {
     let stage = Stage::new(folder, name, None)?;
-    eprintln!("skein-chaos: trains in peace, in {}", stage.run.root().display());
+    eprintln!(
+        "skein-chaos: trains in peace, in {}",
+        stage.run.root().display()
+    );
     let supervisor = stage.start(recipe, actors)?;
     Storm::new(&stage, supervisor, Recorder::silent(), Spared::Nobody)
         .rage(&mut Calm)
@@ -272,5 +303,9 @@ fn planning(arguments: &Arguments, config: &Config, calm: &Summary) -> Planning 
     };
     let epochs = config.run.episodes as f64 / config.learning.episodes_per_epoch as f64;
     let epoch = Duration::from_secs_f64(calm.wall_secs / epochs.max(1.0));
-    Planning::new(wanted.plan(&subject, arguments.seed), subject.episodes_per_epoch, epoch)
+    Planning::new(
+        wanted.plan(&subject, arguments.seed),
+        subject.episodes_per_epoch,
+        epoch,
+    )
 }

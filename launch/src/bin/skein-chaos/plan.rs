@@ -1,7 +1,9 @@
-//! What is done to a run, and when: drawn from a seed before the run starts, so that the same seed disturbs in the same way.
+//! What is done to a run, and when: drawn from a seed before the run starts, so that the same seed
+//! disturbs in the same way.
 //!
-//! Moments are given in training episodes, not in seconds, so that a plan fits a run whatever machine it is on. Some disturbances follow another
-//! within moments, to meet a run that is just getting up again.
+//! Moments are given in training episodes, not in seconds, so that a plan fits a run whatever
+//! machine it is on. Some disturbances follow another within moments, to meet a run that is just
+//! getting up again.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -19,8 +21,13 @@ pub(crate) enum Disturbance {
     KillLearner,
     /// SIGSTOP to the learner, and SIGCONT after `secs`.
     FreezeLearner { secs: f64 },
-    /// SIGKILL to the supervisor, and to whatever `reach` says; the run is resumed after `pause_secs` with so many actors.
-    KillSupervisor { reach: Reach, pause_secs: f64, actors: u32 },
+    /// SIGKILL to the supervisor, and to whatever `reach` says; the run is resumed after
+    /// `pause_secs` with so many actors.
+    KillSupervisor {
+        reach: Reach,
+        pause_secs: f64,
+        actors: u32,
+    },
     /// `skein attach` with so many actors.
     Attach { count: u32 },
     /// Ends one of those that attached actors, with all it attached.
@@ -51,7 +58,8 @@ pub(crate) enum Manner {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum When {
-    /// Once so many training episodes were learned from for the first time, and then this share of the time an epoch takes.
+    /// Once so many training episodes were learned from for the first time, and then this share of
+    /// the time an epoch takes.
     Episode { episode: u64, share: f64 },
     /// So long after the disturbance before it.
     After { secs: f64 },
@@ -85,7 +93,8 @@ pub(crate) struct Subject {
     pub(crate) learner_silence_secs: f64,
 }
 
-/// Nothing is planned for later than this share of the run: what is late must still find it running.
+/// Nothing is planned for later than this share of the run: what is late must still find it
+/// running.
 const LAST: f64 = 0.9;
 /// Share of the kills that follow the kill of a learner or supervisor within moments.
 const AFTERSHOCKS: f64 = 0.3;
@@ -110,7 +119,10 @@ impl Wanted {
         let mut moments: Vec<(u64, f64, Disturbance, Vec<Planned>)> = Vec::new();
         for what in shocks {
             let mut after = Vec::new();
-            let gets_up_again = matches!(what, Disturbance::KillLearner | Disturbance::KillSupervisor { .. });
+            let gets_up_again = matches!(
+                what,
+                Disturbance::KillLearner | Disturbance::KillSupervisor { .. }
+            );
             if gets_up_again
                 && draw.generator.random_bool(AFTERSHOCKS)
                 && let Some(what) = kills.pop()
@@ -144,10 +156,12 @@ impl Wanted {
                 .partial_cmp(&(other.0, other.1))
                 .expect("shares are numbers")
         });
-        let in_order = moments.into_iter().flat_map(|(episode, share, what, after)| {
-            let when = When::Episode { episode, share };
-            std::iter::once(Planned { when, what }).chain(after)
-        });
+        let in_order = moments
+            .into_iter()
+            .flat_map(|(episode, share, what, after)| {
+                let when = When::Episode { episode, share };
+                std::iter::once(Planned { when, what }).chain(after)
+            });
         in_order.collect()
     }
 }
@@ -167,7 +181,10 @@ impl Draw {
         } = self.subject;
         let last = (episodes as f64 * LAST) as u64 / episodes_per_epoch;
         let epoch = self.generator.random_range(0..=last);
-        (epoch * episodes_per_epoch, self.generator.random_range(0.0..1.0))
+        (
+            epoch * episodes_per_epoch,
+            self.generator.random_range(0.0..1.0),
+        )
     }
 
     fn actor_kill(&mut self) -> Disturbance {
@@ -244,12 +261,25 @@ mod tests {
     #[test]
     fn a_plan_holds_all_that_is_wanted_and_depends_on_the_seed_alone() {
         let plan = WANTED.plan(&SUBJECT, 7);
-        let count = |is: fn(&Disturbance) -> bool| plan.iter().filter(|planned| is(&planned.what)).count();
-        assert_eq!(count(|what| matches!(what, Disturbance::KillActor { .. })), 50);
+        let count =
+            |is: fn(&Disturbance) -> bool| plan.iter().filter(|planned| is(&planned.what)).count();
+        assert_eq!(
+            count(|what| matches!(what, Disturbance::KillActor { .. })),
+            50
+        );
         assert_eq!(count(|what| matches!(what, Disturbance::KillLearner)), 5);
-        assert_eq!(count(|what| matches!(what, Disturbance::KillSupervisor { .. })), 2);
-        assert_eq!(count(|what| matches!(what, Disturbance::FreezeActor { .. })), 5);
-        assert_eq!(count(|what| matches!(what, Disturbance::FreezeLearner { .. })), 1);
+        assert_eq!(
+            count(|what| matches!(what, Disturbance::KillSupervisor { .. })),
+            2
+        );
+        assert_eq!(
+            count(|what| matches!(what, Disturbance::FreezeActor { .. })),
+            5
+        );
+        assert_eq!(
+            count(|what| matches!(what, Disturbance::FreezeLearner { .. })),
+            1
+        );
         assert_eq!(count(|what| matches!(what, Disturbance::Attach { .. })), 3);
         assert_eq!(plan, WANTED.plan(&SUBJECT, 7));
         assert_ne!(plan, WANTED.plan(&SUBJECT, 8));
@@ -264,9 +294,16 @@ mod tests {
                 When::After { .. } => None,
             })
             .collect();
-        assert!(episodes.iter().all(|&episode| episode <= 270 && episode % 10 == 0));
+        assert!(
+            episodes
+                .iter()
+                .all(|&episode| episode <= 270 && episode % 10 == 0)
+        );
         let one = WANTED.plan(&SUBJECT, 1);
-        assert!(matches!(one[0].when, When::Episode { .. }), "an aftershock of nothing");
+        assert!(
+            matches!(one[0].when, When::Episode { .. }),
+            "an aftershock of nothing"
+        );
         let mut last = (0, 0.0);
         for planned in &one {
             if let When::Episode { episode, share } = planned.when {

@@ -37,7 +37,9 @@ impl Planning {
         match when {
             When::Episode { episode, share } => {
                 let long_past = storm.highest() >= episode + self.episodes_per_epoch;
-                long_past || storm.highest() >= episode && storm.since_moved() >= self.epoch.mul_f64(share)
+                long_past
+                    || storm.highest() >= episode
+                        && storm.since_moved() >= self.epoch.mul_f64(share)
             }
             When::After { secs } => self.last_done.elapsed().as_secs_f64() >= secs,
         }
@@ -49,7 +51,8 @@ impl Script for Planning {
         while let Some(&next) = self.left.front()
             && self.is_due(next.when, storm)
         {
-            // Processes that are missing will be back; a crew that is gone, with all others by a power cut perhaps, will not.
+            // Processes that are missing will be back; a crew that is gone, with all others by a
+            // power cut perhaps, will not.
             let gone_for_good = matches!(next.what, Disturbance::Detach { .. });
             if storm.disturb(next.what)? == Attempt::NobodyThere && !gone_for_good {
                 break;

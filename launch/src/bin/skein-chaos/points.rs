@@ -10,7 +10,8 @@ use skein_protocol::fault::FaultPoint;
 use crate::plan::Disturbance;
 use crate::storm::{Script, Storm};
 
-/// After this share of the run's episodes the next point is armed as well: some are passed seldom, and the last ones only at the end.
+/// After this share of the run's episodes the next point is armed as well: some are passed seldom,
+/// and the last ones only at the end.
 const PATIENCE: f64 = 1.0 / 6.0;
 
 /// The fault points, in the order in which they are armed.
@@ -33,7 +34,8 @@ impl Points {
     /// # Errors
     /// When the folder cannot be made.
     pub(crate) fn new(folder: PathBuf, total_episodes: u64) -> Result<Self> {
-        fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+        fs::create_dir_all(&folder)
+            .with_context(|| format!("cannot create {}", folder.display()))?;
         Ok(Self {
             folder,
             total_episodes,
@@ -69,8 +71,9 @@ impl Points {
         Ok(())
     }
 
-    /// Whether the run has come farther since the last point fired: deaths without that are answered with longer and longer pauses. What comes
-    /// after the last episode, nobody can wait for.
+    /// Whether the run has come farther since the last point fired: deaths without that are
+    /// answered with longer and longer pauses. What comes after the last episode, nobody can wait
+    /// for.
     fn has_recovered(&mut self, storm: &Storm<'_>) -> bool {
         let total = self.total_episodes;
         let recovering = |&from: &u64| storm.highest() <= from && from < total;
@@ -79,8 +82,8 @@ impl Points {
     }
 }
 
-/// All points, those first that may be passed only early in a run: the first candidate for the best snapshot is always better than none, the later ones
-/// may all be worse.
+/// All points, those first that may be passed only early in a run: the first candidate for the best
+/// snapshot is always better than none, the later ones may all be worse.
 fn order_of_arming() -> Vec<FaultPoint> {
     let mut points = FaultPoint::ALL.to_vec();
     points.sort_by_key(|&point| point != FaultPoint::LearnerBestSaved);

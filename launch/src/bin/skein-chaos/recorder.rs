@@ -1,4 +1,5 @@
-//! The episode recorder: everything that was done to a run, as one JSON object a line, so that a failure can be studied.
+//! The episode recorder: everything that was done to a run, as one JSON object a line, so that a
+//! failure can be studied.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -36,11 +37,17 @@ impl Recorder {
         }
     }
 
-    /// Notes what happened: seconds since the start, episodes learned from by then, `event`, and the fields of `details`.
+    /// Notes what happened: seconds since the start, episodes learned from by then, `event`, and
+    /// the fields of `details`.
     ///
     /// # Errors
     /// When it cannot be written.
-    pub(crate) fn note(&mut self, episodes: u64, event: &str, details: &impl Serialize) -> io::Result<()> {
+    pub(crate) fn note(
+        &mut self,
+        episodes: u64,
+        event: &str,
+        details: &impl Serialize,
+    ) -> io::Result<()> {
         let Some(file) = &mut self.file else {
             return Ok(());
         };
@@ -56,7 +63,8 @@ impl Recorder {
                 line.insert("details".to_owned(), other);
             }
         }
-        // One write a line, and nothing kept back: the recording is whole when this program is killed as well.
+        // One write a line, and nothing kept back: the recording is whole when this program is
+        // killed as well.
         file.write_all(format!("{}\n", Value::Object(line)).as_bytes())
     }
 }

@@ -1,4 +1,5 @@
-//! What is told at the end, on standard output: what was done, what came of it, and the verdict on each.
+//! What is told at the end, on standard output: what was done, what came of it, and the verdict on
+//! each.
 
 use skein_launch::inspection::Check;
 

@@ -1,8 +1,9 @@
 //! A long run with actors coming and going, watched for anything that grows.
 //!
-//! Learner, supervisor and one actor, the elder, are left alone, so that they grow old. The other actors are killed, frozen, attached and taken away all
-//! the time. What a run may well hold more of at first, a replay buffer that fills up, is over by the end of the warm-up if its configuration
-//! is chosen so; everything after that is held to be flat.
+//! Learner, supervisor and one actor, the elder, are left alone, so that they grow old. The other
+//! actors are killed, frozen, attached and taken away all the time. What a run may well hold more
+//! of at first, a replay buffer that fills up, is over by the end of the warm-up if its
+//! configuration is chosen so; everything after that is held to be flat.
 
 use std::fs::File;
 use std::io::Write;
@@ -59,7 +60,11 @@ struct Series {
 
 impl Series {
     const fn new(whose: &'static str, what: &'static str, at_least: f64) -> Self {
-        Self { whose, what, at_least }
+        Self {
+            whose,
+            what,
+            at_least,
+        }
     }
 }
 
@@ -101,8 +106,14 @@ impl Soak {
     ///
     /// # Errors
     /// When that cannot be written.
-    pub(crate) fn new(run: &RunDirectory, length: Duration, seed: u64, table: &Path) -> Result<Self> {
-        let mut file = File::create(table).with_context(|| format!("cannot write {}", table.display()))?;
+    pub(crate) fn new(
+        run: &RunDirectory,
+        length: Duration,
+        seed: u64,
+        table: &Path,
+    ) -> Result<Self> {
+        let mut file =
+            File::create(table).with_context(|| format!("cannot write {}", table.display()))?;
         let columns: Vec<_> = SERIES
             .iter()
             .map(|series| format!("{} {}", series.whose, series.what).replace(' ', "_"))
@@ -186,12 +197,17 @@ impl Soak {
         Ok(())
     }
 
-    /// The trend of each figure after the warm-up, and whether it is flat: over the moments at which as many processes were there as mostly are, because
-    /// each one that comes brings files, segments and descriptors with it.
+    /// The trend of each figure after the warm-up, and whether it is flat: over the moments at
+    /// which as many processes were there as mostly are, because each one that comes brings files,
+    /// segments and descriptors with it.
     pub(crate) fn findings(&self) -> Vec<Finding> {
         let warm = self.length.as_secs_f64() * WARM_UP;
         let hours = (self.length.as_secs_f64() - warm) / 3600.0;
-        let judged: Vec<_> = self.samples.iter().filter(|moment| moment.secs >= warm).collect();
+        let judged: Vec<_> = self
+            .samples
+            .iter()
+            .filter(|moment| moment.secs >= warm)
+            .collect();
         let attendance = commonest(judged.iter().map(|moment| moment.processes));
         let finding = |(index, series): (usize, &Series)| {
             let values: Vec<_> = judged
@@ -200,7 +216,8 @@ impl Soak {
                 .filter_map(|moment| Some((moment.secs, moment.sample[index]?)))
                 .collect();
             let trend = Trend::of(&values);
-            let tolerance = trend.map_or(0.0, |trend| (trend.first * TOLERANCE).max(series.at_least));
+            let tolerance =
+                trend.map_or(0.0, |trend| (trend.first * TOLERANCE).max(series.at_least));
             Finding {
                 whose: series.whose,
                 what: series.what,
@@ -227,7 +244,12 @@ pub(crate) struct Finding {
 }
 
 /// In the order of [`SERIES`].
-fn figures(learner: Option<Usage>, supervisor: Option<Usage>, elder: Option<Usage>, footprint: Footprint) -> Sample {
+fn figures(
+    learner: Option<Usage>,
+    supervisor: Option<Usage>,
+    elder: Option<Usage>,
+    footprint: Footprint,
+) -> Sample {
     let mebibytes = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     let resident = |usage: Option<Usage>| usage.map(|usage| mebibytes(usage.resident_bytes));
     let anonymous = |usage: Option<Usage>| usage.map(|usage| mebibytes(usage.anonymous_bytes));

@@ -37,7 +37,8 @@ pub(crate) struct Stage {
 }
 
 impl Stage {
-    /// For a run in `folder/name`; what its programs say goes to `folder/name.log`. `faults` is where fault points are armed.
+    /// For a run in `folder/name`; what its programs say goes to `folder/name.log`. `faults` is
+    /// where fault points are armed.
     ///
     /// # Errors
     /// When `skein` does not lie beside this program.
@@ -74,7 +75,12 @@ impl Stage {
         command.arg("--config").arg(&recipe.config);
         command.arg("--run-dir").arg(self.run.root());
         command.args(["--actors", &actors.to_string()]);
-        command.args(recipe.overrides.iter().flat_map(|setting| ["--set", setting]));
+        command.args(
+            recipe
+                .overrides
+                .iter()
+                .flat_map(|setting| ["--set", setting]),
+        );
         self.spawn(command)
     }
 
@@ -101,7 +107,12 @@ impl Stage {
     }
 
     fn command(&self, what: &str) -> Result<Command> {
-        let said = || -> io::Result<File> { OpenOptions::new().create(true).append(true).open(&self.said) };
+        let said = || -> io::Result<File> {
+            OpenOptions::new()
+                .create(true)
+                .append(true)
+                .open(&self.said)
+        };
         let context = || format!("cannot write {}", self.said.display());
         let mut command = Command::new(&self.skein);
         command.arg(what).stdin(Stdio::null());
@@ -113,7 +124,8 @@ impl Stage {
         Ok(command)
     }
 
-    /// Starts `command` so that it is interrupted when this program dies: nobody would end a run that is made to last for ever.
+    /// Starts `command` so that it is interrupted when this program dies: nobody would end a run
+    /// that is made to last for ever.
     fn spawn(&self, mut command: Command) -> Result<Child> {
         signal_when_orphaned(&mut command, Signal::INT);
         command

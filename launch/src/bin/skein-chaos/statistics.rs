@@ -1,4 +1,5 @@
-//! Whether a series of samples grows: quarters, medians, and a slope that single outliers do not bend.
+//! Whether a series of samples grows: quarters, medians, and a slope that single outliers do not
+//! bend.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -32,14 +33,18 @@ impl Trend {
         })
     }
 
-    /// Whether neither the quarters nor the slope, over `hours`, show a growth of more than `tolerance`.
+    /// Whether neither the quarters nor the slope, over `hours`, show a growth of more than
+    /// `tolerance`.
     pub(crate) fn is_flat(&self, tolerance: f64, hours: f64) -> bool {
         self.last - self.first <= tolerance && self.per_hour * hours <= tolerance
     }
 }
 
 fn slope_per_sec(samples: &[(f64, f64)]) -> f64 {
-    let thinned: Vec<_> = samples.iter().step_by(samples.len().div_ceil(SAMPLES)).collect();
+    let thinned: Vec<_> = samples
+        .iter()
+        .step_by(samples.len().div_ceil(SAMPLES))
+        .collect();
     let mut slopes = Vec::with_capacity(thinned.len() * thinned.len() / 2);
     for (index, one) in thinned.iter().enumerate() {
         for other in &thinned[index + 1..] {
@@ -53,7 +58,9 @@ fn slope_per_sec(samples: &[(f64, f64)]) -> f64 {
 pub(crate) fn commonest(numbers: impl Iterator<Item = usize>) -> Option<usize> {
     let mut counts = BTreeMap::<usize, usize>::new();
     numbers.for_each(|number| *counts.entry(number).or_default() += 1);
-    let most = counts.iter().max_by_key(|&(&number, &count)| (count, Reverse(number)));
+    let most = counts
+        .iter()
+        .max_by_key(|&(&number, &count)| (count, Reverse(number)));
     most.map(|(&number, _)| number)
 }
 
@@ -76,7 +83,8 @@ mod tests {
 
     #[test]
     fn a_leak_is_seen_through_noise_and_outliers() {
-        let noise = |secs: f64| (secs * 1.7).sin() * 30.0 + if secs % 300.0 == 0.0 { 5000.0 } else { 0.0 };
+        let noise =
+            |secs: f64| (secs * 1.7).sin() * 30.0 + if secs % 300.0 == 0.0 { 5000.0 } else { 0.0 };
         let leak = Trend::of(&series(|secs| 1000.0 + secs / 36.0 + noise(secs))).unwrap();
         assert!((leak.per_hour - 100.0).abs() < 5.0, "{leak:?}");
         assert!(!leak.is_flat(50.0, 1.0));
@@ -87,7 +95,10 @@ mod tests {
     #[test]
     fn a_step_that_the_slope_does_not_see_is_seen_by_the_quarters() {
         let step = Trend::of(&series(|secs| if secs < 3000.0 { 100.0 } else { 200.0 })).unwrap();
-        assert!(step.per_hour * 1.0 < 150.0 && !step.is_flat(50.0, 1.0), "{step:?}");
+        assert!(
+            step.per_hour * 1.0 < 150.0 && !step.is_flat(50.0, 1.0),
+            "{step:?}"
+        );
     }
 
     #[test]
@@ -98,6 +109,10 @@ mod tests {
 
     #[test]
     fn what_shrinks_is_no_leak() {
-        assert!(Trend::of(&series(|secs| 1000.0 - secs)).unwrap().is_flat(1.0, 1.0));
+        assert!(
+            Trend::of(&series(|secs| 1000.0 - secs))
+                .unwrap()
+                .is_flat(1.0, 1.0)
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! `skein-experiment`: runs the experiments of `configs/experiments/`, and tells what they found. `launch/experiment.sh` builds it and hands over.
+//! `skein-experiment`: runs the experiments of `configs/experiments/`, and tells what they found.
+//! `launch/experiment.sh` builds it and hands over.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -43,7 +44,8 @@ struct Cli {
     /// Run nothing: tell again what is there.
     #[arg(long)]
     report: bool,
-    /// Put the report into RESULTS.md, and its pictures and the figures of each run into launch/pictures/experiments/.
+    /// Put the report into RESULTS.md, and its pictures and the figures of each run into
+    /// launch/pictures/experiments/.
     #[arg(long)]
     publish: bool,
 }
@@ -75,7 +77,11 @@ fn main() -> ExitCode {
 /// Prints what each experiment in `folder` is to find out.
 fn list(folder: &Path) -> Result<()> {
     let names = names(folder)?;
-    let width = names.iter().map(|name| name.chars().count()).max().unwrap_or(0);
+    let width = names
+        .iter()
+        .map(|name| name.chars().count())
+        .max()
+        .unwrap_or(0);
     let mut unusable = Vec::new();
     for name in &names {
         match Experiment::load(folder, name, None) {
@@ -117,7 +123,10 @@ impl Cli {
         if !self.report {
             let session = self.run(&experiment, &root, seeds)?;
             if session.interruptions > 0 {
-                eprintln!("skein: to go on with it: {}", self.command(&experiment, Options::All));
+                eprintln!(
+                    "skein: to go on with it: {}",
+                    self.command(&experiment, Options::All)
+                );
                 return Ok(Ended::Interrupted);
             }
             if !session.failed.is_empty() {
@@ -138,7 +147,10 @@ impl Cli {
         let mut plan = Plan::new(experiment, root, seeds)?;
         plan.check_idle()?;
         for (run, other) in plan.take_over()? {
-            eprintln!("skein: {run} was trained already: it is {}", other.display());
+            eprintln!(
+                "skein: {run} was trained already: it is {}",
+                other.display()
+            );
         }
         let jobs = match self.jobs {
             Some(jobs) => jobs.into(),
@@ -152,17 +164,28 @@ impl Cli {
             evaluate: &evaluate,
             jobs,
         };
-        let session = runtime().context("cannot start the runtime")?.block_on(async {
-            let mut interrupts = interrupts().context("cannot listen for signals")?;
-            anyhow::Ok(runner::run(experiment, &plan, manner, &mut interrupts, &mut board).await)
-        });
+        let session = runtime()
+            .context("cannot start the runtime")?
+            .block_on(async {
+                let mut interrupts = interrupts().context("cannot listen for signals")?;
+                anyhow::Ok(
+                    runner::run(experiment, &plan, manner, &mut interrupts, &mut board).await,
+                )
+            });
         board.finish();
         session
     }
 
     /// Reports what there is, and publishes it if that was asked for.
-    fn tell(&self, experiment: &Experiment, root: &Path, seeds: u64, publication: Option<&Publication>) -> Result<()> {
-        // Looked at anew: a file that was changed while runs were under way has made two experiments of one.
+    fn tell(
+        &self,
+        experiment: &Experiment,
+        root: &Path,
+        seeds: u64,
+        publication: Option<&Publication>,
+    ) -> Result<()> {
+        // Looked at anew: a file that was changed while runs were under way has made two
+        // experiments of one.
         let plan = Plan::new(experiment, root, seeds)?;
         let findings = Findings {
             experiment,
@@ -203,10 +226,16 @@ impl Cli {
                 .filter(|seeds| *seeds != experiment.seeds)
                 .map(|seeds| seeds.to_string()),
         );
-        option("--episodes", self.episodes.map(|episodes| episodes.to_string()));
+        option(
+            "--episodes",
+            self.episodes.map(|episodes| episodes.to_string()),
+        );
         if options == Options::All {
             option("--jobs", self.jobs.map(|jobs| jobs.to_string()));
-            option("--runs", self.runs.as_ref().map(|runs| runs.display().to_string()));
+            option(
+                "--runs",
+                self.runs.as_ref().map(|runs| runs.display().to_string()),
+            );
             option("--publish", self.publish.then(String::new));
         }
         command.trim_end().to_owned()

@@ -11,7 +11,8 @@ use super::{Arm, DefinitionError, Experiment, FlownSuite, MOST_ARMS, Measure, Ta
 use crate::experiments::plan::{ACTORS, REPORT};
 use crate::prepare::{self, PrepareError};
 
-/// What is set in every run, because it gets one core. Sums of several threads round otherwise on libtorch; the native engine's do not.
+/// What is set in every run, because it gets one core. Sums of several threads round otherwise on
+/// libtorch; the native engine's do not.
 const FOR_ALL: &str = "run.learner_threads=1";
 /// Keys that no file may set, and why.
 const OURS: [(&str, &str); 2] = [
@@ -40,7 +41,11 @@ pub(super) fn resolve(
             .and_then(refuse_ours)
             .map_err(|problem| settings_error(path, whose, problem))
     };
-    let mut settings = [vec![FOR_ALL.to_owned()], settings_of("[settings]", &file.settings)?].concat();
+    let mut settings = [
+        vec![FOR_ALL.to_owned()],
+        settings_of("[settings]", &file.settings)?,
+    ]
+    .concat();
     let base_config = Config::load(&base, &[])
         .map_err(|error| settings_error(path, "base", PrepareError::from(error).to_string()))?;
     let mut arms = Vec::with_capacity(file.arms.len());
@@ -59,7 +64,12 @@ pub(super) fn resolve(
     Ok(Experiment {
         name: name.to_owned(),
         question: file.question,
-        base_name: file.base.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+        base_name: file
+            .base
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned(),
         base,
         base_episodes: base_config.run.episodes,
         paper_episodes: file.paper_episodes,
@@ -119,20 +129,28 @@ fn tell_episodes(episodes: u64, settings: &mut Vec<String>, arms: &mut [Arm]) {
 }
 
 /// The suite that `file` names, if every arm can be put to it and a table tells what came of it.
-fn suite_of(file: &File, folder: &Path, arms: &[Arm], path: &Path) -> Result<Option<FlownSuite>, DefinitionError> {
+fn suite_of(
+    file: &File,
+    folder: &Path,
+    arms: &[Arm],
+    path: &Path,
+) -> Result<Option<FlownSuite>, DefinitionError> {
     let is_told = file.tables.contains(&TableKind::Suite);
     let nothing = match (file.suite_episodes, &file.suite) {
         (Some(episodes), _) if !(1..=MOST_EPISODES).contains(&episodes) => Some(format!(
             "is outside 1..={MOST_EPISODES}: leave it out for as many as the suite says"
         )),
-        (Some(_), None) => Some("are of a suite, and none is named: add suite = \"FILE\", or leave it out".to_owned()),
+        (Some(_), None) => Some(
+            "are of a suite, and none is named: add suite = \"FILE\", or leave it out".to_owned(),
+        ),
         _ => None,
     };
     if let (Some(episodes), Some(problem)) = (file.suite_episodes, nothing) {
         return Err(value_error(path, "suite_episodes", episodes, problem));
     }
     let Some(named) = &file.suite else {
-        let problem = "has the results of a suite, and none is named: add suite = \"FILE\", or take it out";
+        let problem =
+            "has the results of a suite, and none is named: add suite = \"FILE\", or take it out";
         return match is_told {
             true => Err(value_error(path, "tables", "\"suite\"", problem.to_owned())),
             false => Ok(None),
@@ -140,7 +158,8 @@ fn suite_of(file: &File, folder: &Path, arms: &[Arm], path: &Path) -> Result<Opt
     };
     let refuse = |problem| value_error(path, "suite", format!("{named:?}"), problem);
     if !is_told {
-        let problem = "would be flown, and no table tells it: add \"suite\" to tables, or leave it out";
+        let problem =
+            "would be flown, and no table tells it: add \"suite\" to tables, or leave it out";
         return Err(refuse(problem.to_owned()));
     }
     let suite = FlownSuite::load(&folder.join(named), file.suite_episodes).map_err(|problem| {
@@ -161,7 +180,9 @@ fn suite_of(file: &File, folder: &Path, arms: &[Arm], path: &Path) -> Result<Opt
 
 fn refuse_ours(overrides: Vec<String>) -> Result<Vec<String>, String> {
     for setting in &overrides {
-        let key = setting.split_once('=').map_or(setting.as_str(), |(key, _)| key);
+        let key = setting
+            .split_once('=')
+            .map_or(setting.as_str(), |(key, _)| key);
         if let Some((_, why)) = OURS.iter().find(|(ours, _)| *ours == key) {
             return Err(format!("{setting} cannot be set: {why}"));
         }
@@ -170,7 +191,9 @@ fn refuse_ours(overrides: Vec<String>) -> Result<Vec<String>, String> {
 }
 
 fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
-    let refuse = |key, value: &dyn std::fmt::Display, problem: &str| Err(value_error(path, key, value, problem.into()));
+    let refuse = |key, value: &dyn std::fmt::Display, problem: &str| {
+        Err(value_error(path, key, value, problem.into()))
+    };
     if file.question.trim().is_empty() {
         return refuse(
             "question",
@@ -196,13 +219,18 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
         return refuse("seeds", &file.seeds, "is outside 1..=100");
     }
     if !(1..=MOST_ARMS).contains(&file.arms.len()) {
-        let problem = format!("of them are outside 1..={MOST_ARMS}: more could not be told apart in one picture");
+        let problem = format!(
+            "of them are outside 1..={MOST_ARMS}: more could not be told apart in one picture"
+        );
         return refuse("[[arm]]", &file.arms.len(), &problem);
     }
     let (mut names, mut labels) = (BTreeSet::new(), BTreeSet::new());
     for arm in &file.arms {
-        let is_plain = |character: char| character.is_ascii_alphanumeric() || "-_.".contains(character);
-        if !arm.name.starts_with(|first: char| first.is_ascii_alphanumeric())
+        let is_plain =
+            |character: char| character.is_ascii_alphanumeric() || "-_.".contains(character);
+        if !arm
+            .name
+            .starts_with(|first: char| first.is_ascii_alphanumeric())
             || !arm.name.chars().all(is_plain)
             || arm.name == REPORT
         {
@@ -211,7 +239,10 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
             );
             return refuse("arm.name", &arm.name, &problem);
         }
-        if arm.label.trim().is_empty() || arm.label.contains(['|', '\n']) || arm.label.contains("<!--") {
+        if arm.label.trim().is_empty()
+            || arm.label.contains(['|', '\n'])
+            || arm.label.contains("<!--")
+        {
             return refuse(
                 "arm.label",
                 &arm.label,
@@ -219,10 +250,18 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
             );
         }
         if !names.insert(&arm.name) {
-            return refuse("arm.name", &arm.name, "is there twice: give each arm its own");
+            return refuse(
+                "arm.name",
+                &arm.name,
+                "is there twice: give each arm its own",
+            );
         }
         if !labels.insert(&arm.label) {
-            return refuse("arm.label", &arm.label, "is there twice: give each arm its own");
+            return refuse(
+                "arm.label",
+                &arm.label,
+                "is there twice: give each arm its own",
+            );
         }
     }
     Ok(())
@@ -230,7 +269,12 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
 
 /// Whether all arms are measured alike.
 fn check_comparable(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
-    let measured = |arm: &Arm| (arm.config.evaluation.clone(), arm.config.courses.evaluation.clone());
+    let measured = |arm: &Arm| {
+        (
+            arm.config.evaluation.clone(),
+            arm.config.courses.evaluation.clone(),
+        )
+    };
     refuse_other(arms, path, measured, |first| {
         format!(
             "[evaluation] and courses.evaluation cannot differ from those of arm {first}, or the two could not be compared: set them in [settings]"
@@ -241,7 +285,8 @@ fn check_comparable(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
 /// Why arms that fly elsewhere cannot be compared by their own episodes, and how they can.
 const ELSEWHERE: &str = ", or the two would be measured on different episodes: put them to a suite, and write tables = [\"suite\", \"cost\"] and curves = []";
 
-/// Whether what is told of the arms' own episodes, training's and evaluation's, is of episodes of one kind. A suite flies all arms alike, whatever they were trained on.
+/// Whether what is told of the arms' own episodes, training's and evaluation's, is of episodes of
+/// one kind. A suite flies all arms alike, whatever they were trained on.
 fn check_same_episodes(file: &File, arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
     let of_own_episodes = |kind: &TableKind| !matches!(kind, TableKind::Suite | TableKind::Cost);
     if file.curves.is_empty() && !file.tables.iter().any(of_own_episodes) {
@@ -271,7 +316,11 @@ fn check_same_episodes(file: &File, arms: &[Arm], path: &Path) -> Result<(), Def
 
 /// Whether returns that are drawn beside one another are of one scale.
 fn check_same_reward(file: &File, arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
-    if file.curves.iter().all(|curve| curve.measure != Measure::Return) {
+    if file
+        .curves
+        .iter()
+        .all(|curve| curve.measure != Measure::Return)
+    {
         return Ok(());
     }
     refuse_other(arms, path, Arm::reward, |first| {
@@ -288,7 +337,9 @@ fn refuse_other<T: PartialEq>(
     of: impl Fn(&Arm) -> T,
     problem: impl Fn(&str) -> String,
 ) -> Result<(), DefinitionError> {
-    let Some(first) = arms.first() else { return Ok(()) };
+    let Some(first) = arms.first() else {
+        return Ok(());
+    };
     match arms.iter().find(|arm| of(arm) != of(first)) {
         None => Ok(()),
         Some(other) => Err(settings_error(
@@ -307,7 +358,12 @@ fn settings_error(path: &Path, whose: &str, problem: String) -> DefinitionError 
     }
 }
 
-fn value_error(path: &Path, key: &'static str, value: impl std::fmt::Display, problem: String) -> DefinitionError {
+fn value_error(
+    path: &Path,
+    key: &'static str,
+    value: impl std::fmt::Display,
+    problem: String,
+) -> DefinitionError {
     DefinitionError::Value {
         path: path.to_owned(),
         key,

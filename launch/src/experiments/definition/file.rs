@@ -59,7 +59,9 @@ pub fn names(folder: &Path) -> Result<Vec<String>, DefinitionError> {
     let mut names = Vec::new();
     for entry in fs::read_dir(folder).map_err(fail)? {
         let path = entry.map_err(fail)?.path();
-        if path.extension().is_some_and(|extension| extension == "toml")
+        if path
+            .extension()
+            .is_some_and(|extension| extension == "toml")
             && let Some(name) = path.file_stem().and_then(|stem| stem.to_str())
         {
             names.push(name.to_owned());
@@ -109,7 +111,12 @@ pub(super) fn as_overrides(settings: &Table, folder: &Path) -> Result<Vec<String
 /// Tables within each other at most: more than any setting has, and few enough to be gone through.
 const DEEPEST: usize = 16;
 
-fn flatten(section: &str, table: &Table, folder: &Path, into: &mut Vec<String>) -> Result<(), String> {
+fn flatten(
+    section: &str,
+    table: &Table,
+    folder: &Path,
+    into: &mut Vec<String>,
+) -> Result<(), String> {
     if section.split('.').count() > DEEPEST {
         return Err(format!(
             "{section} lies deeper than any setting: write section.key = value"
@@ -121,7 +128,9 @@ fn flatten(section: &str, table: &Table, folder: &Path, into: &mut Vec<String>) 
             section => format!("{section}.{name}"),
         };
         match value {
-            Value::Table(inner) if inner.is_empty() => return Err(format!("{key} holds no setting: leave it out")),
+            Value::Table(inner) if inner.is_empty() => {
+                return Err(format!("{key} holds no setting: leave it out"));
+            }
             Value::Table(inner) => flatten(&key, inner, folder, into)?,
             value if ["courses.training", "courses.evaluation"].contains(&key.as_str()) => {
                 into.push(format!("{key}={}", within(value, folder)));
@@ -136,7 +145,9 @@ fn flatten(section: &str, table: &Table, folder: &Path, into: &mut Vec<String>) 
 fn within(value: &Value, folder: &Path) -> Value {
     match value {
         Value::String(path) => Value::String(folder.join(path).to_string_lossy().into_owned()),
-        Value::Array(values) => Value::Array(values.iter().map(|value| within(value, folder)).collect()),
+        Value::Array(values) => {
+            Value::Array(values.iter().map(|value| within(value, folder)).collect())
+        }
         value => value.clone(),
     }
 }

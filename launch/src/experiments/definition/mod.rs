@@ -35,7 +35,8 @@ pub struct Experiment {
     pub base_episodes: u64,
     /// Training episodes of the paper's own runs, where the experiment stands for them.
     pub paper_episodes: Option<u64>,
-    /// In what all arms differ from the base, the one thread of each run among it: `section.key=value`.
+    /// In what all arms differ from the base, the one thread of each run among it:
+    /// `section.key=value`.
     pub settings: Vec<String>,
     /// Runs of each arm, with seeds from 1.
     pub seeds: u64,
@@ -62,8 +63,15 @@ pub struct Shortened {
 
 impl Display for Shortened {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let Self { flown, whole, whose } = self;
-        write!(f, "{flown} training episodes a run instead of the {whole} of {whose}")
+        let Self {
+            flown,
+            whole,
+            whose,
+        } = self;
+        write!(
+            f,
+            "{flown} training episodes a run instead of the {whole} of {whose}"
+        )
     }
 }
 
@@ -76,7 +84,8 @@ pub struct Arm {
     pub label: String,
     /// In what it differs from the other arms: `section.key=value`.
     pub settings: Vec<String>,
-    /// Everything that is set beside the base configuration, but for the seed: for `--set`, in this order.
+    /// Everything that is set beside the base configuration, but for the seed: for `--set`, in this
+    /// order.
     pub overrides: Vec<String>,
     /// What comes of it, for seed 1.
     pub config: Config,
@@ -88,11 +97,13 @@ pub struct Arm {
 pub enum TableKind {
     /// R and completed courses of the best snapshot, for each evaluation course.
     Evaluation,
-    /// How the evaluation episodes went: wall by wall, and what ended those that did not get through.
+    /// How the evaluation episodes went: wall by wall, and what ended those that did not get
+    /// through.
     Outcomes,
     /// Completed courses and R of the best snapshot, for each entry of the suite.
     Suite,
-    /// What it took until the first wall was passed and until the agent was trained, and how well and steadily it flew at the end of training.
+    /// What it took until the first wall was passed and until the agent was trained, and how well
+    /// and steadily it flew at the end of training.
     Learning,
     /// How much training swung, and how much of what was learned was lost again.
     Steadiness,
@@ -201,7 +212,8 @@ pub enum DefinitionError {
 }
 
 impl Experiment {
-    /// Reads the experiment called `name` in `folder`, and checks that each of its arms can be run. `episodes` shortens all runs to so many.
+    /// Reads the experiment called `name` in `folder`, and checks that each of its arms can be run.
+    /// `episodes` shortens all runs to so many.
     ///
     /// # Errors
     /// [`DefinitionError`] names file, arm, key, value and remedy.
@@ -210,18 +222,30 @@ impl Experiment {
         check::resolve(file::read(&path)?, &path, name, episodes)
     }
 
-    /// How much less the shortest arm flies than the paper, or than the configuration that all are based on; `None` if it flies as much.
+    /// How much less the shortest arm flies than the paper, or than the configuration that all are
+    /// based on; `None` if it flies as much.
     pub fn shortened(&self) -> Option<Shortened> {
-        let paper = self.paper_episodes.map(|episodes| (episodes, "the paper".to_owned()));
+        let paper = self
+            .paper_episodes
+            .map(|episodes| (episodes, "the paper".to_owned()));
         let base = (self.base_episodes, format!("`configs/{}`", self.base_name));
         let flown = self.arms.iter().map(|arm| arm.config.run.episodes).min()?;
-        let (whole, whose) = paper.into_iter().chain([base]).find(|(whole, _)| flown < *whole)?;
-        Some(Shortened { flown, whole, whose })
+        let (whole, whose) = paper
+            .into_iter()
+            .chain([base])
+            .find(|(whole, _)| flown < *whole)?;
+        Some(Shortened {
+            flown,
+            whole,
+            whose,
+        })
     }
 
     /// Whether all arms are rewarded alike, so that their returns can be compared.
     pub fn has_one_reward(&self) -> bool {
-        self.arms.windows(2).all(|pair| pair[0].reward() == pair[1].reward())
+        self.arms
+            .windows(2)
+            .all(|pair| pair[0].reward() == pair[1].reward())
     }
 }
 

@@ -19,8 +19,9 @@ pub struct FlownSuite {
     pub suite: Suite,
     /// Episodes of each entry, if they are not as many as the suite says.
     pub each: Option<u64>,
-    /// What the result of a run is called: the suite file's name, `each`, and a checksum of all that is flown. The result of a suite that has been changed since is
-    /// that of another one, and stays as it is.
+    /// What the result of a run is called: the suite file's name, `each`, and a checksum of all
+    /// that is flown. The result of a suite that has been changed since is that of another one, and
+    /// stays as it is.
     pub result_name: String,
 }
 
@@ -34,7 +35,11 @@ impl FlownSuite {
         for entry in &mut suite.entries {
             entry.episodes = each.unwrap_or(entry.episodes);
         }
-        if let Some(entry) = suite.entries.iter().find(|entry| entry.name.contains(['|', '\n'])) {
+        if let Some(entry) = suite
+            .entries
+            .iter()
+            .find(|entry| entry.name.contains(['|', '\n']))
+        {
             return Err(format!(
                 "entry {:?} cannot stand in a table: call it something on one line without |",
                 entry.name
@@ -52,7 +57,11 @@ impl FlownSuite {
 
     /// The file's name, for readers.
     pub fn file_name(&self) -> String {
-        self.path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+        self.path
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned()
     }
 
     /// Episodes of all entries.
@@ -60,7 +69,8 @@ impl FlownSuite {
         self.suite.entries.iter().map(|entry| entry.episodes).sum()
     }
 
-    /// Whether what `arm` trains can be put to it: that shows when the suite is flown, and that would be after all of the training.
+    /// Whether what `arm` trains can be put to it: that shows when the suite is flown, and that
+    /// would be after all of the training.
     ///
     /// # Errors
     /// The entry, and what is wrong with it for this arm.
@@ -69,7 +79,9 @@ impl FlownSuite {
             .try_into()
             .map_err(|error: toml::de::Error| error.to_string())?;
         for entry in &self.suite.entries {
-            let flown = entry.disturbances.check(&settings.vehicle, &settings.camera);
+            let flown = entry
+                .disturbances
+                .check(&settings.vehicle, &settings.camera);
             flown.map_err(|fault| format!("entry \"{}\": {}", entry.name, with_causes(&fault)))?;
         }
         Ok(())
@@ -94,5 +106,6 @@ fn checksum(path: &Path) -> Result<u32, String> {
 
 fn content(path: &Path) -> Result<Table, String> {
     let text = fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
-    text.parse().map_err(|error| format!("{}: {error}", path.display()))
+    text.parse()
+        .map_err(|error| format!("{}: {error}", path.display()))
 }

@@ -5,7 +5,9 @@ use std::fs;
 use super::*;
 
 fn shipped(path: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs").join(path)
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../configs")
+        .join(path)
 }
 
 /// The head of an experiment's file, based on the shipped smoke configuration.
@@ -19,7 +21,8 @@ fn head() -> String {
 fn load(text: &str, episodes: Option<u64>) -> Result<Experiment, String> {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("test.toml"), text).unwrap();
-    Experiment::load(folder.path(), "test", episodes).map_err(|error| skein_protocol::failure::with_causes(&error))
+    Experiment::load(folder.path(), "test", episodes)
+        .map_err(|error| skein_protocol::failure::with_causes(&error))
 }
 
 const ARM: &str = "[[arm]]\nname = \"a\"\nlabel = \"A\"\n";
@@ -31,12 +34,20 @@ fn every_shipped_experiment_can_be_run() {
     assert!(names.contains(&"paper".to_owned()), "{names:?}");
     for name in names {
         let experiment = Experiment::load(&folder, &name, None).unwrap();
-        let fewest = experiment.arms.iter().map(|arm| arm.config.run.episodes).min().unwrap();
+        let fewest = experiment
+            .arms
+            .iter()
+            .map(|arm| arm.config.run.episodes)
+            .min()
+            .unwrap();
         assert!(
             experiment.seeds >= 3,
             "{name}: fewer seeds than anything can be said of"
         );
-        assert!(Experiment::load(&folder, &name, Some(fewest - 1)).is_ok_and(|short| short.shortened().is_some()));
+        assert!(
+            Experiment::load(&folder, &name, Some(fewest - 1))
+                .is_ok_and(|short| short.shortened().is_some())
+        );
     }
 }
 
@@ -54,8 +65,14 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
         (a.config.replay.success_share, b.config.replay.success_share),
         (0.25, 0.5)
     );
-    assert_eq!((a.config.run.episodes, a.config.run.learner_threads), (90, 1));
-    assert_eq!(a.config.simulator["reward"]["action_scale"].as_float(), Some(2.0));
+    assert_eq!(
+        (a.config.run.episodes, a.config.run.learner_threads),
+        (90, 1)
+    );
+    assert_eq!(
+        a.config.simulator["reward"]["action_scale"].as_float(),
+        Some(2.0)
+    );
     assert_eq!(
         b.config.simulator["reward"]["action_scale"].as_float(),
         Some(1.0),
@@ -84,7 +101,11 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
 
 #[test]
 fn what_flies_less_than_the_paper_is_shortened_and_what_flies_as_much_is_not() {
-    let shortened = |keys: &str| load(&format!("{keys}{}{ARM}", head()), None).unwrap().shortened();
+    let shortened = |keys: &str| {
+        load(&format!("{keys}{}{ARM}", head()), None)
+            .unwrap()
+            .shortened()
+    };
     assert_eq!(shortened(""), None);
     assert_eq!(shortened("paper_episodes = 300\n"), None);
     assert_eq!(
@@ -103,13 +124,20 @@ fn the_example_in_the_readme_can_be_run() {
     let (example, _) = example.split_once("```").unwrap();
     let text = example.replace("../local.toml", shipped("local.toml").to_str().unwrap());
     let experiment = load(&text, None).unwrap();
-    assert_eq!((experiment.seeds, experiment.arms[1].config.sac.batch_size), (5, 512));
+    assert_eq!(
+        (experiment.seeds, experiment.arms[1].config.sac.batch_size),
+        (5, 512)
+    );
 }
 
 #[test]
 fn course_files_are_named_relative_to_the_experiment() {
     let folder = tempfile::tempdir().unwrap();
-    fs::copy(shipped("courses/training.toml"), folder.path().join("mine.toml")).unwrap();
+    fs::copy(
+        shipped("courses/training.toml"),
+        folder.path().join("mine.toml"),
+    )
+    .unwrap();
     let text = format!(
         "{}{ARM}[settings]\ncourses.training = \"mine.toml\"\ncourses.evaluation = [\"mine.toml\"]\n",
         head()
@@ -125,20 +153,33 @@ fn a_suite_is_named_relative_to_the_experiment_and_its_result_after_all_that_is_
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
     let course = fs::read_to_string(shipped("courses/training.toml")).unwrap();
-    let suite = "name = \"x\"\nepisodes = 5\n[[entry]]\nname = \"as it is\"\ncourse = \"mine.toml\"\n";
+    let suite =
+        "name = \"x\"\nepisodes = 5\n[[entry]]\nname = \"as it is\"\ncourse = \"mine.toml\"\n";
     write(
         "test.toml",
-        &format!("suite = \"few.toml\"\n{}{ARM}", head().replace("evaluation", "suite")),
+        &format!(
+            "suite = \"few.toml\"\n{}{ARM}",
+            head().replace("evaluation", "suite")
+        ),
     );
     write("mine.toml", &course);
     write("few.toml", suite);
-    let load = || Experiment::load(folder.path(), "test", None).unwrap().suite.unwrap();
+    let load = || {
+        Experiment::load(folder.path(), "test", None)
+            .unwrap()
+            .suite
+            .unwrap()
+    };
     let first = load();
     assert_eq!(
         (first.path.clone(), first.episodes()),
         (folder.path().join("few.toml"), 5)
     );
-    assert!(first.result_name.starts_with("few-"), "{}", first.result_name);
+    assert!(
+        first.result_name.starts_with("few-"),
+        "{}",
+        first.result_name
+    );
     // Words about it change nothing.
     write("few.toml", &format!("# Few episodes.\n{suite}"));
     write("mine.toml", &format!("# Five walls.\n{course}"));
@@ -151,7 +192,10 @@ fn a_suite_is_named_relative_to_the_experiment_and_its_result_after_all_that_is_
         head().replace("evaluation", "suite")
     );
     write("fewer.toml", &fewer);
-    let fewer = Experiment::load(folder.path(), "fewer", None).unwrap().suite.unwrap();
+    let fewer = Experiment::load(folder.path(), "fewer", None)
+        .unwrap()
+        .suite
+        .unwrap();
     assert_eq!((fewer.each, fewer.episodes()), (Some(2), 2));
     assert_ne!(fewer.result_name, first.result_name);
     write(
@@ -174,8 +218,16 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             None,
             vec!["test.toml is no experiment", "question = 1"],
         ),
-        (with_arm("sed = 1"), None, vec!["unknown field `sed`", "settings"]),
-        (head() + "arms = 1\n" + ARM, None, vec!["unknown field `arms`"]),
+        (
+            with_arm("sed = 1"),
+            None,
+            vec!["unknown field `sed`", "settings"],
+        ),
+        (
+            head() + "arms = 1\n" + ARM,
+            None,
+            vec!["unknown field `arms`"],
+        ),
         (head(), None, vec!["missing field `arm`"]),
         (
             head().replace("evaluation", "evaluations") + ARM,
@@ -195,7 +247,10 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         (
             head().replace("What for?", "What\\nfor?") + ARM,
             None,
-            vec!["question = \"What\\nfor?\" cannot head a report", "one line"],
+            vec![
+                "question = \"What\\nfor?\" cannot head a report",
+                "one line",
+            ],
         ),
         (
             head().replace("What for?", "<!-- end -->") + ARM,
@@ -212,7 +267,11 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             None,
             vec!["seeds = 0", "1..=100"],
         ),
-        (head() + &ARM.repeat(2), None, vec!["arm.name = a is there twice"]),
+        (
+            head() + &ARM.repeat(2),
+            None,
+            vec!["arm.name = a is there twice"],
+        ),
         (
             head() + &ARM.replace("\"a\"", "\"../a\""),
             None,
@@ -241,7 +300,11 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         (
             with_arm("settings.replay.success_share = 1.5"),
             None,
-            vec!["test.toml: arm a", "replay.success_share = 1.5", "outside [0, 1)"],
+            vec![
+                "test.toml: arm a",
+                "replay.success_share = 1.5",
+                "outside [0, 1)",
+            ],
         ),
         (
             with_arm("settings.simulator.max_step = 1"),
@@ -258,7 +321,11 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             None,
             vec!["arm a: run.seed=4 cannot be set", "`seeds`"],
         ),
-        (with_arm("settings.run = {}"), None, vec!["arm a: run holds no setting"]),
+        (
+            with_arm("settings.run = {}"),
+            None,
+            vec!["arm a: run holds no setting"],
+        ),
         (
             with_arm("settings.seed = 4"),
             None,
@@ -313,14 +380,26 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             vec!["suite_episodes = 5 are of a suite", "add suite ="],
         ),
         (
-            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.generator.clearance_m = [0.9, 1.25]"),
+            with_arm(
+                "[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.generator.clearance_m = [0.9, 1.25]",
+            ),
             None,
-            vec!["arm b: simulator.generator cannot differ", "arm a", "\"suite\""],
+            vec![
+                "arm b: simulator.generator cannot differ",
+                "arm a",
+                "\"suite\"",
+            ],
         ),
         (
-            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.disturbances.share = 0.5"),
+            with_arm(
+                "[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.disturbances.share = 0.5",
+            ),
             None,
-            vec!["arm b: simulator.disturbances cannot differ", "arm a", "\"suite\""],
+            vec![
+                "arm b: simulator.disturbances cannot differ",
+                "arm a",
+                "\"suite\"",
+            ],
         ),
         (
             with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.learning.levels = 3"),
@@ -333,24 +412,41 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             ],
         ),
         (
-            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.courses.generated_share = 0.5"),
+            with_arm(
+                "[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.courses.generated_share = 0.5",
+            ),
             None,
-            vec!["arm b: courses.training, courses.generated_share", "\"suite\""],
+            vec![
+                "arm b: courses.training, courses.generated_share",
+                "\"suite\"",
+            ],
         ),
         (
-            with_arm("[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.reward.action_scale = 2.0"),
+            with_arm(
+                "[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.reward.action_scale = 2.0",
+            ),
             None,
-            vec!["arm b: simulator.reward cannot differ", "arm a", "walls_passed"],
+            vec![
+                "arm b: simulator.reward cannot differ",
+                "arm a",
+                "walls_passed",
+            ],
         ),
         (
-            format!("suite_episodes = 0\n{}", with_suite(&shipped("evaluations/paper.toml"))),
+            format!(
+                "suite_episodes = 0\n{}",
+                with_suite(&shipped("evaluations/paper.toml"))
+            ),
             None,
             vec!["suite_episodes = 0 is outside 1..=1000000", "leave it out"],
         ),
         (
             format!("suite = \"few.toml\"\n{}{ARM}", head()),
             None,
-            vec!["suite = \"few.toml\" would be flown", "add \"suite\" to tables"],
+            vec![
+                "suite = \"few.toml\" would be flown",
+                "add \"suite\" to tables",
+            ],
         ),
         (
             head().replace("evaluation", "suite") + ARM,
@@ -364,8 +460,14 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         }
         assert!(error.contains("test.toml"), "{error}");
     }
-    let many: String = (0..9).map(|n| ARM.replace("\"a\"", &format!("\"a{n}\""))).collect();
-    assert!(load(&(head() + &many), None).unwrap_err().contains("[[arm]] = 9"));
+    let many: String = (0..9)
+        .map(|n| ARM.replace("\"a\"", &format!("\"a{n}\"")))
+        .collect();
+    assert!(
+        load(&(head() + &many), None)
+            .unwrap_err()
+            .contains("[[arm]] = 9")
+    );
 }
 
 #[test]

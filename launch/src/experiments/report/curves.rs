@@ -15,11 +15,16 @@ const PLACES: usize = 400;
 const RESAMPLES: usize = 2000;
 
 impl Findings<'_> {
-    /// Draws every picture of the experiment into `folder`. One that would have no line, because runs are shorter than what is averaged over, is left out.
+    /// Draws every picture of the experiment into `folder`. One that would have no line, because
+    /// runs are shorter than what is averaged over, is left out.
     pub(super) fn draw(&self, folder: &Path) -> Result<Vec<Picture>, ExperimentReportError> {
         let mut pictures = Vec::new();
         for &curve in &self.experiment.curves {
-            let file = format!("{}_over_{}.png", measure_name(curve.measure), axis_name(curve.over));
+            let file = format!(
+                "{}_over_{}.png",
+                measure_name(curve.measure),
+                axis_name(curve.over)
+            );
             let comparison = self.comparison(curve)?;
             if comparison.draw(&folder.join(&file))? {
                 let caption = format!("{}, over {}", comparison.title, comparison.x);
@@ -42,7 +47,9 @@ impl Findings<'_> {
             None => "",
         };
         Ok(Comparison {
-            title: format!("{what} per training episode, average over {window} episodes{shortened}"),
+            title: format!(
+                "{what} per training episode, average over {window} episodes{shortened}"
+            ),
             x: match curve.over {
                 Axis::Episodes => "training episodes",
                 Axis::Steps => "environment steps",
@@ -90,7 +97,8 @@ impl Findings<'_> {
     }
 }
 
-/// `curves`, one a seed, as one: from where the last of them begins to where the first of them ends.
+/// `curves`, one a seed, as one: from where the last of them begins to where the first of them
+/// ends.
 fn summed_up(curves: &[Vec<(f64, f64)>], bootstrap: &Bootstrap) -> Vec<(f64, Estimate)> {
     let begin = curves
         .iter()

@@ -9,9 +9,13 @@ use crate::experiments::definition::{Experiment, TableKind};
 use crate::experiments::results::RunResult;
 
 impl Findings<'_> {
-    /// The report as Markdown; its pictures and `runs`, the figures of each run, lie where `prefix` and a file's name say.
+    /// The report as Markdown; its pictures and `runs`, the figures of each run, lie where `prefix`
+    /// and a file's name say.
     pub(super) fn document(&self, pictures: &[Picture], prefix: &str, runs: &str) -> String {
-        let mut text = format!("**{}**\n\n```sh\n{}\n```\n\n", self.experiment.question, self.command);
+        let mut text = format!(
+            "**{}**\n\n```sh\n{}\n```\n\n",
+            self.experiment.question, self.command
+        );
         push(&mut text, &self.what_was_run());
         if let Some(note) = self.shortened() {
             push(&mut text, &note);
@@ -30,11 +34,16 @@ impl Findings<'_> {
             }
         }
         for picture in pictures {
-            push(&mut text, &format!("![{}]({prefix}{})", picture.caption, picture.file));
+            push(
+                &mut text,
+                &format!("![{}]({prefix}{})", picture.caption, picture.file),
+            );
         }
         push(
             &mut text,
-            &format!("Every run's own figures, and the SHA-256 of what it learned: [one line a run]({prefix}{runs})."),
+            &format!(
+                "Every run's own figures, and the SHA-256 of what it learned: [one line a run]({prefix}{runs})."
+            ),
         );
         push(&mut text, &self.how_to_read(pictures));
         text
@@ -72,7 +81,8 @@ impl Findings<'_> {
 
     fn missing(&self) -> Option<String> {
         let (planned, complete) = (self.plan.runs.len(), self.results.len());
-        (complete < planned).then(|| format!("**Not all of it**: {complete} of {planned} runs are complete."))
+        (complete < planned)
+            .then(|| format!("**Not all of it**: {complete} of {planned} runs are complete."))
     }
 
     /// What all figures rest on.
@@ -140,7 +150,9 @@ impl Findings<'_> {
         }
         let window = self.experiment.arms[0].config.evaluation.window_episodes;
         if tables.contains(&TableKind::Learning) {
-            text.push_str("A run that never came to a wall or to the rate counts with all that it took (≥). ");
+            text.push_str(
+                "A run that never came to a wall or to the rate counts with all that it took (≥). ",
+            );
         }
         if tables.contains(&TableKind::Learning) || tables.contains(&TableKind::Steadiness) {
             let _ = write!(
@@ -170,14 +182,24 @@ fn push(text: &mut String, paragraph: &str) {
 }
 
 fn code(settings: &[String]) -> String {
-    let quoted: Vec<_> = settings.iter().map(|setting| format!("`{setting}`")).collect();
+    let quoted: Vec<_> = settings
+        .iter()
+        .map(|setting| format!("`{setting}`"))
+        .collect();
     quoted.join(", ")
 }
 
 /// From the least to the most, or the one that all have.
-fn range(results: &[RunResult], of: impl Fn(&RunResult) -> f64, show: impl Fn(f64) -> String) -> String {
+fn range(
+    results: &[RunResult],
+    of: impl Fn(&RunResult) -> f64,
+    show: impl Fn(f64) -> String,
+) -> String {
     let values = || results.iter().map(&of);
-    let (least, most) = (values().fold(f64::INFINITY, f64::min), values().fold(0.0, f64::max));
+    let (least, most) = (
+        values().fold(f64::INFINITY, f64::min),
+        values().fold(0.0, f64::max),
+    );
     match (show(least), show(most)) {
         (least, most) if least == most => least,
         (least, most) => format!("{least} to {most}"),

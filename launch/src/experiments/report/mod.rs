@@ -111,7 +111,10 @@ impl Findings<'_> {
 
     /// Whether every run is complete.
     pub fn is_whole(&self) -> bool {
-        self.plan.runs.iter().all(|run| run.state == State::Complete)
+        self.plan
+            .runs
+            .iter()
+            .all(|run| run.state == State::Complete)
     }
 
     /// The complete runs of an arm, by its place.

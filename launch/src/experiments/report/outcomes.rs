@@ -1,4 +1,5 @@
-//! How the evaluation episodes of an experiment went: wall by wall, and what ended those that did not get through.
+//! How the evaluation episodes of an experiment went: wall by wall, and what ended those that did
+//! not get through.
 
 use skein_protocol::evaluation::{CourseEvaluation, Failures};
 
@@ -45,7 +46,10 @@ impl Findings<'_> {
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
             for course in courses {
-                let of_seeds: Vec<_> = self.of_arm(number).filter_map(|run| find(run, course)).collect();
+                let of_seeds: Vec<_> = self
+                    .of_arm(number)
+                    .filter_map(|run| find(run, course))
+                    .collect();
                 let mut row = vec![arm.label.clone(), course.clone()];
                 row.extend(cells(&of_seeds));
                 rows.push(row);
@@ -63,8 +67,12 @@ pub(super) fn entry_of<'a>(result: &'a RunResult, name: &str) -> Option<&'a Cour
 
 /// What stands behind the arm and the course: the episodes of all seeds.
 fn cells(of_seeds: &[&CourseEvaluation]) -> [String; HEADER.len() - 2] {
-    let sum = |count: fn(&CourseEvaluation) -> u64| of_seeds.iter().map(|course| count(course)).sum::<u64>();
-    let failed = |by: fn(&Failures) -> u64| summed(of_seeds, |course| course.failures.iter().map(by).collect());
+    let sum = |count: fn(&CourseEvaluation) -> u64| {
+        of_seeds.iter().map(|course| count(course)).sum::<u64>()
+    };
+    let failed = |by: fn(&Failures) -> u64| {
+        summed(of_seeds, |course| course.failures.iter().map(by).collect())
+    };
     let passed = summed(of_seeds, |course| course.walls_passed.clone());
     let could_be_passed = sum(|course| course.episodes * course.walls_passed.len() as u64);
     let mut hit_wall = failed(|failures| failures.hit_wall);
@@ -86,7 +94,10 @@ fn cells(of_seeds: &[&CourseEvaluation]) -> [String; HEADER.len() - 2] {
 }
 
 /// Counts wall by wall, added up over the seeds.
-fn summed(of_seeds: &[&CourseEvaluation], counts: impl Fn(&CourseEvaluation) -> Vec<u64>) -> Vec<u64> {
+fn summed(
+    of_seeds: &[&CourseEvaluation],
+    counts: impl Fn(&CourseEvaluation) -> Vec<u64>,
+) -> Vec<u64> {
     let mut sums = Vec::new();
     for counts in of_seeds.iter().map(|course| counts(course)) {
         sums.resize(sums.len().max(counts.len()), 0);
@@ -102,7 +113,11 @@ fn joined(counts: &[u64]) -> String {
     if counts.iter().all(|&count| count == 0) {
         return "0".to_owned();
     }
-    counts.iter().map(u64::to_string).collect::<Vec<_>>().join(" ")
+    counts
+        .iter()
+        .map(u64::to_string)
+        .collect::<Vec<_>>()
+        .join(" ")
 }
 
 #[cfg(test)]
@@ -132,11 +147,17 @@ mod tests {
             CourseEvaluation::of(
                 "c",
                 2,
-                &[score(2, Outcome::Collided, None), score(0, Outcome::TimedOut, None)],
+                &[
+                    score(2, Outcome::Collided, None),
+                    score(0, Outcome::TimedOut, None),
+                ],
             ),
         ];
         let cells = cells(&seeds.each_ref());
-        assert_eq!(cells, ["2", "4", "0.625", "3 2", "1", "0 1", "0 0 1", "1 0 0"]);
+        assert_eq!(
+            cells,
+            ["2", "4", "0.625", "3 2", "1", "0 1", "0 0 1", "1 0 0"]
+        );
         assert_eq!(super::cells(&[])[2], NOTHING);
     }
 }

@@ -54,8 +54,8 @@ pub enum PublicationError {
 }
 
 impl Publication {
-    /// Finds the place of the experiment called `name` in RESULTS.md of `repository`: between its markers, or, where there are none, a new part at the end.
-    /// Nothing is written.
+    /// Finds the place of the experiment called `name` in RESULTS.md of `repository`: between its
+    /// markers, or, where there are none, a new part at the end. Nothing is written.
     ///
     /// # Errors
     /// [`PublicationError`] names the file and what is wrong with the markers.
@@ -88,7 +88,9 @@ impl Publication {
                     before: before.to_owned(),
                     after: after.to_owned(),
                 }),
-                _ => markers(format!("nothing ends what `{begin}` begins: write {END} after it")),
+                _ => markers(format!(
+                    "nothing ends what `{begin}` begins: write {END} after it"
+                )),
             },
             _ => markers(format!("`{begin}` is there more than once: leave one")),
         }
@@ -98,18 +100,27 @@ impl Publication {
         format!("{BEGIN}{} -->", self.name)
     }
 
-    /// Puts the report there, and its pictures and the figures of each run beside the documents' others. Returns what was written.
+    /// Puts the report there, and its pictures and the figures of each run beside the documents'
+    /// others. Returns what was written.
     ///
     /// # Errors
-    /// [`PublicationError`] names the file; nothing was written where another experiment is just being published.
-    pub fn publish(&self, findings: &Findings<'_>, report: &Written) -> Result<Vec<PathBuf>, PublicationError> {
+    /// [`PublicationError`] names the file; nothing was written where another experiment is just
+    /// being published.
+    pub fn publish(
+        &self,
+        findings: &Findings<'_>,
+        report: &Written,
+    ) -> Result<Vec<PathBuf>, PublicationError> {
         let repository = self.results.parent().unwrap_or(Path::new(""));
         let folder = repository.join(PICTURES);
         let _claim = claim(&folder)?;
         let mut written = Vec::new();
         let mut put = |file: &str| {
             let published = format!("{}_{file}", findings.experiment.name);
-            let (from, to) = (findings.plan.root.join(REPORT).join(file), folder.join(&published));
+            let (from, to) = (
+                findings.plan.root.join(REPORT).join(file),
+                folder.join(&published),
+            );
             fs::copy(&from, &to).map_err(at(&to))?;
             written.push(to);
             Ok(published)
@@ -131,7 +142,11 @@ impl Publication {
     /// Puts `document` into RESULTS.md as it is now: hours have passed since its place was found.
     fn write(&self, document: &str) -> Result<(), PublicationError> {
         let Surroundings { before, after } = self.surroundings()?;
-        let text = format!("{before}{}\n{}\n{END}{after}", self.begin(), document.trim_end());
+        let text = format!(
+            "{before}{}\n{}\n{END}{after}",
+            self.begin(),
+            document.trim_end()
+        );
         let aside = self.results.with_extension("md.partial");
         fs::write(&aside, text)
             .and_then(|()| fs::rename(&aside, &self.results))
@@ -154,12 +169,14 @@ fn at(path: &Path) -> impl FnOnce(io::Error) -> PublicationError {
 mod tests {
     use super::*;
 
-    /// What RESULTS.md becomes when `new` is published for the experiment `lag`, and somebody has put `changed` there since its place was found.
+    /// What RESULTS.md becomes when `new` is published for the experiment `lag`, and somebody has
+    /// put `changed` there since its place was found.
     fn published(results: &str, changed: &str) -> Result<String, String> {
         let repository = tempfile::tempdir().unwrap();
         let file = repository.path().join("RESULTS.md");
         fs::write(&file, results).unwrap();
-        let place = Publication::find(repository.path(), "lag").map_err(|error| error.to_string())?;
+        let place =
+            Publication::find(repository.path(), "lag").map_err(|error| error.to_string())?;
         fs::write(&file, changed).unwrap();
         place.write("new\n\n").map_err(|error| error.to_string())?;
         Ok(fs::read_to_string(&file).unwrap())
@@ -199,8 +216,15 @@ mod tests {
     #[test]
     fn markers_that_leave_a_doubt_are_refused() {
         let begin = "<!-- experiment: lag -->";
-        for unended in [begin.to_owned(), format!("{begin}\n<!-- experiment: k -->\n{END}")] {
-            assert!(place(&unended).unwrap_err().contains("write <!-- end --> after it"));
+        for unended in [
+            begin.to_owned(),
+            format!("{begin}\n<!-- experiment: k -->\n{END}"),
+        ] {
+            assert!(
+                place(&unended)
+                    .unwrap_err()
+                    .contains("write <!-- end --> after it")
+            );
         }
         assert!(
             place(&format!("{begin}\n{END}\n{begin}\n{END}"))

@@ -1,4 +1,5 @@
-//! Each run's own figures: what the estimates of a report are made of, and what another run of the same configuration and seed must come to.
+//! Each run's own figures: what the estimates of a report are made of, and what another run of the
+//! same configuration and seed must come to.
 
 use std::io;
 use std::path::Path;
@@ -31,8 +32,10 @@ impl Findings<'_> {
     /// Name and value of every column; the value is empty where the run has none.
     fn columns(&self, run: &RunResult) -> Vec<(String, String)> {
         let summary = &run.summary;
-        let trained = |of: fn(&Trained) -> String| summary.trained.as_ref().map_or(String::new(), of);
-        let measure = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.4}"));
+        let trained =
+            |of: fn(&Trained) -> String| summary.trained.as_ref().map_or(String::new(), of);
+        let measure =
+            |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.4}"));
         let counts = [
             ("arm", self.experiment.arms[run.arm].name.clone()),
             ("seed", run.seed.to_string()),
@@ -42,12 +45,18 @@ impl Findings<'_> {
             ("steps", summary.steps.to_string()),
             ("updates", summary.updates.to_string()),
             ("vae_updates", summary.vae_updates.to_string()),
-            ("evaluation_episodes", summary.evaluation_episodes.to_string()),
+            (
+                "evaluation_episodes",
+                summary.evaluation_episodes.to_string(),
+            ),
             ("wall_secs", format!("{:.1}", summary.wall_secs)),
             ("trained_episodes", trained(|at| at.episodes.to_string())),
             ("trained_steps", trained(|at| at.steps.to_string())),
             ("trained_updates", trained(|at| at.updates.to_string())),
-            ("trained_wall_secs", trained(|at| format!("{:.1}", at.wall_secs))),
+            (
+                "trained_wall_secs",
+                trained(|at| format!("{:.1}", at.wall_secs)),
+            ),
             (
                 "one_wall_episodes",
                 run.one_wall_after()
@@ -57,7 +66,9 @@ impl Findings<'_> {
             ("final_return", measure(run.final_return())),
             ("volatility", measure(run.volatility())),
         ];
-        let mut columns: Vec<_> = counts.map(|(name, value)| (name.to_owned(), value)).to_vec();
+        let mut columns: Vec<_> = counts
+            .map(|(name, value)| (name.to_owned(), value))
+            .to_vec();
         let mut flown = |name: &str, course: Option<&CourseEvaluation>| {
             columns.push((format!("R {name}"), measure(course.map(|course| course.r))));
             columns.push((
@@ -78,7 +89,12 @@ impl Findings<'_> {
     pub(super) fn entries(&self) -> Vec<String> {
         let suite = self.experiment.suite.as_ref();
         suite.map_or(Vec::new(), |flown| {
-            flown.suite.entries.iter().map(|entry| entry.name.clone()).collect()
+            flown
+                .suite
+                .entries
+                .iter()
+                .map(|entry| entry.name.clone())
+                .collect()
         })
     }
 }

@@ -55,18 +55,25 @@ impl Findings<'_> {
     }
 
     /// A row an arm, a column a course.
-    fn by_course(&self, value: impl Fn(&CourseEvaluation) -> f64, show: impl Fn(Estimate) -> String) -> String {
+    fn by_course(
+        &self,
+        value: impl Fn(&CourseEvaluation) -> f64,
+        show: impl Fn(Estimate) -> String,
+    ) -> String {
         let courses = self.courses();
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
             let mut row = self.head(number, arm).to_vec();
             row.extend(courses.iter().map(|name| {
                 let of_course = |result: &RunResult| course_of(result, name).map(&value);
-                self.estimate(number, of_course).map_or(NOTHING.to_owned(), &show)
+                self.estimate(number, of_course)
+                    .map_or(NOTHING.to_owned(), &show)
             }));
             rows.push(row);
         }
-        let header = ["arm".to_owned(), "seeds".to_owned()].into_iter().chain(courses);
+        let header = ["arm".to_owned(), "seeds".to_owned()]
+            .into_iter()
+            .chain(courses);
         grid(header.collect(), rows, 1)
     }
 
@@ -81,8 +88,10 @@ impl Findings<'_> {
                     self.estimate(number, of_entry)
                 };
                 let [label, seeds] = self.head(number, arm);
-                let completed = self.values(number, |run| Some(entry_of(run, &entry.name)?.completed));
-                let mean = completed.and_then(|values| self.bootstrap(number, RESAMPLES).mean(&values));
+                let completed =
+                    self.values(number, |run| Some(entry_of(run, &entry.name)?.completed));
+                let mean =
+                    completed.and_then(|values| self.bootstrap(number, RESAMPLES).mean(&values));
                 rows.push(vec![
                     label,
                     entry.name.clone(),
@@ -94,7 +103,15 @@ impl Findings<'_> {
                 ]);
             }
         }
-        let header = ["arm", "entry", "seeds", "episodes", "completed, mean", "completed", "R"];
+        let header = [
+            "arm",
+            "entry",
+            "seeds",
+            "episodes",
+            "completed, mean",
+            "completed",
+            "R",
+        ];
         Some(Titled {
             title: format!(
                 "How the best snapshot flew the suite `{}` without exploration: the share of episodes that completed their course, and R",
@@ -107,8 +124,10 @@ impl Findings<'_> {
     fn learning(&self) -> Titled {
         let evaluation = &self.experiment.arms[0].config.evaluation;
         let window = evaluation.window_episodes;
-        let mut at_the_end: Vec<(String, Measured)> =
-            vec![(format!("walls passed, last {window}"), RunResult::final_walls_passed)];
+        let mut at_the_end: Vec<(String, Measured)> = vec![(
+            format!("walls passed, last {window}"),
+            RunResult::final_walls_passed,
+        )];
         if self.experiment.has_one_reward() {
             at_the_end.push((format!("return, last {window}"), RunResult::final_return));
         }
@@ -127,9 +146,24 @@ impl Findings<'_> {
                 .count();
             row.push(format!("{trained} of {}", self.of_arm(number).count()));
             row.push(self.until_trained(number, |at| at.episodes as f64, episodes, &count));
-            row.push(self.until_trained(number, |at| at.steps as f64, |run| run.summary.steps as f64, &count));
-            row.push(self.until_trained(number, |at| at.updates as f64, |run| run.summary.updates as f64, &count));
-            row.push(self.until_trained(number, |at| at.wall_secs, |run| run.summary.wall_secs, &time));
+            row.push(self.until_trained(
+                number,
+                |at| at.steps as f64,
+                |run| run.summary.steps as f64,
+                &count,
+            ));
+            row.push(self.until_trained(
+                number,
+                |at| at.updates as f64,
+                |run| run.summary.updates as f64,
+                &count,
+            ));
+            row.push(self.until_trained(
+                number,
+                |at| at.wall_secs,
+                |run| run.summary.wall_secs,
+                &time,
+            ));
             row.extend(self.measured(number, &measures));
             rows.push(row);
         }
@@ -206,10 +240,16 @@ impl Findings<'_> {
         whole: impl Fn(&RunResult) -> f64,
         show: &dyn Fn(f64) -> String,
     ) -> String {
-        self.until(arm, |result| result.summary.trained.as_ref().map(&at), whole, show)
+        self.until(
+            arm,
+            |result| result.summary.trained.as_ref().map(&at),
+            whole,
+            show,
+        )
     }
 
-    /// When the runs of an arm had `reached` something. A run that never had counts with the `whole` that it took, which is the least it would have taken.
+    /// When the runs of an arm had `reached` something. A run that never had counts with the
+    /// `whole` that it took, which is the least it would have taken.
     fn until(
         &self,
         arm: usize,
@@ -233,15 +273,19 @@ impl Findings<'_> {
                 let values: Vec<_> = self.of_arm(number).map(of).collect();
                 interquartile_mean(&values)
             };
-            let count =
-                |of: &dyn Fn(&RunResult) -> f64| mean(of).map_or(NOTHING.to_owned(), |value| format!("{value:.0}"));
+            let count = |of: &dyn Fn(&RunResult) -> f64| {
+                mean(of).map_or(NOTHING.to_owned(), |value| format!("{value:.0}"))
+            };
             let mut row = self.head(number, arm).to_vec();
             row.push(count(&|run| run.summary.episodes as f64));
             row.push(count(&|run| run.summary.steps as f64));
             row.push(count(&|run| run.summary.updates as f64));
             row.push(count(&|run| run.summary.vae_updates as f64));
             row.push(count(&|run| run.summary.evaluation_episodes as f64));
-            row.push(mean(&|run| run.summary.wall_secs).map_or(NOTHING.to_owned(), |secs| Clock(secs).to_string()));
+            row.push(
+                mean(&|run| run.summary.wall_secs)
+                    .map_or(NOTHING.to_owned(), |secs| Clock(secs).to_string()),
+            );
             rows.push(row);
         }
         let header = [
@@ -270,13 +314,15 @@ impl Findings<'_> {
         [arm.label.clone(), seeds]
     }
 
-    /// The estimate of what `of_run` says of the complete runs of an arm; `None` when it says nothing of one of them.
+    /// The estimate of what `of_run` says of the complete runs of an arm; `None` when it says
+    /// nothing of one of them.
     fn estimate(&self, arm: usize, of_run: impl Fn(&RunResult) -> Option<f64>) -> Option<Estimate> {
         self.bootstrap(arm, RESAMPLES)
             .interquartile_mean(&self.values(arm, of_run)?)
     }
 
-    /// What `of_run` says of each of the complete runs of an arm; `None` when it says nothing of one of them.
+    /// What `of_run` says of each of the complete runs of an arm; `None` when it says nothing of
+    /// one of them.
     fn values(&self, arm: usize, of_run: impl Fn(&RunResult) -> Option<f64>) -> Option<Vec<f64>> {
         self.of_arm(arm).map(of_run).collect()
     }
@@ -292,7 +338,11 @@ impl Findings<'_> {
 }
 
 pub(super) fn course_of<'a>(result: &'a RunResult, name: &str) -> Option<&'a CourseEvaluation> {
-    result.evaluation.courses.iter().find(|course| course.course == name)
+    result
+        .evaluation
+        .courses
+        .iter()
+        .find(|course| course.course == name)
 }
 
 fn rate(estimate: Estimate) -> String {
@@ -352,7 +402,11 @@ mod tests {
     #[test]
     fn columns_of_figures_are_aligned_right_for_those_who_render_it_too() {
         let row = |cells: [&str; 3]| cells.map(str::to_owned).to_vec();
-        let text = grid(row(["arm", "seeds", "R"]), vec![row(["one", "3", "0.5 [0.4, 0.6]"])], 1);
+        let text = grid(
+            row(["arm", "seeds", "R"]),
+            vec![row(["one", "3", "0.5 [0.4, 0.6]"])],
+            1,
+        );
         assert_eq!(
             text,
             "| arm | seeds |              R |\n|-----|------:|---------------:|\n| one |     3 | 0.5 [0.4, 0.6] |"
@@ -362,7 +416,15 @@ mod tests {
     #[test]
     fn an_interval_is_shown_where_there_is_one() {
         let show = |value: f64| format!("{value:.1}");
-        let of = |interval| with_interval(Estimate { value: 0.5, interval }, show);
+        let of = |interval| {
+            with_interval(
+                Estimate {
+                    value: 0.5,
+                    interval,
+                },
+                show,
+            )
+        };
         assert_eq!(
             (of(None), of(Some((0.25, 1.0)))),
             ("0.5".to_owned(), "0.5 [0.2, 1.0]".to_owned())

@@ -45,15 +45,27 @@ fn leave(run: &PlannedRun, suite: &[CourseEvaluation]) {
     fs::write(result, report(suite)).unwrap();
     fs::write(run.directory.evaluation_json(), report(&[])).unwrap();
     fs::write(run.directory.summary_json(), SUMMARY).unwrap();
-    fs::write(run.directory.episodes_csv(), "steps,walls_passed,return\n4,2,1.0\n").unwrap();
+    fs::write(
+        run.directory.episodes_csv(),
+        "steps,walls_passed,return\n4,2,1.0\n",
+    )
+    .unwrap();
 }
 
-/// An experiment in `folder` of one arm and two seeds, and its runs, which are complete: the first completed half of its calm episodes, the second all.
+/// An experiment in `folder` of one arm and two seeds, and its runs, which are complete: the first
+/// completed half of its calm episodes, the second all.
 fn two_runs(folder: &Path) -> (Experiment, Plan) {
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
-    let (base, course) = (configs.join("smoke.toml"), configs.join("courses/training.toml"));
+    let (base, course) = (
+        configs.join("smoke.toml"),
+        configs.join("courses/training.toml"),
+    );
     let entry = |name: &str| format!("[[entry]]\nname = \"{name}\"\ncourse = {course:?}\n");
-    let suite = format!("name = \"few\"\nepisodes = 4\n{}{}", entry("calm"), entry("windy"));
+    let suite = format!(
+        "name = \"few\"\nepisodes = 4\n{}{}",
+        entry("calm"),
+        entry("windy")
+    );
     fs::write(folder.join("few.toml"), suite).unwrap();
     let experiment = format!(
         "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\npaper_episodes = 4000\ncurves = []\n[settings]\nevaluation.window_episodes = 2\nlearning.warmup_steps = 20\nsac.batch_size = 16\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
@@ -68,7 +80,11 @@ fn two_runs(folder: &Path) -> (Experiment, Plan) {
     (experiment, plan)
 }
 
-fn findings<'a>(experiment: &'a Experiment, plan: &'a Plan, results: &'a [RunResult]) -> Findings<'a> {
+fn findings<'a>(
+    experiment: &'a Experiment,
+    plan: &'a Plan,
+    results: &'a [RunResult],
+) -> Findings<'a> {
     Findings {
         experiment,
         plan,
@@ -85,7 +101,11 @@ fn a_suite_is_told_entry_by_entry_over_the_seeds() {
         let runs = results::read(plan).unwrap();
         let findings = findings(&experiment, plan, &runs);
         let tables = findings.tables(TableKind::Suite);
-        assert!(tables[0].title.contains("`few.toml`"), "{}", tables[0].title);
+        assert!(
+            tables[0].title.contains("`few.toml`"),
+            "{}",
+            tables[0].title
+        );
         tables[0].table.clone()
     };
     assert_eq!(
@@ -119,12 +139,18 @@ fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
     let (one, several) = (told(), "**Of several builds**");
     let shortened = "**Shortened**: 300 training episodes a run instead of the 4000 of the paper.";
     assert!(one.contains(shortened), "{one}");
-    assert!(one.contains("Skein 0.\n") && !one.contains(several), "{one}");
+    assert!(
+        one.contains("Skein 0.\n") && !one.contains(several),
+        "{one}"
+    );
 
     let newer = SUMMARY.replace(r#""skein_version":"0""#, r#""skein_version":"0+b873565""#);
     fs::write(plan.runs[1].directory.summary_json(), newer).unwrap();
     let two = told();
-    assert!(two.contains("Skein 0, 0+b873565.\n") && two.contains(several), "{two}");
+    assert!(
+        two.contains("Skein 0, 0+b873565.\n") && two.contains(several),
+        "{two}"
+    );
 }
 
 #[test]
@@ -138,13 +164,17 @@ fn every_run_has_a_line_of_its_own() {
     fs::write(plan.runs[1].directory.summary_json(), learned).unwrap();
     let runs = results::read(&plan).unwrap();
     let file = folder.path().join("runs.csv");
-    findings(&experiment, &plan, &runs).write_runs(&file).unwrap();
+    findings(&experiment, &plan, &runs)
+        .write_runs(&file)
+        .unwrap();
     let mut reader = csv::Reader::from_path(file).unwrap();
     let header = reader.headers().unwrap().clone();
     let rows: Vec<_> = reader.records().map(Result::unwrap).collect();
     let column = |name: &str| {
         let place = header.iter().position(|column| column == name).unwrap();
-        rows.iter().map(|row| row[place].to_owned()).collect::<Vec<_>>()
+        rows.iter()
+            .map(|row| row[place].to_owned())
+            .collect::<Vec<_>>()
     };
     assert_eq!(column("seed"), ["1", "2"]);
     assert_eq!(column("policy_sha256"), ["", "ab"]);
@@ -152,10 +182,15 @@ fn every_run_has_a_line_of_its_own() {
     assert_eq!(column("R calm"), ["0.7500", "1.0000"]);
     assert_eq!(column("R windy"), ["0.2500", "0.2500"]);
     assert_eq!(column("trained_episodes"), ["", ""], "never");
-    assert_eq!(column("one_wall_episodes"), ["", ""], "one episode is not two");
+    assert_eq!(
+        column("one_wall_episodes"),
+        ["", ""],
+        "one episode is not two"
+    );
 }
 
-/// Two runs of ten episodes, told by hand: the first rises and is trained after six of them, the second never comes to a wall.
+/// Two runs of ten episodes, told by hand: the first rises and is trained after six of them, the
+/// second never comes to a wall.
 #[test]
 fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
     let folder = tempfile::tempdir().unwrap();
@@ -168,9 +203,13 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
         let counts = format!(r#""episodes":10,"steps":{steps},"updates":{updates}"#);
         SUMMARY
             .replace(r#""episodes":8,"steps":4,"updates":2"#, &counts)
-            .replace(r#""wall_secs":3.3}"#, &format!(r#""wall_secs":70.0{trained}}}"#))
+            .replace(
+                r#""wall_secs":3.3}"#,
+                &format!(r#""wall_secs":70.0{trained}}}"#),
+            )
     };
-    let trained = r#","trained":{"rate":0.95,"episodes":6,"steps":60,"updates":20,"wall_secs":30.0}"#;
+    let trained =
+        r#","trained":{"rate":0.95,"episodes":6,"steps":60,"updates":20,"wall_secs":30.0}"#;
     for (run, walls, steps, summary) in [
         (
             &plan.runs[0],
@@ -178,7 +217,12 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
             10,
             summary(100, 40, trained),
         ),
-        (&plan.runs[1], [0, 0, 1, 0, 0, 0, 0, 1, 0, 1], 20, summary(200, 60, "")),
+        (
+            &plan.runs[1],
+            [0, 0, 1, 0, 0, 0, 0, 1, 0, 1],
+            20,
+            summary(200, 60, ""),
+        ),
     ] {
         fs::write(run.directory.episodes_csv(), episodes(walls, steps)).unwrap();
         fs::write(run.directory.summary_json(), summary).unwrap();
@@ -195,8 +239,9 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
             .map(|cell| cell.trim().to_owned());
         cells.filter(|cell| !cell.is_empty()).collect::<Vec<_>>()
     };
-    // Averages of two episodes: 0, 2, 3, 2, 2.5, whose level is 2.5, and 0, 0.5, 0, 0.5, 0.5, whose is 0.5. Once risen they change by -1 and 0.5, and by -0.5, 0.5
-    // and 0: the root mean squares are 0.79 and 0.41, the interquartile ranges 0.75 and 0.5.
+    // Averages of two episodes: 0, 2, 3, 2, 2.5, whose level is 2.5, and 0, 0.5, 0, 0.5, 0.5, whose
+    // is 0.5. Once risen they change by -1 and 0.5, and by -0.5, 0.5 and 0: the root mean squares
+    // are 0.79 and 0.41, the interquartile ranges 0.75 and 0.5.
     let volatility = "0.60 [0.41, 0.79]";
     assert_eq!(
         row(TableKind::Learning),
@@ -225,7 +270,10 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
             "0.75 [0.50, 1.00]"
         ]
     );
-    assert_eq!(row(TableKind::Cost), ["A", "2", "10", "150", "50", "4", "4", "1:10"]);
+    assert_eq!(
+        row(TableKind::Cost),
+        ["A", "2", "10", "150", "50", "4", "4", "1:10"]
+    );
 
     let walls = |axis| runs[0].curve(Measure::WallsPassed, axis);
     let averages = [0.0, 0.5, 2.0, 3.0, 3.0, 2.5, 2.0, 2.0, 2.5];
@@ -244,7 +292,9 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
         over([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0])
     );
     assert_eq!(
-        runs.iter().map(RunResult::one_wall_after).collect::<Vec<_>>(),
+        runs.iter()
+            .map(RunResult::one_wall_after)
+            .collect::<Vec<_>>(),
         [Some(4.0), None]
     );
 }

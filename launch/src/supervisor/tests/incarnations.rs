@@ -30,13 +30,19 @@ fn a_learner_that_dies_is_started_again_and_its_actors_stay() {
             "kill -9 $$",
             "the learner was killed by signal 9; it is started again at once",
         ),
-        ("exit 101", "the learner panicked; it is started again at once"),
+        (
+            "exit 101",
+            "the learner panicked; it is started again at once",
+        ),
         (
             "exit 4",
             "the learner exited with status 4; it is started again at once",
         ),
     ] {
-        let stage = Stage::new(&first_incarnation(&format!("sleep 0.1; {death}")), FAITHFUL_ACTOR);
+        let stage = Stage::new(
+            &first_incarnation(&format!("sleep 0.1; {death}")),
+            FAITHFUL_ACTOR,
+        );
         fs::create_dir_all(stage.plan.run.checkpoints().join("episode-40")).unwrap();
         fs::create_dir(stage.plan.run.checkpoints().join(".writing")).unwrap();
         let (result, seen) = stage.run(never);
@@ -46,7 +52,13 @@ fn a_learner_that_dies_is_started_again_and_its_actors_stay() {
             format!("{told}, from its newest checkpoint\n"),
             "{death}"
         );
-        assert_eq!(seen.restarts, Restarts { learner: 1, actors: 0 });
+        assert_eq!(
+            seen.restarts,
+            Restarts {
+                learner: 1,
+                actors: 0
+            }
+        );
         assert_eq!(stage.processes(), 4, "two learners, two actors");
     }
 }
@@ -58,7 +70,8 @@ fn a_learner_that_never_gets_further_fails_the_run() {
     let (result, seen) = stage.run(never);
     let error = result.unwrap_err().to_string();
     assert!(
-        error.contains("died 10 times without getting any further") && error.contains("always here"),
+        error.contains("died 10 times without getting any further")
+            && error.contains("always here"),
         "{error}"
     );
     assert_eq!((seen.restarts.learner, stage.processes()), (9, 12));
@@ -88,13 +101,17 @@ fn an_actor_that_is_killed_before_it_is_of_use_is_always_started_again() {
 
 #[test]
 fn a_frozen_learner_is_killed_and_started_again() {
-    for first in ["kill -STOP $$", "trap '' TERM; while :; do sleep 0.02; done"] {
+    for first in [
+        "kill -STOP $$",
+        "trap '' TERM; while :; do sleep 0.02; done",
+    ] {
         let mut stage = Stage::new(&first_incarnation(first), FAITHFUL_ACTOR);
         stage.plan.deadlines.learner_silence = Duration::from_millis(300);
         let (result, seen) = stage.run(never);
         assert_eq!(result.unwrap(), Ended::Finished);
         assert!(
-            seen.warnings.contains("has not reported for 0 s: it is killed"),
+            seen.warnings
+                .contains("has not reported for 0 s: it is killed"),
             "{}",
             seen.warnings
         );
@@ -104,7 +121,8 @@ fn a_frozen_learner_is_killed_and_started_again() {
 
 #[test]
 fn a_learner_that_hangs_before_its_first_report_is_started_again() {
-    let hangs_once = "if mkdir $dir/died 2>/dev/null; then kill -STOP $$; fi; report 2; touch $dir/stop";
+    let hangs_once =
+        "if mkdir $dir/died 2>/dev/null; then kill -STOP $$; fi; report 2; touch $dir/stop";
     let mut stage = Stage::new(hangs_once, FAITHFUL_ACTOR);
     stage.plan.deadlines.learner_start = Duration::from_millis(300);
     let (result, seen) = stage.run(never);
@@ -114,7 +132,8 @@ fn a_learner_that_hangs_before_its_first_report_is_started_again() {
 
 #[test]
 fn actors_that_left_for_want_of_a_learner_come_back_with_it() {
-    // The first incarnation of the actors ends with that of the learner, which takes a while to come back.
+    // The first incarnation of the actors ends with that of the learner, which takes a while to
+    // come back.
     let actor = format!(
         "while [ ! -e $dir/died ]; do sleep 0.02; done; if mkdir $dir/left-$id 2>/dev/null; then exit 3; fi; touch $dir/back-$id; {FAITHFUL_ACTOR}"
     );
@@ -125,7 +144,8 @@ fn actors_that_left_for_want_of_a_learner_come_back_with_it() {
     let (result, seen) = Stage::new(learner, &actor).run(never);
     assert_eq!(result.unwrap(), Ended::Finished);
     assert!(
-        seen.warnings.contains("actor 0 heard nothing of the learner and left"),
+        seen.warnings
+            .contains("actor 0 heard nothing of the learner and left"),
         "{}",
         seen.warnings
     );
@@ -143,7 +163,11 @@ fn actors_that_were_sent_home_come_back_with_a_learner_that_died_before_the_end(
     let stage = Stage::new(learner, actor);
     let (result, _) = stage.run(never);
     assert_eq!(result.unwrap(), Ended::Finished);
-    assert_eq!(stage.processes(), 6, "two learners, and two actors for each");
+    assert_eq!(
+        stage.processes(),
+        6,
+        "two learners, and two actors for each"
+    );
 }
 
 #[test]
@@ -167,10 +191,10 @@ fn an_actor_that_the_learner_has_not_heard_of_for_long_is_killed_and_started_aga
 
 #[test]
 fn actors_that_are_of_use_are_started_again_as_often_as_they_die() {
-    // Five deaths of one actor while the run gets on: one that is of no use is given up after as many.
+    // Five deaths of one actor while the run gets on: one that is of no use is given up after as
+    // many.
     let actor = format!("if [ $id = 0 ]; then sleep 0.1; kill -9 $$; fi; {FAITHFUL_ACTOR}");
-    let learner =
-        "n=0; while [ $(wc -l < $dir/pids) -lt 8 ]; do n=$((n+1)); report $n; sleep 0.05; done; touch $dir/stop";
+    let learner = "n=0; while [ $(wc -l < $dir/pids) -lt 8 ]; do n=$((n+1)); report $n; sleep 0.05; done; touch $dir/stop";
     let stage = Stage::new(learner, &actor);
     let (result, seen) = stage.run(never);
     assert_eq!(result.unwrap(), Ended::Finished);
@@ -186,5 +210,8 @@ fn a_stall_is_told_once() {
     let learner = r#"report 1; for i in 1 2 3; do report 1 '[0,1],"stalled":"the learner waits for a disk"'; done; report 2; touch $dir/stop"#;
     let (result, seen) = Stage::new(learner, FAITHFUL_ACTOR).run(never);
     assert_eq!(result.unwrap(), Ended::Finished);
-    assert_eq!(seen.warnings, "nothing moves: the learner waits for a disk\n");
+    assert_eq!(
+        seen.warnings,
+        "nothing moves: the learner waits for a disk\n"
+    );
 }

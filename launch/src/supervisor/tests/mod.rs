@@ -33,13 +33,15 @@ impl Watcher for Seen {
     }
 }
 
-/// A shell function that reports so many updates, and these actors, both of them unless told otherwise.
+/// A shell function that reports so many updates, and these actors, both of them unless told
+/// otherwise.
 const REPORT: &str = r#"report() { echo '{"phase":"flying","episodes":7,"total_episodes":9,"evaluation_episodes":[0,0],"steps":1,"updates":'$1',"vae_updates":0,"steps_per_sec":1.0,"updates_per_sec":0.0,"walls_passed":null,"mean_return":null,"temperature":null,"vae_loss":null,"actors":2,"live_actors":'${2:-[0,1]}',"elapsed_secs":1.0}'; }"#;
 
 /// An actor that flies until the learner's script says stop.
 const FAITHFUL_ACTOR: &str = "while [ ! -e $dir/stop ]; do sleep 0.02; done";
 /// A learner that runs until it is told to stop.
-const ENDLESS_LEARNER: &str = "trap 'touch $dir/saved $dir/stop; exit 0' TERM; report 0; while :; do sleep 0.02; done";
+const ENDLESS_LEARNER: &str =
+    "trap 'touch $dir/saved $dir/stop; exit 0' TERM; report 0; while :; do sleep 0.02; done";
 
 struct Stage {
     directory: TempDir,
@@ -47,8 +49,8 @@ struct Stage {
 }
 
 impl Stage {
-    /// Two actors and a learner, given as shell commands that find the run's directory in `$dir` and the actor's id in `$id`. Each notes its process
-    /// id in the directory.
+    /// Two actors and a learner, given as shell commands that find the run's directory in `$dir`
+    /// and the actor's id in `$id`. Each notes its process id in the directory.
     fn new(learner: &str, actor: &str) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
@@ -116,14 +118,18 @@ impl Stage {
 
     /// The processes that were started.
     fn processes(&self) -> usize {
-        fs::read_to_string(self.directory.path().join("pids")).map_or(0, |pids| pids.lines().count())
+        fs::read_to_string(self.directory.path().join("pids"))
+            .map_or(0, |pids| pids.lines().count())
     }
 
     /// Neither a process nor a zombie of those that were started.
     fn assert_nothing_is_left(&self) {
         let pids = fs::read_to_string(self.directory.path().join("pids")).unwrap();
         for pid in pids.lines() {
-            assert!(!Path::new("/proc").join(pid).exists(), "process {pid} is left");
+            assert!(
+                !Path::new("/proc").join(pid).exists(),
+                "process {pid} is left"
+            );
         }
     }
 }
@@ -252,7 +258,10 @@ fn a_program_that_cannot_be_started_leaves_nothing_behind() {
     let error = runtime
         .block_on(run(&stage.plan, &mut interrupts, &mut Seen::default()))
         .unwrap_err();
-    assert!(error.to_string().contains("/nowhere/skein-actor"), "{error}");
+    assert!(
+        error.to_string().contains("/nowhere/skein-actor"),
+        "{error}"
+    );
     if stage.has("pids") {
         stage.assert_nothing_is_left();
     }
@@ -279,7 +288,10 @@ fn actors_that_find_no_learner_are_not_started_again() {
     let error = result.unwrap_err().to_string();
     assert_eq!(
         error,
-        format!("the learner of {} is gone", stage.directory.path().display())
+        format!(
+            "the learner of {} is gone",
+            stage.directory.path().display()
+        )
     );
     assert_eq!(stage.processes(), 2);
 }
@@ -292,7 +304,8 @@ fn attached_actors_that_cannot_leave_are_ended_after_the_run() {
     assert_eq!(result.unwrap(), Ended::Finished);
 }
 
-/// A learner that goes on reporting for a second after it is told to stop, with `$n` counting up, and then saves.
+/// A learner that goes on reporting for a second after it is told to stop, with `$n` counting up,
+/// and then saves.
 fn slow_to_stop(report: &str) -> Stage {
     let learner = format!(
         "trap 'told=1' TERM; n=0; report 0; while [ -z $told ]; do sleep 0.02; done

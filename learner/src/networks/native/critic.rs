@@ -1,4 +1,5 @@
-//! A critic's two estimates of Q on the kernels, from one network with two outputs or from two networks with one.
+//! A critic's two estimates of Q on the kernels, from one network with two outputs or from two
+//! networks with one.
 
 use std::ops::Range;
 
@@ -39,25 +40,41 @@ impl NativeCritic {
     /// Places for what is computed of so many rows.
     pub fn places(&self, rows: usize) -> CriticLayers {
         CriticLayers {
-            networks: (0..self.networks).map(|_| self.network.places(rows)).collect(),
+            networks: (0..self.networks)
+                .map(|_| self.network.places(rows))
+                .collect(),
             values: vec![0.0; rows * ESTIMATES],
         }
     }
 
     /// Both estimates for `joined`, `[rows, observation + 2]`, and what the layers gave on the way.
-    pub fn forward(&self, team: &mut Team, parameters: &[f32], joined: &[f32], given: &mut CriticLayers) {
+    pub fn forward(
+        &self,
+        team: &mut Team,
+        parameters: &[f32],
+        joined: &[f32],
+        given: &mut CriticLayers,
+    ) {
         for (number, layers) in given.networks.iter_mut().enumerate() {
-            self.network.forward(team, self.of(number, parameters), joined, layers);
+            self.network
+                .forward(team, self.of(number, parameters), joined, layers);
             scatter(output(layers), number, &mut given.values);
         }
     }
 
     /// Both estimates alone, `[rows, 2]`.
-    pub fn forward_through(&self, team: &mut Team, parameters: &[f32], joined: &[f32], values: &mut [f32]) {
+    pub fn forward_through(
+        &self,
+        team: &mut Team,
+        parameters: &[f32],
+        joined: &[f32],
+        values: &mut [f32],
+    ) {
         let mut own = vec![0.0; values.len() / self.networks];
         for number in 0..self.networks {
             let parameters = self.of(number, parameters);
-            self.network.forward_through(team, parameters, joined, &mut own);
+            self.network
+                .forward_through(team, parameters, joined, &mut own);
             scatter(&own, number, values);
         }
     }
@@ -81,7 +98,8 @@ impl NativeCritic {
         }
     }
 
-    /// What flows back to some columns of the input, `[rows, columns]`, from what flows to the estimates, `[rows, 2]`.
+    /// What flows back to some columns of the input, `[rows, columns]`, from what flows to the
+    /// estimates, `[rows, 2]`.
     pub fn backward_through(
         &self,
         team: &mut Team,
@@ -113,7 +131,10 @@ impl NativeCritic {
 /// Writes what network `number` gave, `[rows, estimates of it]`, to its place among the estimates.
 fn scatter(own: &[f32], number: usize, values: &mut [f32]) {
     let each = ESTIMATES * own.len() / values.len();
-    for (own, values) in own.chunks_exact(each).zip(values.chunks_exact_mut(ESTIMATES)) {
+    for (own, values) in own
+        .chunks_exact(each)
+        .zip(values.chunks_exact_mut(ESTIMATES))
+    {
         values[number * each..][..each].copy_from_slice(own);
     }
 }
@@ -121,7 +142,10 @@ fn scatter(own: &[f32], number: usize, values: &mut [f32]) {
 /// Reads what network `number` gave from among the estimates: the other way round.
 fn gather(values: &[f32], number: usize, own: &mut [f32]) {
     let each = ESTIMATES * own.len() / values.len();
-    for (own, values) in own.chunks_exact_mut(each).zip(values.chunks_exact(ESTIMATES)) {
+    for (own, values) in own
+        .chunks_exact_mut(each)
+        .zip(values.chunks_exact(ESTIMATES))
+    {
         own.copy_from_slice(&values[number * each..][..each]);
     }
 }

@@ -1,8 +1,10 @@
 //! Fully connected networks with ReLU between their layers, forward and backward, on the kernels.
 //!
-//! An update's numbers are more than the nearer caches hold, and what has to be fetched from memory is what it waits for. So rows go through all layers some hundred at
-//! a time: what a layer gives is still there when the next one takes it; what nobody needs later is written over by the next rows; and weights are packed when their turn
-//! comes, not beforehand. Which rows go together, and which member of the team takes them, changes no bit.
+//! An update's numbers are more than the nearer caches hold, and what has to be fetched from memory
+//! is what it waits for. So rows go through all layers some hundred at a time: what a layer gives
+//! is still there when the next one takes it; what nobody needs later is written over by the next
+//! rows; and weights are packed when their turn comes, not beforehand. Which rows go together, and
+//! which member of the team takes them, changes no bit.
 
 use std::cell::RefCell;
 use std::ops::Range;
@@ -18,7 +20,8 @@ const ROW_GRAIN: usize = 12;
 /// Columns of a bias's gradient that stay with one member.
 const COLUMN_GRAIN: usize = 64;
 
-/// What there is of each layer for so many rows, `[rows, outputs]` each: what it gave, or what flows back to its sums.
+/// What there is of each layer for so many rows, `[rows, outputs]` each: what it gave, or what
+/// flows back to its sums.
 pub type Layers = Vec<Vec<f32>>;
 
 thread_local! {
@@ -72,7 +75,10 @@ impl Dense {
 
     /// Places for what each layer gives for so many rows.
     pub fn places(&self, rows: usize) -> Layers {
-        let places = self.layers.iter().map(|layer| vec![0.0; rows * layer.outputs]);
+        let places = self
+            .layers
+            .iter()
+            .map(|layer| vec![0.0; rows * layer.outputs]);
         places.collect()
     }
 
@@ -88,7 +94,11 @@ impl Dense {
     fn layer_forward(&self, index: usize, parameters: &[f32], input: &[f32], output: &mut [f32]) {
         let layer = &self.layers[index];
         let last = index + 1 == self.layers.len();
-        let finish = if last { Finish::Plain } else { Finish::Rectified };
+        let finish = if last {
+            Finish::Plain
+        } else {
+            Finish::Rectified
+        };
         let bias = Start::Bias(&parameters[layer.bias.clone()]);
         product_once(
             self.isa,
@@ -101,9 +111,23 @@ impl Dense {
     }
 
     /// ∂zᵢ₋₁ = ∂zᵢ Wᵢ where hᵢ₋₁ > 0.
-    fn layer_backward(&self, index: usize, parameters: &[f32], grad: &[f32], before: &[f32], into: &mut [f32]) {
+    fn layer_backward(
+        &self,
+        index: usize,
+        parameters: &[f32],
+        grad: &[f32],
+        before: &[f32],
+        into: &mut [f32],
+    ) {
         let weights = self.layers[index].weights(parameters);
-        product_once(self.isa, grad, weights, Start::Zero, Finish::Gated(before), into);
+        product_once(
+            self.isa,
+            grad,
+            weights,
+            Start::Zero,
+            Finish::Gated(before),
+            into,
+        );
     }
 
     /// h₀ = `input`, `[rows, inputs]`; fills `given` with all hᵢ.
@@ -122,15 +146,24 @@ impl Dense {
     }
 
     /// [`Dense::forward`] of which only the last layer's is kept, in `output`.
-    pub fn forward_through(&self, team: &mut Team, parameters: &[f32], input: &[f32], output: &mut [f32]) {
+    pub fn forward_through(
+        &self,
+        team: &mut Team,
+        parameters: &[f32],
+        input: &[f32],
+        output: &mut [f32],
+    ) {
         let rows_each = rows_each(output.len() / self.outputs(), team.size());
         let mut parts: Vec<_> = output.chunks_mut(rows_each * self.outputs()).collect();
         team.split_rows(&mut parts, 1, 1, |first, parts| {
-            let inputs = input[first * rows_each * self.inputs()..].chunks(rows_each * self.inputs());
+            let inputs =
+                input[first * rows_each * self.inputs()..].chunks(rows_each * self.inputs());
             for (output, input) in parts.iter_mut().zip(inputs) {
                 let rows = output.len() / self.outputs();
                 PASSING.with_borrow_mut(|[before, after]| {
-                    let [hidden @ .., _] = &self.layers[..] else { return };
+                    let [hidden @ .., _] = &self.layers[..] else {
+                        return;
+                    };
                     for (index, layer) in hidden.iter().enumerate() {
                         let from: &[f32] = if index == 0 { input } else { &*before };
                         after.resize(rows * layer.outputs, 0.0);
@@ -144,7 +177,8 @@ impl Dense {
         });
     }
 
-    /// What flows back to each layer's sums zᵢ = hᵢ₋₁ Wᵢᵀ + bᵢ. The last of `grad` is given, the others are filled. `given`: what the layers gave for the same rows.
+    /// What flows back to each layer's sums zᵢ = hᵢ₋₁ Wᵢᵀ + bᵢ. The last of `grad` is given, the
+    /// others are filled. `given`: what the layers gave for the same rows.
     pub fn backward(&self, team: &mut Team, parameters: &[f32], given: &Layers, grad: &mut Layers) {
         let rows = grad[0].len() / self.layers[0].outputs;
         let mut parts = self.parts(rows, team.size(), grad);
@@ -154,14 +188,16 @@ impl Dense {
                     let [into, from] = &mut layers[index - 1..=index] else {
                         unreachable!("two layers side by side")
                     };
-                    let before = &given[index - 1][*first * self.layers[index - 1].outputs..][..into.len()];
+                    let before =
+                        &given[index - 1][*first * self.layers[index - 1].outputs..][..into.len()];
                     self.layer_backward(index, parameters, from, before, into);
                 }
             }
         });
     }
 
-    /// What flows back to some columns of the input, `[rows, columns]`, from what flows to the last layer's sums, `[rows, outputs]`. `given`: as for [`Dense::backward`].
+    /// What flows back to some columns of the input, `[rows, columns]`, from what flows to the last
+    /// layer's sums, `[rows, outputs]`. `given`: as for [`Dense::backward`].
     pub fn backward_through(
         &self,
         team: &mut Team,
@@ -178,7 +214,9 @@ impl Dense {
                 let (start, rows) = ((first + part) * rows_each, into.len() / columns.len());
                 PASSING.with_borrow_mut(|[from, to]| {
                     from.clear();
-                    from.extend_from_slice(&grad[start * self.outputs()..][..rows * self.outputs()]);
+                    from.extend_from_slice(
+                        &grad[start * self.outputs()..][..rows * self.outputs()],
+                    );
                     for index in (1..self.layers.len()).rev() {
                         let width = self.layers[index - 1].outputs;
                         to.resize(rows * width, 0.0);
@@ -186,15 +224,25 @@ impl Dense {
                         self.layer_backward(index, parameters, from, before, to);
                         std::mem::swap(from, to);
                     }
-                    let weights = self.layers[0].weights(parameters).columns_of(columns.clone());
+                    let weights = self.layers[0]
+                        .weights(parameters)
+                        .columns_of(columns.clone());
                     product_once(self.isa, from, weights, Start::Zero, Finish::Plain, into);
                 });
             }
         });
     }
 
-    /// The gradient of all parameters, summed over rows: ∂Wᵢ = ∂zᵢᵀ hᵢ₋₁, ∂bᵢ = Σ ∂zᵢ. `given` and `grad`: of as many rows as `input`.
-    pub fn gradient(&self, team: &mut Team, input: &[f32], given: &Layers, grad: &Layers, into: &mut [f32]) {
+    /// The gradient of all parameters, summed over rows: ∂Wᵢ = ∂zᵢᵀ hᵢ₋₁, ∂bᵢ = Σ ∂zᵢ. `given` and
+    /// `grad`: of as many rows as `input`.
+    pub fn gradient(
+        &self,
+        team: &mut Team,
+        input: &[f32],
+        given: &Layers,
+        grad: &Layers,
+        into: &mut [f32],
+    ) {
         for (index, layer) in self.layers.iter().enumerate() {
             let (grad, inputs) = (&grad[index], layer.inputs);
             let input = if index == 0 { input } else { &given[index - 1] };

@@ -51,14 +51,21 @@ impl Learned {
     pub fn parts(&mut self, name: &str, adam: &str) -> Vec<(String, Part<'_>)> {
         vec![
             (name.to_owned(), Part::Numbers(&mut self.values)),
-            (format!("{adam}.first_moment"), Part::Numbers(&mut self.first_moment)),
-            (format!("{adam}.second_moment"), Part::Numbers(&mut self.second_moment)),
+            (
+                format!("{adam}.first_moment"),
+                Part::Numbers(&mut self.first_moment),
+            ),
+            (
+                format!("{adam}.second_moment"),
+                Part::Numbers(&mut self.second_moment),
+            ),
             (format!("{adam}.steps"), Part::Count(&mut self.steps)),
         ]
     }
 }
 
-/// Squared length of a gradient: infinite or not a number if one of its numbers is, or if it overflows. Sixteen sums side by side, the same on every processor.
+/// Squared length of a gradient: infinite or not a number if one of its numbers is, or if it
+/// overflows. Sixteen sums side by side, the same on every processor.
 pub fn squared_norm(isa: Isa, gradient: &[f32]) -> f32 {
     isa.vectorised(
         #[inline(always)]

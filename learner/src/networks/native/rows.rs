@@ -23,7 +23,11 @@ pub fn pair(values: &[f32], row: usize) -> [f32; ESTIMATES] {
 
 /// The smaller estimate; not a number if one of them is none.
 pub fn smaller([one, other]: [f32; ESTIMATES]) -> f32 {
-    if one < other || one.is_nan() { one } else { other }
+    if one < other || one.is_nan() {
+        one
+    } else {
+        other
+    }
 }
 
 /// Moves a target network by the share `rate` towards its leader.

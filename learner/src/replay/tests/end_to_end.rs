@@ -1,4 +1,5 @@
-//! Images that a policy learns from: those of the transitions, however often the rings have gone round, and not many more.
+//! Images that a policy learns from: those of the transitions, however often the rings have gone
+//! round, and not many more.
 
 use skein_protocol::config::EncoderTraining;
 
@@ -72,7 +73,10 @@ fn a_minibatch_has_the_images_of_its_transitions_however_often_the_ring_goes_rou
             assert!(restored.state() == replay.state() && draw(&restored, number) == batch);
             replay = restored;
         }
-        assert!(stored > 3 * most && swept > 3, "{stored} images, swept {swept} times");
+        assert!(
+            stored > 3 * most && swept > 3,
+            "{stored} images, swept {swept} times"
+        );
         assert!(replay.success_len() > 0 && replay.len() > replay.success_len());
     }
 }
@@ -85,7 +89,10 @@ fn a_buffer_restored_at_any_time_comes_to_hold_the_same() {
         undisturbed.insert(flown(number)).unwrap();
         restored.insert(flown(number)).unwrap();
         restored = Replay::restore(&config, restored.state()).unwrap();
-        assert!(restored.state() == undisturbed.state(), "after episode {number}");
+        assert!(
+            restored.state() == undisturbed.state(),
+            "after episode {number}"
+        );
     }
 }
 
@@ -118,7 +125,10 @@ fn an_episode_that_is_needed_whole_is_never_copied() {
         let after = replay.state().images.unwrap();
         // The newest but one lies where it lay, also if the others were swept.
         let newest = after.len() - 2;
-        assert!(Arc::ptr_eq(&after[newest], before.last().unwrap()), "episode {number}");
+        assert!(
+            Arc::ptr_eq(&after[newest], before.last().unwrap()),
+            "episode {number}"
+        );
     }
 }
 
@@ -127,7 +137,12 @@ fn while_a_policy_learns_from_images_an_episode_or_a_checkpoint_without_them_is_
     let config = end_to_end(60);
     let mut replay = Replay::new(&config);
     let error = replay.insert(flown(4).without_images()).unwrap_err();
-    assert_eq!(error, InsertError::NoImages { episode: EpisodeId(4) });
+    assert_eq!(
+        error,
+        InsertError::NoImages {
+            episode: EpisodeId(4)
+        }
+    );
     replay.insert(flown(4)).unwrap();
     let mut state = replay.state();
     state.images = None;
@@ -135,5 +150,8 @@ fn while_a_policy_learns_from_images_an_episode_or_a_checkpoint_without_them_is_
     state.regular.images.clear();
     let error = Replay::restore(&config, state).unwrap_err();
     assert_eq!(error.part, "depth images");
-    assert!(error.problem.contains("the policy learns from them"), "{error}");
+    assert!(
+        error.problem.contains("the policy learns from them"),
+        "{error}"
+    );
 }

@@ -55,7 +55,11 @@ fn a_minibatch_holds_the_configured_share_of_success() {
     let mut batch = Minibatch::default();
     for (count, success) in [(256, 64), (8, 2), (2, 1), (1, 0)] {
         replay.sample(&mut Pcg64Mcg::seed_from_u64(1), count, &mut batch);
-        let marked = batch.rewards.iter().filter(|&&reward| reward == 10.07).count();
+        let marked = batch
+            .rewards
+            .iter()
+            .filter(|&&reward| reward == 10.07)
+            .count();
         assert_eq!((batch.rewards.len(), marked), (count, success));
         assert_eq!(batch.observations.len(), count * LATENT);
         assert_eq!(batch.next_observations.len(), count * LATENT);
@@ -69,7 +73,8 @@ fn in_segments(episode: &CommittedEpisode, steps: usize) -> Vec<CommittedEpisode
     let segment = |first: usize| {
         let end = (first + steps).min(episode.steps());
         let is_last = end == episode.steps();
-        let images = &episode.depth.as_ref().unwrap()[first * IMAGE_PIXELS..(end + 1) * IMAGE_PIXELS];
+        let images =
+            &episode.depth.as_ref().unwrap()[first * IMAGE_PIXELS..(end + 1) * IMAGE_PIXELS];
         CommittedEpisode {
             first_step: first,
             action_before: first
@@ -90,7 +95,11 @@ fn in_segments(episode: &CommittedEpisode, steps: usize) -> Vec<CommittedEpisode
 
 #[test]
 fn an_episode_stored_in_segments_is_the_episode_stored_whole() {
-    for (steps, outcome) in [(1, Outcome::Collided), (3, Outcome::TimedOut), (7, Outcome::ReachedEnd)] {
+    for (steps, outcome) in [
+        (1, Outcome::Collided),
+        (3, Outcome::TimedOut),
+        (7, Outcome::ReachedEnd),
+    ] {
         let config = config(1000, Observation::LatentVelocityAction);
         let (mut whole, mut segments) = (Replay::new(&config), Replay::new(&config));
         for number in 0..3 {
@@ -100,7 +109,9 @@ fn an_episode_stored_in_segments_is_the_episode_stored_whole() {
             let mut joined = parts[0].without_images();
             parts[1..].iter().for_each(|segment| joined.extend(segment));
             assert_eq!(joined, flown.without_images());
-            parts.into_iter().for_each(|segment| segments.insert(segment).unwrap());
+            parts
+                .into_iter()
+                .for_each(|segment| segments.insert(segment).unwrap());
             whole.insert(flown).unwrap();
         }
         assert_eq!(segments.state(), whole.state());
@@ -162,7 +173,11 @@ fn without_a_success_share_the_whole_buffer_is_one_part_that_knows_no_success() 
     replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 20_000, &mut batch);
     // The level-up of the newest episode is one transition of a thousand.
     let level_up = 49_007.0_f32 / 100.0;
-    let drawn = batch.rewards.iter().filter(|&&reward| reward == level_up).count();
+    let drawn = batch
+        .rewards
+        .iter()
+        .filter(|&&reward| reward == level_up)
+        .count();
     assert!((5..50).contains(&drawn), "{drawn}");
     assert_eq!(
         Replay::restore(&config, replay.state()).unwrap().state(),
@@ -183,7 +198,10 @@ fn every_transition_of_a_part_is_equally_likely() {
             .filter(|&&reward| reward == step as f32 / 100.0)
             .count();
         // Five standard deviations of a binomial count of 100,000 draws at 1/10.
-        assert!(drawn.abs_diff(10_000) < 475, "step {step} was drawn {drawn} times");
+        assert!(
+            drawn.abs_diff(10_000) < 475,
+            "step {step} was drawn {drawn} times"
+        );
     }
 }
 
@@ -191,7 +209,9 @@ fn every_transition_of_a_part_is_equally_likely() {
 fn a_minibatch_is_a_function_of_content_and_seed() {
     let mut replay = frozen(&config(100, Observation::LatentVelocity));
     for number in 0..20 {
-        replay.insert(episode(number, 9, Outcome::Collided)).unwrap();
+        replay
+            .insert(episode(number, 9, Outcome::Collided))
+            .unwrap();
     }
     let draw = |seed| {
         let mut batch = Minibatch::default();
@@ -208,7 +228,9 @@ fn rows_of_a_minibatch_belong_together() {
     config.learning.critic_input = CriticInput::GroundTruth;
     let mut replay = frozen(&config);
     for number in 0..20 {
-        replay.insert(episode(number, 9, Outcome::Collided)).unwrap();
+        replay
+            .insert(episode(number, 9, Outcome::Collided))
+            .unwrap();
     }
     let mut batch = Minibatch::default();
     replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 64, &mut batch);
@@ -223,14 +245,21 @@ fn rows_of_a_minibatch_belong_together() {
             "the next observation is one step later in the same episode"
         );
         assert_eq!(batch.rewards[index], at / 100.0);
-        for (states, seen) in [(&batch.true_states, observation), (&batch.next_true_states, next)] {
+        for (states, seen) in [
+            (&batch.true_states, observation),
+            (&batch.next_true_states, next),
+        ] {
             let state = &states[index * TRUE_STATE..][..TRUE_STATE];
             assert_eq!(
                 state[17..19],
                 seen[LATENT..LATENT + 2],
                 "the critic is told of the same moment"
             );
-            assert_eq!(state[21..], seen[LATENT + 2..], "and of the action before it");
+            assert_eq!(
+                state[21..],
+                seen[LATENT + 2..],
+                "and of the action before it"
+            );
         }
         assert_eq!(
             batch.actions[2 * index..2 * index + 2],
@@ -250,7 +279,9 @@ fn a_truncated_episode_is_not_terminated_anywhere() {
     ] {
         let mut replay = frozen(&config(100, Observation::Latent));
         replay.insert(episode(1, 6, outcome)).unwrap();
-        let terminated: Vec<_> = (0..6).map(|slot| replay.regular.row(slot).terminated).collect();
+        let terminated: Vec<_> = (0..6)
+            .map(|slot| replay.regular.row(slot).terminated)
+            .collect();
         assert_eq!(terminated, [0.0, 0.0, 0.0, 0.0, 0.0, expected]);
     }
 }
@@ -262,16 +293,25 @@ fn memory_is_bounded_and_set_aside_once() {
     replay.insert(episode(0, 1, Outcome::Collided)).unwrap();
     let first_row = replay.regular.row(0).observation.as_ptr();
     for number in 1..100 {
-        replay.insert(episode(number, 9, Outcome::Collided)).unwrap();
+        replay
+            .insert(episode(number, 9, Outcome::Collided))
+            .unwrap();
     }
-    assert_eq!(replay.len(), 48, "the regular part is full, the success part empty");
+    assert_eq!(
+        replay.len(),
+        48,
+        "the regular part is full, the success part empty"
+    );
     assert_eq!(
         replay.regular.row(0).observation.as_ptr(),
         first_row,
         "no growth moved the rows"
     );
     let state = replay.state().regular;
-    assert_eq!((state.rows.len(), state.images.len()), (48 * (2 * LATENT + 4), 0));
+    assert_eq!(
+        (state.rows.len(), state.images.len()),
+        (48 * (2 * LATENT + 4), 0)
+    );
 }
 
 #[test]
@@ -281,7 +321,9 @@ fn more_images_than_training_can_need_are_refused_and_nothing_is_stored() {
     config.learning.episodes_per_epoch = 1;
     config.transport.max_records_per_episode = 20;
     let mut replay = Replay::new(&config);
-    replay.insert(with_images(episode(0, 30, Outcome::Collided))).unwrap();
+    replay
+        .insert(with_images(episode(0, 30, Outcome::Collided)))
+        .unwrap();
     let before = replay.state();
     let error = replay
         .insert(with_images(episode(1, 9, Outcome::Collided)))
@@ -305,17 +347,26 @@ fn more_images_than_training_can_need_are_refused_and_nothing_is_stored() {
 fn an_episode_without_images_is_refused_while_the_vae_is_trained() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
     let error = replay.insert(episode(7, 3, Outcome::Collided)).unwrap_err();
-    assert_eq!(error, InsertError::NoImages { episode: EpisodeId(7) });
+    assert_eq!(
+        error,
+        InsertError::NoImages {
+            episode: EpisodeId(7)
+        }
+    );
     assert!(replay.is_empty());
 }
 
 #[test]
 fn images_are_dropped_when_the_vae_is_frozen_and_no_more_are_taken() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
-    replay.insert(with_images(episode(0, 5, Outcome::Collided))).unwrap();
+    replay
+        .insert(with_images(episode(0, 5, Outcome::Collided)))
+        .unwrap();
     assert_eq!(replay.image_count(), Some(6));
     replay.freeze();
-    replay.insert(with_images(episode(1, 5, Outcome::Collided))).unwrap();
+    replay
+        .insert(with_images(episode(1, 5, Outcome::Collided)))
+        .unwrap();
     assert_eq!(replay.image_count(), None);
     assert_eq!(replay.state().images, None);
 }
@@ -341,7 +392,9 @@ fn the_encoder_sees_pieces_of_one_size_whatever_the_episodes_lengths() {
 #[test]
 fn a_failed_encoder_leaves_everything_as_it_was() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
-    replay.insert(with_images(episode(0, 5, Outcome::Collided))).unwrap();
+    replay
+        .insert(with_images(episode(0, 5, Outcome::Collided)))
+        .unwrap();
     let before = replay.state();
     let mut calls = 0;
     let result = replay.renew_latents(4, |images| {
@@ -367,7 +420,10 @@ fn sampled_images_are_those_of_the_episodes_closing_ones_included() {
     let mut images = Vec::new();
     replay.sample_images(&mut Pcg64Mcg::seed_from_u64(3), 200, &mut images);
     assert_eq!(images.len(), 200 * IMAGE_PIXELS);
-    let mut drawn: Vec<_> = images.chunks_exact(IMAGE_PIXELS).map(|image| image[0]).collect();
+    let mut drawn: Vec<_> = images
+        .chunks_exact(IMAGE_PIXELS)
+        .map(|image| image[0])
+        .collect();
     drawn.sort_unstable();
     drawn.dedup();
     let mut expected: Vec<_> = (0..3)
@@ -381,8 +437,11 @@ fn sampled_images_are_those_of_the_episodes_closing_ones_included() {
 fn content_of_another_shape_is_not_restored() {
     let narrow = config(64, Observation::Latent);
     let mut replay = Replay::new(&narrow);
-    replay.insert(with_images(episode(0, 5, Outcome::Collided))).unwrap();
-    let error = Replay::restore(&config(64, Observation::LatentVelocity), replay.state()).unwrap_err();
+    replay
+        .insert(with_images(episode(0, 5, Outcome::Collided)))
+        .unwrap();
+    let error =
+        Replay::restore(&config(64, Observation::LatentVelocity), replay.state()).unwrap_err();
     assert_eq!(error.part, "regular part");
     let mut without_images = replay.state();
     without_images.images = None;
@@ -392,14 +451,21 @@ fn content_of_another_shape_is_not_restored() {
     );
     let mut too_few = replay.state();
     too_few.images = Some(Vec::new());
-    assert_eq!(Replay::restore(&narrow, too_few).unwrap_err().part, "depth images");
+    assert_eq!(
+        Replay::restore(&narrow, too_few).unwrap_err().part,
+        "depth images"
+    );
     let mut endless = replay.state();
     endless.success.inserted = u64::MAX;
     let error = Replay::restore(&narrow, endless).unwrap_err();
-    assert!(error.problem.contains("more than any run commits"), "{error}");
+    assert!(
+        error.problem.contains("more than any run commits"),
+        "{error}"
+    );
 }
 
-/// Prints what a minibatch costs: `cargo test --release -p skein-learner -- --ignored --nocapture minibatch_of_256`.
+/// Prints what a minibatch costs: `cargo test --release -p skein-learner -- --ignored --nocapture
+/// minibatch_of_256`.
 #[test]
 #[ignore = "a measurement, not a claim"]
 fn time_of_a_minibatch_of_256_from_a_full_buffer() {

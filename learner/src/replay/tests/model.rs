@@ -1,4 +1,5 @@
-//! The buffer against a naive model of it: overwriting, sorting, freezing, storing and restoring at any point.
+//! The buffer against a naive model of it: overwriting, sorting, freezing, storing and restoring at
+//! any point.
 
 use std::collections::VecDeque;
 
@@ -46,7 +47,11 @@ impl Model {
                     vector.extend(&episode.observations[step].velocity_mps[1..]);
                 }
                 if self.view.moment == Observation::LatentVelocityAction {
-                    vector.extend(if step == 0 { [0.0; 2] } else { episode.actions[step - 1] });
+                    vector.extend(if step == 0 {
+                        [0.0; 2]
+                    } else {
+                        episode.actions[step - 1]
+                    });
                 }
                 vector
             };
@@ -84,7 +89,10 @@ impl Model {
 
     fn set_latents(&mut self, latent: impl Fn(&[f32]) -> LatentCode) {
         for transition in self.parts.iter_mut().flat_map(|(part, _)| part) {
-            for vector in [&mut transition.observation, &mut transition.next_observation] {
+            for vector in [
+                &mut transition.observation,
+                &mut transition.next_observation,
+            ] {
                 for moment in vector.chunks_exact_mut(self.view.moment_len()) {
                     let made = latent(moment);
                     moment[..self.view.latent].copy_from_slice(&made[..self.view.latent]);
@@ -115,8 +123,14 @@ fn transitions(ring: &Ring) -> Vec<Transition> {
 }
 
 fn assert_same(replay: &Replay, model: &Model) {
-    assert_eq!(transitions(&replay.success), Vec::from(model.parts[0].0.clone()));
-    assert_eq!(transitions(&replay.regular), Vec::from(model.parts[1].0.clone()));
+    assert_eq!(
+        transitions(&replay.success),
+        Vec::from(model.parts[0].0.clone())
+    );
+    assert_eq!(
+        transitions(&replay.regular),
+        Vec::from(model.parts[1].0.clone())
+    );
 }
 
 prop_compose! {
@@ -140,7 +154,8 @@ prop_compose! {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Overwriting, classification, freezing at any point, saving and restoring at any point: always what the model holds.
+    /// Overwriting, classification, freezing at any point, saving and restoring at any point:
+    /// always what the model holds.
     #[test]
     fn holds_what_a_naive_model_holds(
         episodes in episodes(),

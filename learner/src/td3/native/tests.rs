@@ -49,10 +49,12 @@ fn forty_updates_stay_close_to_automatic_gradients() {
     for (seed, section) in [(1, section()), (2, section()), (3, apart), (4, cut_off)] {
         let mut native = NativeTd3::new(&section, TOLD, seed, Isa::best());
         let mut torch = TorchTd3::new(&section, TOLD, seed, Device::Cpu);
-        let (mut data, mut noise, mut same_noise) = (Noise::new(seed), Noise::new(9), Noise::new(9));
+        let (mut data, mut noise, mut same_noise) =
+            (Noise::new(seed), Noise::new(9), Noise::new(9));
         let before = native.policy_parameters.values.clone();
         for number in 1..=40 {
-            let transitions = Transitions::random(OBSERVATION, 50, &mut data).telling(TOLD.critic, &mut data);
+            let transitions =
+                Transitions::random(OBSERVATION, 50, &mut data).telling(TOLD.critic, &mut data);
             let found = native
                 .update(&mut Team::new(1), transitions.columns(), &mut noise)
                 .unwrap();
@@ -69,8 +71,16 @@ fn forty_updates_stay_close_to_automatic_gradients() {
             }
         }
         let pairs = [
-            (&native.policy_parameters.values, &torch.policy_parameters, 6e-3),
-            (&native.critic_parameters.values, &torch.critic_parameters, 1.2e-2),
+            (
+                &native.policy_parameters.values,
+                &torch.policy_parameters,
+                6e-3,
+            ),
+            (
+                &native.critic_parameters.values,
+                &torch.critic_parameters,
+                1.2e-2,
+            ),
             (&native.target_policy, &torch.target_policy, 1e-3),
             (&native.target_critic, &torch.target_critic, 1e-3),
         ];
@@ -80,11 +90,19 @@ fn forty_updates_stay_close_to_automatic_gradients() {
                 .iter()
                 .zip(&expected)
                 .map(|(found, expected)| (found - expected).abs());
-            // Adam's steps are as large as its rate, however small a gradient; where one is nearly nothing, its sign is chance.
+            // Adam's steps are as large as its rate, however small a gradient; where one is nearly
+            // nothing, its sign is chance.
             let far = apart.filter(|apart| *apart > 0.05 * moved).count();
-            assert!(far <= 2 + found.len() / 200, "{far} of {} are far off", found.len());
+            assert!(
+                far <= 2 + found.len() / 200,
+                "{far} of {} are far off",
+                found.len()
+            );
         }
-        assert_ne!(before, native.policy_parameters.values, "the policy was never updated");
+        assert_ne!(
+            before, native.policy_parameters.values,
+            "the policy was never updated"
+        );
         let layout = |algorithm: &mut dyn Algorithm| {
             let parts = algorithm.named_tensors().into_iter();
             let mut parts: Vec<_> = parts.map(|part| (part.name, part.shape)).collect();
@@ -126,7 +144,8 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
         ..section()
     };
     for seed in 1..=3 {
-        let (mut data, mut noise, mut team) = (Noise::new(seed), Noise::new(seed + 1), Team::new(1));
+        let (mut data, mut noise, mut team) =
+            (Noise::new(seed), Noise::new(seed + 1), Team::new(1));
         let mut algorithm = td3(&section, seed);
         let error = |algorithm: &NativeTd3| {
             let asked = Transitions::guessing(OBSERVATION, 200, &mut Noise::new(77));
@@ -137,7 +156,10 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
                 &asked.observations,
                 &mut actions,
             );
-            let wanted = asked.observations.chunks(OBSERVATION).flat_map(|row| &row[..2]);
+            let wanted = asked
+                .observations
+                .chunks(OBSERVATION)
+                .flat_map(|row| &row[..2]);
             let squares = actions
                 .iter()
                 .zip(wanted)
@@ -147,7 +169,9 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
         let before = error(&algorithm);
         for _ in 0..1500 {
             let transitions = Transitions::guessing(OBSERVATION, 64, &mut data);
-            algorithm.update(&mut team, transitions.columns(), &mut noise).unwrap();
+            algorithm
+                .update(&mut team, transitions.columns(), &mut noise)
+                .unwrap();
         }
         let after = error(&algorithm);
         assert!(after < 0.15 * before, "seed {seed}: {before} to {after}");
@@ -171,7 +195,9 @@ fn neither_threads_nor_instructions_change_a_bit() {
         let (mut data, mut noise, mut team) = (Noise::new(1), Noise::new(2), Team::new(members));
         for _ in 0..4 {
             let transitions = Transitions::random(OBSERVATION, 37, &mut data);
-            algorithm.update(&mut team, transitions.columns(), &mut noise).unwrap();
+            algorithm
+                .update(&mut team, transitions.columns(), &mut noise)
+                .unwrap();
         }
         algorithm.named_tensors()
     };

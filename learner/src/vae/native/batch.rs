@@ -5,7 +5,8 @@ use super::network::Network;
 use super::order::Affine;
 use super::unfold;
 
-/// Activations, and the loss's gradients with respect to them, image by image, channels last. Kept from step to step.
+/// Activations, and the loss's gradients with respect to them, image by image, channels last. Kept
+/// from step to step.
 #[derive(Debug, Default)]
 pub(super) struct Batch {
     /// Pixels and the encoder's images, after ReLU.

@@ -11,7 +11,8 @@ const LINE: usize = 16;
 #[repr(C, align(64))]
 struct Line([f32; LINE]);
 
-/// Numbers from the beginning of a cache line, kept from use to use. A vector register that is loaded across two lines takes twice the time.
+/// Numbers from the beginning of a cache line, kept from use to use. A vector register that is
+/// loaded across two lines takes twice the time.
 #[derive(Debug, Default)]
 pub(super) struct Buffer {
     lines: Vec<Line>,

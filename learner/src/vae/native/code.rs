@@ -1,4 +1,5 @@
-//! The code between encoder and decoder: how it is drawn, what it costs, and what flows back through it.
+//! The code between encoder and decoder: how it is drawn, what it costs, and what flows back
+//! through it.
 
 use skein_kernels::{Isa, exp};
 use skein_protocol::LONGEST_LATENT;
@@ -7,19 +8,29 @@ use crate::networks::LOG_VARIANCE_BOUND;
 
 const BOUND: f32 = LOG_VARIANCE_BOUND as f32;
 
-/// Draws codes as mean + std · noise (arXiv:1312.6114, section 2.4): `[n, latent]` from heads, `[n, 2 latent]`, mean and log-variance, unbounded, side by side,
-/// and standard normal `[n, latent]`. Returns the sum of the divergences from the standard normal, in nats (appendix B).
-pub(super) fn draw(isa: Isa, latent: usize, heads: &[f32], noise: &[f32], codes: &mut [f32]) -> f64 {
+/// Draws codes as mean + std · noise (arXiv:1312.6114, section 2.4): `[n, latent]` from heads, `[n,
+/// 2 latent]`, mean and log-variance, unbounded, side by side, and standard normal `[n, latent]`.
+/// Returns the sum of the divergences from the standard normal, in nats (appendix B).
+pub(super) fn draw(
+    isa: Isa,
+    latent: usize,
+    heads: &[f32],
+    noise: &[f32],
+    codes: &mut [f32],
+) -> f64 {
     let mut total = 0.0;
     let terms = &mut [0.0_f32; LONGEST_LATENT][..latent];
-    let rows = heads.chunks_exact(2 * latent).zip(noise.chunks_exact(latent));
+    let rows = heads
+        .chunks_exact(2 * latent)
+        .zip(noise.chunks_exact(latent));
     for ((heads, noise), codes) in rows.zip(codes.chunks_exact_mut(latent)) {
         let (means, log_variances) = heads.split_at(latent);
         isa.vectorised(
             #[inline(always)]
             || {
                 for place in 0..latent {
-                    let (mean, log_variance) = (means[place], log_variances[place].clamp(-BOUND, BOUND));
+                    let (mean, log_variance) =
+                        (means[place], log_variances[place].clamp(-BOUND, BOUND));
                     codes[place] = exp(0.5 * log_variance).mul_add(noise[place], mean);
                     terms[place] = mean * mean + exp(log_variance) - log_variance - 1.0;
                 }
@@ -30,8 +41,8 @@ pub(super) fn draw(isa: Isa, latent: usize, heads: &[f32], noise: &[f32], codes:
     0.5 * total
 }
 
-/// The gradient with respect to the heads, `[n, 2 latent]`, from that with respect to the codes, `[n, latent]`, and from the divergence, which counts
-/// `divergence_weight`.
+/// The gradient with respect to the heads, `[n, 2 latent]`, from that with respect to the codes,
+/// `[n, latent]`, and from the divergence, which counts `divergence_weight`.
 pub(super) fn flow_back(
     isa: Isa,
     latent: usize,
@@ -41,7 +52,9 @@ pub(super) fn flow_back(
     divergence_weight: f32,
     heads_flow: &mut [f32],
 ) {
-    let rows = heads.chunks_exact(2 * latent).zip(noise.chunks_exact(latent));
+    let rows = heads
+        .chunks_exact(2 * latent)
+        .zip(noise.chunks_exact(latent));
     let flows = codes_flow
         .chunks_exact(latent)
         .zip(heads_flow.chunks_exact_mut(2 * latent));
@@ -90,7 +103,8 @@ mod tests {
 
     #[test]
     fn what_flows_back_is_the_slope_of_what_is_drawn() {
-        let mut heads: [f32; 2 * LATENT] = std::array::from_fn(|place| (place as f32 * 0.7).sin() * 2.0);
+        let mut heads: [f32; 2 * LATENT] =
+            std::array::from_fn(|place| (place as f32 * 0.7).sin() * 2.0);
         // Two that are out of bounds.
         (heads[LATENT + 3], heads[LATENT + 4]) = (11.0, -12.0);
         let noise: [f32; LATENT] = std::array::from_fn(|place| (place as f32 * 1.3).cos());
@@ -100,11 +114,23 @@ mod tests {
         let loss = |heads: &[f32]| {
             let mut codes = [0.0; LATENT];
             let divergence = draw(Isa::best(), LATENT, heads, &noise, &mut codes);
-            let linear: f64 = codes.iter().zip(&grad).map(|(code, flow)| f64::from(code * flow)).sum();
+            let linear: f64 = codes
+                .iter()
+                .zip(&grad)
+                .map(|(code, flow)| f64::from(code * flow))
+                .sum();
             linear + f64::from(weight) * divergence
         };
         let mut found = [0.0; 2 * LATENT];
-        flow_back(Isa::best(), LATENT, &heads, &noise, &grad, weight, &mut found);
+        flow_back(
+            Isa::best(),
+            LATENT,
+            &heads,
+            &noise,
+            &grad,
+            weight,
+            &mut found,
+        );
         for place in 0..2 * LATENT {
             let at = |moved: f32| {
                 let mut heads = heads;

@@ -1,9 +1,13 @@
 //! A convolution or a transposed one: the same weights seen from either side.
 //!
-//! Both tie an image to rows of channels, one for each place of a kernel on the image. A convolution *looks* through the windows: image to rows. A transposed one *spreads*
-//! rows back through them: rows to image. The gradient goes the other way in both, and the weights' gradient is the same product for either.
+//! Both tie an image to rows of channels, one for each place of a kernel on the image. A
+//! convolution *looks* through the windows: image to rows. A transposed one *spreads* rows back
+//! through them: rows to image. The gradient goes the other way in both, and the weights' gradient
+//! is the same product for either.
 
-use skein_kernels::{Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product, spread};
+use skein_kernels::{
+    Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product, spread,
+};
 
 use super::order::Affine;
 
@@ -25,7 +29,11 @@ pub(super) struct Layer {
 
 impl Layer {
     pub(super) fn new(isa: Isa, windows: Windows, channels: usize, place: Affine) -> Self {
-        assert_eq!(place.weight.len(), channels * windows.window_len(), "a layer's weights");
+        assert_eq!(
+            place.weight.len(),
+            channels * windows.window_len(),
+            "a layer's weights"
+        );
         let [looking, spreading] = [0; 2].map(|_| Panels::new(isa));
         Self {
             windows,
@@ -38,14 +46,29 @@ impl Layer {
 
     /// Takes over the weights.
     pub(super) fn pack(&mut self, parameters: &[f32]) {
-        let weights = Matrix::of_rows(&parameters[self.place.weight.clone()], self.windows.window_len());
+        let weights = Matrix::of_rows(
+            &parameters[self.place.weight.clone()],
+            self.windows.window_len(),
+        );
         self.looking.pack(weights.transposed());
         self.spreading.pack(weights);
     }
 
     /// `rows`, `[windows, channels]`, from an image.
-    pub(super) fn look(&self, image: &[f32], start: Start<'_>, finish: Finish<'_>, rows: &mut [f32]) {
-        product(Rows::Windows(&self.windows, image), &self.looking, start, finish, rows);
+    pub(super) fn look(
+        &self,
+        image: &[f32],
+        start: Start<'_>,
+        finish: Finish<'_>,
+        rows: &mut [f32],
+    ) {
+        product(
+            Rows::Windows(&self.windows, image),
+            &self.looking,
+            start,
+            finish,
+            rows,
+        );
     }
 
     /// Adds what `rows` make of it to `image`.
@@ -53,8 +76,16 @@ impl Layer {
         spread(rows, &self.spreading, &self.windows, scratch, image);
     }
 
-    /// The weights' gradient, from rows and images of the whole batch: one side what came in, the other what flows back.
-    pub(super) fn gradient(&self, team: &mut Team, isa: Isa, rows: &[f32], images: &[f32], all: &mut [f32]) {
+    /// The weights' gradient, from rows and images of the whole batch: one side what came in, the
+    /// other what flows back.
+    pub(super) fn gradient(
+        &self,
+        team: &mut Team,
+        isa: Isa,
+        rows: &[f32],
+        images: &[f32],
+        all: &mut [f32],
+    ) {
         let rows = Matrix::of_rows(rows, self.channels);
         let terms = Terms::Windows(&self.windows, images);
         gradient(team, isa, rows, terms, &mut all[self.place.weight.clone()]);
@@ -117,16 +148,37 @@ impl Linear {
         output: &mut [f32],
     ) {
         let bias = &parameters[self.place.bias.clone()];
-        rows_times(team, input, &self.forward, Start::Bias(bias), finish, output);
+        rows_times(
+            team,
+            input,
+            &self.forward,
+            Start::Bias(bias),
+            finish,
+            output,
+        );
     }
 
-    /// The gradient with respect to the input, `[n, inputs]`, from that with respect to the output, `[n, outputs]`.
-    pub(super) fn backward(&self, team: &mut Team, grad: &[f32], finish: Finish<'_>, input: &mut [f32]) {
+    /// The gradient with respect to the input, `[n, inputs]`, from that with respect to the output,
+    /// `[n, outputs]`.
+    pub(super) fn backward(
+        &self,
+        team: &mut Team,
+        grad: &[f32],
+        finish: Finish<'_>,
+        input: &mut [f32],
+    ) {
         rows_times(team, grad, &self.backward, Start::Zero, finish, input);
     }
 
     /// The gradient of the weights and biases.
-    pub(super) fn gradient(&self, team: &mut Team, isa: Isa, grad: &[f32], input: &[f32], all: &mut [f32]) {
+    pub(super) fn gradient(
+        &self,
+        team: &mut Team,
+        isa: Isa,
+        grad: &[f32],
+        input: &[f32],
+        all: &mut [f32],
+    ) {
         let left = Matrix::of_rows(grad, self.outputs);
         let terms = Terms::Matrix(input, self.inputs);
         gradient(team, isa, left, terms, &mut all[self.place.weight.clone()]);

@@ -27,7 +27,8 @@ impl Member {
     }
 }
 
-/// Lets each member do its share of `items`, in order: `work` is given an item's number and the item.
+/// Lets each member do its share of `items`, in order: `work` is given an item's number and the
+/// item.
 pub(super) fn share<T: Send>(
     team: &mut Team,
     members: &mut [Member],
@@ -54,14 +55,18 @@ pub(super) fn share<T: Send>(
 }
 
 /// The parts of each buffer that belong to each of `count` images.
-pub(super) fn by_image<const N: usize>(buffers: [&mut [f32]; N], count: usize) -> Vec<[&mut [f32]; N]> {
+pub(super) fn by_image<const N: usize>(
+    buffers: [&mut [f32]; N],
+    count: usize,
+) -> Vec<[&mut [f32]; N]> {
     let mut parts = buffers.map(|buffer| buffer.chunks_exact_mut(buffer.len() / count));
     (0..count)
         .map(|_| std::array::from_fn(|index| parts[index].next().expect("a part for each image")))
         .collect()
 }
 
-/// `rows`, each `len` long, in a part for each member with the number of its first row; fewer when there are fewer rows.
+/// `rows`, each `len` long, in a part for each member with the number of its first row; fewer when
+/// there are fewer rows.
 pub(super) fn portions(rows: &mut [f32], len: usize, members: usize) -> Vec<(usize, &mut [f32])> {
     let each = (rows.len() / len).div_ceil(members).max(1);
     let portions = rows.chunks_mut(each * len).enumerate();

@@ -54,7 +54,9 @@ impl Network {
         heads.weight.end = log_variance.weight.end;
         heads.bias.end = log_variance.bias.end;
         let mut size = [1, 3];
-        let grown = |size: [usize; 2], kernel: [usize; 2]| [0, 1].map(|axis| STRIDE * (size[axis] - 1) + kernel[axis]);
+        let grown = |size: [usize; 2], kernel: [usize; 2]| {
+            [0, 1].map(|axis| STRIDE * (size[axis] - 1) + kernel[axis])
+        };
         size = grown(size, DECODER_KERNELS[0]);
         let decoder = std::array::from_fn(|index| {
             let (layer, kernel) = (index + 1, DECODER_KERNELS[index + 1]);
@@ -73,7 +75,12 @@ impl Network {
             encoder,
             heads: Linear::new(isa, ENCODER_FEATURES, 2 * latent, heads),
             mean: Panels::new(isa),
-            linear: Linear::new(isa, latent, unfold::INPUT_LEN, order.layer("decoder.linear")),
+            linear: Linear::new(
+                isa,
+                latent,
+                unfold::INPUT_LEN,
+                order.layer("decoder.linear"),
+            ),
             unfold: Unfold::new(isa, order.layer("decoder.conv1")),
             decoder,
         }
@@ -82,17 +89,26 @@ impl Network {
     /// Takes over all weights but those of the decoder's first convolution.
     pub(super) fn pack(&mut self, team: &mut Team, parameters: &[f32]) {
         let mean = &parameters[self.heads.place.weight.clone()][..self.latent() * ENCODER_FEATURES];
-        self.mean.pack(Matrix::of_rows(mean, ENCODER_FEATURES).transposed());
+        self.mean
+            .pack(Matrix::of_rows(mean, ENCODER_FEATURES).transposed());
         self.heads.pack(parameters);
         self.linear.pack(parameters);
-        let mut layers: Vec<&mut Layer> = self.encoder.iter_mut().chain(&mut self.decoder).collect();
+        let mut layers: Vec<&mut Layer> =
+            self.encoder.iter_mut().chain(&mut self.decoder).collect();
         team.split_rows(&mut layers, 1, 1, |_, layers| {
             layers.iter_mut().for_each(|layer| layer.pack(parameters));
         });
     }
 
-    /// Depth, `[72, 128]`, to pixels in [0, 1] and the encoder's four images, the last of which are the features.
-    pub(super) fn see(&self, parameters: &[f32], depth: &[u8], images: [&mut [f32]; 5], watch: &mut Stopwatch) {
+    /// Depth, `[72, 128]`, to pixels in [0, 1] and the encoder's four images, the last of which are
+    /// the features.
+    pub(super) fn see(
+        &self,
+        parameters: &[f32],
+        depth: &[u8],
+        images: [&mut [f32]; 5],
+        watch: &mut Stopwatch,
+    ) {
         let [pixels, rest @ ..] = images;
         scale(self.isa, depth, pixels);
         watch.rest();
@@ -117,7 +133,8 @@ impl Network {
         self.linear.inputs
     }
 
-    /// Image number `index` of a batch whose codes have gone through [`Unfold::multiply`]: the decoder's four images, the last one before its sigmoid.
+    /// Image number `index` of a batch whose codes have gone through [`Unfold::multiply`]: the
+    /// decoder's four images, the last one before its sigmoid.
     pub(super) fn draw(
         &self,
         parameters: &[f32],
@@ -128,7 +145,8 @@ impl Network {
     ) {
         let [first, rest @ ..] = images;
         let bias = |place: &Affine| &parameters[place.bias.clone()];
-        self.unfold.add_up(self.isa, bias(&self.unfold.place), index, first);
+        self.unfold
+            .add_up(self.isa, bias(&self.unfold.place), index, first);
         rectify(self.isa, first);
         watch.layer(UNFOLD, Pass::Forward);
         let mut input = &*first;
@@ -155,7 +173,8 @@ impl Network {
         [unfold::IMAGE_LEN, a, b, c]
     }
 
-    /// Layers with biases of which each image has its sums, in order: the encoder's convolutions, and the decoder's.
+    /// Layers with biases of which each image has its sums, in order: the encoder's convolutions,
+    /// and the decoder's.
     pub(super) fn encoder_places(&self) -> [&Affine; 4] {
         [0, 1, 2, 3].map(|layer| &self.encoder[layer].place)
     }
@@ -165,14 +184,22 @@ impl Network {
         [&self.unfold.place, a, b, c]
     }
 
-    /// Floating-point operations of a pass of each layer for an image, in the order of [`super::stopwatch::LAYERS`].
+    /// Floating-point operations of a pass of each layer for an image, in the order of
+    /// [`super::stopwatch::LAYERS`].
     pub(super) fn operations(&self) -> [f64; 10] {
         let encoder = [0, 1, 2, 3].map(|layer| self.encoder[layer].operations());
         let decoder = [0, 1, 2].map(|layer| self.decoder[layer].operations());
-        let between = [self.heads.operations(), self.linear.operations(), Unfold::operations()];
+        let between = [
+            self.heads.operations(),
+            self.linear.operations(),
+            Unfold::operations(),
+        ];
         let all = encoder.into_iter().chain(between).chain(decoder);
         let mut operations = [0.0; 10];
-        operations.iter_mut().zip(all).for_each(|(into, from)| *into = from);
+        operations
+            .iter_mut()
+            .zip(all)
+            .for_each(|(into, from)| *into = from);
         operations
     }
 }

@@ -1,7 +1,10 @@
-//! The order in which the native engine keeps its parameters, and the way from PyTorch's order and back.
+//! The order in which the native engine keeps its parameters, and the way from PyTorch's order and
+//! back.
 //!
-//! Images lie channels-last, so weights do: `[rows' channels, kernel row, kernel column, image's channels]` for both kinds of convolution, where the rows are
-//! a convolution's output and a transposed one's input. Initial values are drawn, and snapshots published, in PyTorch's order, which is the contract with actors.
+//! Images lie channels-last, so weights do: `[rows' channels, kernel row, kernel column, image's
+//! channels]` for both kinds of convolution, where the rows are a convolution's output and a
+//! transposed one's input. Initial values are drawn, and snapshots published, in PyTorch's order,
+//! which is the contract with actors.
 
 use std::ops::Range;
 
@@ -14,7 +17,8 @@ pub(super) struct Affine {
     pub(super) bias: Range<usize>,
 }
 
-/// One of PyTorch's tensors, as four dimensions, and which of them is the outermost, the second, … here.
+/// One of PyTorch's tensors, as four dimensions, and which of them is the outermost, the second, …
+/// here.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Entry {
     name: String,
@@ -35,8 +39,11 @@ fn arranged(name: &str, shape: &[usize]) -> ([usize; 4], [usize; 4]) {
     const AS_IT_IS: [usize; 4] = [0, 1, 2, 3];
     const CHANNELS_LAST: [usize; 4] = [0, 2, 3, 1];
     match (name, shape) {
-        // Each kernel row makes an image row of its own, for the input has one row only; so each is a matrix of its own.
-        ("decoder.conv1.weight", &[inputs, outputs, height, width]) => ([inputs, outputs, height, width], [2, 0, 3, 1]),
+        // Each kernel row makes an image row of its own, for the input has one row only; so each is
+        // a matrix of its own.
+        ("decoder.conv1.weight", &[inputs, outputs, height, width]) => {
+            ([inputs, outputs, height, width], [2, 0, 3, 1])
+        }
         (_, &[rows, channels, height, width]) => ([rows, channels, height, width], CHANNELS_LAST),
         ("encoder.mean.weight" | "encoder.log_variance.weight", &[outputs, features]) => (
             [outputs, FEATURE_CHANNELS, features / FEATURE_CHANNELS, 1],
@@ -46,7 +53,10 @@ fn arranged(name: &str, shape: &[usize]) -> ([usize; 4], [usize; 4]) {
             [UNFOLDED_CHANNELS, features / UNFOLDED_CHANNELS, 1, inputs],
             [1, 0, 2, 3],
         ),
-        ("decoder.linear.bias", &[features]) => ([UNFOLDED_CHANNELS, features / UNFOLDED_CHANNELS, 1, 1], [1, 0, 2, 3]),
+        ("decoder.linear.bias", &[features]) => (
+            [UNFOLDED_CHANNELS, features / UNFOLDED_CHANNELS, 1, 1],
+            [1, 0, 2, 3],
+        ),
         (_, &[len]) => ([len, 1, 1, 1], AS_IT_IS),
         _ => unreachable!("{name} has shape {shape:?}, which no layer of the VAE has"),
     }
@@ -78,7 +88,10 @@ impl Order {
         // The two heads are one layer here: their weights lie side by side, and then their biases.
         let mut places: Vec<usize> = (0..entries.len()).collect();
         let place = |name: &str| entries.iter().position(|entry| entry.name == name);
-        if let (Some(bias), Some(weight)) = (place("encoder.mean.bias"), place("encoder.log_variance.weight")) {
+        if let (Some(bias), Some(weight)) = (
+            place("encoder.mean.bias"),
+            place("encoder.log_variance.weight"),
+        ) {
             places.swap(bias, weight);
         }
         let mut start = 0;
@@ -130,7 +143,8 @@ impl Order {
     fn walk(&self, mut pair: impl FnMut(usize, usize)) {
         let mut first = 0;
         for entry in &self.entries {
-            let strides = [3, 2, 1, 0].map(|axis: usize| entry.shape[axis + 1..].iter().product::<usize>());
+            let strides =
+                [3, 2, 1, 0].map(|axis: usize| entry.shape[axis + 1..].iter().product::<usize>());
             let [d, c, b, a] = strides;
             let strides = entry.axes.map(|axis| [a, b, c, d][axis]);
             let sizes = entry.axes.map(|axis| entry.shape[axis]);
@@ -212,7 +226,8 @@ mod tests {
         let there = first_of(name) + (9 * 3 + 2) * 32 + 11;
         let here = order.tensor(name).start + (2 * 1024 + 9) * 32 + 11;
         assert_eq!(arranged[here], there as f32);
-        // Heads [32, 3072]: output 3, channel 200 of 256, pixel 10 of 12; the second one behind the first.
+        // Heads [32, 3072]: output 3, channel 200 of 256, pixel 10 of 12; the second one behind the
+        // first.
         let name = "encoder.log_variance.weight";
         let there = first_of(name) + 3 * 3072 + 200 * 12 + 10;
         let here = order.tensor("encoder.mean.weight").start + (32 + 3) * 3072 + 10 * 256 + 200;

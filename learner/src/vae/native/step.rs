@@ -1,8 +1,9 @@
 //! Loss and gradient of a minibatch, pass by pass.
 //!
-//! Whatever concerns one image alone is done image by image, so that what one layer leaves is in the caches when the next one comes, and images are
-//! shared among the members of the team. What concerns the whole batch (the linear layers, the decoder's first convolution, the gradients of weights) is shared by rows
-//! or columns. No sum is ever split between members.
+//! Whatever concerns one image alone is done image by image, so that what one layer leaves is in
+//! the caches when the next one comes, and images are shared among the members of the team. What
+//! concerns the whole batch (the linear layers, the decoder's first convolution, the gradients of
+//! weights) is shared by rows or columns. No sum is ever split between members.
 
 use skein_kernels::{Finish, Isa, Start, Team};
 use skein_protocol::IMAGE_PIXELS;
@@ -37,9 +38,15 @@ pub(super) struct Step<'a> {
 }
 
 impl Step<'_> {
-    /// The loss of depth images, `[n, 72, 128]`, and its gradient but for the weights of the decoder's first convolution, for which what flows back is left in
-    /// [`super::unfold::Unfold`]. `noise`: standard normal, `[n, latent]`.
-    pub(super) fn objective(&mut self, depth: &[u8], noise: &[f32], gradient: &mut [f32]) -> Objective {
+    /// The loss of depth images, `[n, 72, 128]`, and its gradient but for the weights of the
+    /// decoder's first convolution, for which what flows back is left in [`super::unfold::Unfold`].
+    /// `noise`: standard normal, `[n, latent]`.
+    pub(super) fn objective(
+        &mut self,
+        depth: &[u8],
+        noise: &[f32],
+        gradient: &mut [f32],
+    ) -> Objective {
         let count = depth.len() / IMAGE_PIXELS;
         self.batch.resize(self.network, count);
         self.see(depth);
@@ -62,24 +69,43 @@ impl Step<'_> {
     fn see(&mut self, depth: &[u8]) {
         let count = depth.len() / IMAGE_PIXELS;
         let (network, parameters) = (&*self.network, self.parameters);
-        let mut images = by_image(self.batch.seen.each_mut().map(|buffer| &mut **buffer), count);
-        share(self.team, self.members, &mut images, |index, images, member| {
-            let depth = &depth[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
-            let images = images.each_mut().map(|image| &mut **image);
-            network.see(parameters, depth, images, &mut member.watch);
-        });
+        let mut images = by_image(
+            self.batch.seen.each_mut().map(|buffer| &mut **buffer),
+            count,
+        );
+        share(
+            self.team,
+            self.members,
+            &mut images,
+            |index, images, member| {
+                let depth = &depth[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
+                let images = images.each_mut().map(|image| &mut **image);
+                network.see(parameters, depth, images, &mut member.watch);
+            },
+        );
     }
 
-    /// Heads, codes, the decoder's linear layer, and what it makes of the first image. Returns the sum of divergences.
+    /// Heads, codes, the decoder's linear layer, and what it makes of the first image. Returns the
+    /// sum of divergences.
     fn draw_codes(&mut self, noise: &[f32]) -> f64 {
         let (network, parameters, batch) = (&mut *self.network, self.parameters, &mut *self.batch);
         let watch = &mut self.members[0].watch;
         watch.start();
-        network
-            .heads
-            .forward(self.team, parameters, &batch.seen[4], Finish::Plain, &mut batch.heads);
+        network.heads.forward(
+            self.team,
+            parameters,
+            &batch.seen[4],
+            Finish::Plain,
+            &mut batch.heads,
+        );
         watch.layer(HEADS, Pass::Forward);
-        let divergence = code::draw(self.isa, network.latent(), &batch.heads, noise, &mut batch.codes);
+        let divergence = code::draw(
+            self.isa,
+            network.latent(),
+            &batch.heads,
+            noise,
+            &mut batch.codes,
+        );
         watch.rest();
         network.linear.forward(
             self.team,
@@ -109,26 +135,31 @@ impl Step<'_> {
         let images = by_image(buffers.map(|buffer| &mut **buffer), count);
         let mut items: Vec<_> = images.into_iter().zip(errors).collect();
         let weight = 2.0 / count as f32;
-        share(self.team, self.members, &mut items, |index, (images, error), member| {
-            let Member { columns, watch, .. } = member;
-            let [a, b, c, d, e, f, g, sums] = images;
-            network.draw(parameters, index, [a, b, c, d], columns, watch);
-            let pixels = &pixels[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
-            **error = reconstruction_error(isa, d, pixels, weight);
-            watch.rest();
-            let mut sums = Sums::new(network.decoder_places(), sums);
-            let ways = [(2, &*c, &mut *g), (1, &*b, f), (0, &*a, e)];
-            let mut grad = &**d;
-            for (index, output, into) in ways {
-                sums.add(isa, index + 1, grad);
-                watch.layer(DECODER + index, Pass::Gradient);
-                network.decoder[index].look(grad, Start::Zero, Finish::Gated(output), into);
-                watch.layer(DECODER + index, Pass::Backward);
-                grad = into;
-            }
-            sums.add(isa, 0, grad);
-            watch.layer(UNFOLD, Pass::Gradient);
-        });
+        share(
+            self.team,
+            self.members,
+            &mut items,
+            |index, (images, error), member| {
+                let Member { columns, watch, .. } = member;
+                let [a, b, c, d, e, f, g, sums] = images;
+                network.draw(parameters, index, [a, b, c, d], columns, watch);
+                let pixels = &pixels[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
+                **error = reconstruction_error(isa, d, pixels, weight);
+                watch.rest();
+                let mut sums = Sums::new(network.decoder_places(), sums);
+                let ways = [(2, &*c, &mut *g), (1, &*b, f), (0, &*a, e)];
+                let mut grad = &**d;
+                for (index, output, into) in ways {
+                    sums.add(isa, index + 1, grad);
+                    watch.layer(DECODER + index, Pass::Gradient);
+                    network.decoder[index].look(grad, Start::Zero, Finish::Gated(output), into);
+                    watch.layer(DECODER + index, Pass::Backward);
+                    grad = into;
+                }
+                sums.add(isa, 0, grad);
+                watch.layer(UNFOLD, Pass::Gradient);
+            },
+        );
     }
 
     /// Through the decoder's first convolution, back to its input.
@@ -140,12 +171,21 @@ impl Step<'_> {
         watch.layer(UNFOLD, Pass::Backward);
         let (unfold, gate) = (&self.network.unfold, &batch.unfolded);
         // Whole images, so that members have equal parts.
-        let mut parts = portions(&mut batch.unfolded_flow, super::unfold::INPUT_LEN, self.members.len());
-        share(self.team, self.members, &mut parts, |_, (first, input), member| {
-            let gate = &gate[*first * super::unfold::INPUT_LEN..][..input.len()];
-            unfold.backward(parameters, &mut member.unfold, *first, gate, input);
-            member.watch.layer(UNFOLD, Pass::Backward);
-        });
+        let mut parts = portions(
+            &mut batch.unfolded_flow,
+            super::unfold::INPUT_LEN,
+            self.members.len(),
+        );
+        share(
+            self.team,
+            self.members,
+            &mut parts,
+            |_, (first, input), member| {
+                let gate = &gate[*first * super::unfold::INPUT_LEN..][..input.len()];
+                unfold.backward(parameters, &mut member.unfold, *first, gate, input);
+                member.watch.layer(UNFOLD, Pass::Backward);
+            },
+        );
     }
 
     /// Through the code, back to the features.
@@ -153,9 +193,12 @@ impl Step<'_> {
         let (network, batch) = (&*self.network, &mut *self.batch);
         let watch = &mut self.members[0].watch;
         watch.start();
-        network
-            .linear
-            .backward(self.team, &batch.unfolded_flow, Finish::Plain, &mut batch.codes_flow);
+        network.linear.backward(
+            self.team,
+            &batch.unfolded_flow,
+            Finish::Plain,
+            &mut batch.codes_flow,
+        );
         watch.layer(LINEAR, Pass::Backward);
         let weight = divergence_weight as f32;
         code::flow_back(
@@ -169,7 +212,9 @@ impl Step<'_> {
         );
         watch.rest();
         let (finish, into) = (Finish::Gated(&batch.seen[4]), &mut batch.seen_flow[3]);
-        network.heads.backward(self.team, &batch.heads_flow, finish, into);
+        network
+            .heads
+            .backward(self.team, &batch.heads_flow, finish, into);
         watch.layer(HEADS, Pass::Backward);
     }
 
@@ -184,23 +229,28 @@ impl Step<'_> {
         } = &mut *self.batch;
         let buffers: [&mut Buffer; 5] = [a, b, c, d, seen_sums];
         let mut images = by_image(buffers.map(|buffer| &mut **buffer), count);
-        share(self.team, self.members, &mut images, |index, images, member| {
-            let Member { columns, watch, .. } = member;
-            let [a, b, c, d, sums] = images;
-            let mut sums = Sums::new(network.encoder_places(), sums);
-            let mut grad = &**d;
-            for (layer, into) in [(3, c), (2, b), (1, a)] {
-                sums.add(isa, layer, grad);
-                watch.layer(layer, Pass::Gradient);
-                into.fill(0.0);
-                network.encoder[layer].spread(grad, columns, into);
-                gate(isa, into, &seen[layer][index * into.len()..][..into.len()]);
-                watch.layer(layer, Pass::Backward);
-                grad = into;
-            }
-            sums.add(isa, 0, grad);
-            watch.layer(0, Pass::Gradient);
-        });
+        share(
+            self.team,
+            self.members,
+            &mut images,
+            |index, images, member| {
+                let Member { columns, watch, .. } = member;
+                let [a, b, c, d, sums] = images;
+                let mut sums = Sums::new(network.encoder_places(), sums);
+                let mut grad = &**d;
+                for (layer, into) in [(3, c), (2, b), (1, a)] {
+                    sums.add(isa, layer, grad);
+                    watch.layer(layer, Pass::Gradient);
+                    into.fill(0.0);
+                    network.encoder[layer].spread(grad, columns, into);
+                    gate(isa, into, &seen[layer][index * into.len()..][..into.len()]);
+                    watch.layer(layer, Pass::Backward);
+                    grad = into;
+                }
+                sums.add(isa, 0, grad);
+                watch.layer(0, Pass::Gradient);
+            },
+        );
     }
 
     /// Of all weights but the decoder's first convolution's, and of all biases.
@@ -208,12 +258,19 @@ impl Step<'_> {
         let (isa, network, batch) = (self.isa, &*self.network, &*self.batch);
         let watch = &mut self.members[0].watch;
         watch.start();
-        let mut of_layer = |index: usize, layer: &Layer, rows: &[f32], images: &[f32], gradient: &mut [f32]| {
-            layer.gradient(self.team, isa, rows, images, gradient);
-            watch.layer(index, Pass::Gradient);
-        };
+        let mut of_layer =
+            |index: usize, layer: &Layer, rows: &[f32], images: &[f32], gradient: &mut [f32]| {
+                layer.gradient(self.team, isa, rows, images, gradient);
+                watch.layer(index, Pass::Gradient);
+            };
         for (index, layer) in network.encoder.iter().enumerate() {
-            of_layer(index, layer, &batch.seen_flow[index], &batch.seen[index], gradient);
+            of_layer(
+                index,
+                layer,
+                &batch.seen_flow[index],
+                &batch.seen[index],
+                gradient,
+            );
         }
         for (index, layer) in network.decoder.iter().enumerate() {
             let grad = batch.drawn_flow.get(index + 1).unwrap_or(&batch.drawn[3]);

@@ -103,6 +103,7 @@ impl Stopwatch {
 
     fn lap(&mut self) -> f64 {
         let now = Instant::now();
-        now.duration_since(std::mem::replace(&mut self.last, now)).as_secs_f64()
+        now.duration_since(std::mem::replace(&mut self.last, now))
+            .as_secs_f64()
     }
 }

@@ -1,18 +1,23 @@
 //! The decoder's first transposed convolution: three pixels of 1024 channels to 5 × 11 of 128.
 //!
-//! It has three quarters of all weights and three windows an image, so that reading the weights, not multiplying with them, would take the time. Therefore it is done for
-//! the whole batch at once, and in blocks of weights that have nothing to do with each other: what an input pixel makes of the image are five runs of seven
-//! pixels, one in each image row; a block is a part of a run, for all input channels. From its gradient through Adam to being packed for the next step, a block
-//! stays in the caches, and no gradient of the whole is ever stored.
+//! It has three quarters of all weights and three windows an image, so that reading the weights,
+//! not multiplying with them, would take the time. Therefore it is done for the whole batch at
+//! once, and in blocks of weights that have nothing to do with each other: what an input pixel
+//! makes of the image are five runs of seven pixels, one in each image row; a block is a part of a
+//! run, for all input channels. From its gradient through Adam to being packed for the next step, a
+//! block stays in the caches, and no gradient of the whole is ever stored.
 
-use skein_kernels::{AdamStep, Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product};
+use skein_kernels::{
+    AdamStep, Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product,
+};
 
 use super::buffer::Buffer;
 use super::elementwise::{fill, squares};
 use super::layer::STRIDE;
 use super::order::Affine;
 
-/// Rows of the image, and of the kernel: the input has one row, so kernel row k makes image row k and nothing else.
+/// Rows of the image, and of the kernel: the input has one row, so kernel row k makes image row k
+/// and nothing else.
 const ROWS: usize = 5;
 /// Pixels of the input.
 const INPUTS: usize = 3;
@@ -27,8 +32,8 @@ const ROW: usize = (STRIDE * (INPUTS - 1) + KERNEL_WIDTH) * CHANNELS;
 /// Numbers in the input, and in the image.
 pub(super) const INPUT_LEN: usize = INPUTS * INPUT_CHANNELS;
 pub(super) const IMAGE_LEN: usize = ROWS * ROW;
-/// Blocks that a run is cut into. One: [`super::order::Order`] keeps the weights of a kernel row as `[1024, 7 · 128]`, so blocks of less would read them in the
-/// wrong order.
+/// Blocks that a run is cut into. One: [`super::order::Order`] keeps the weights of a kernel row as
+/// `[1024, 7 · 128]`, so blocks of less would read them in the wrong order.
 pub(super) const PARTS: usize = 1;
 /// Numbers of a run in a block.
 const PART: usize = RUN / PARTS;
@@ -104,10 +109,21 @@ impl Unfold {
     pub(super) fn multiply(&mut self, team: &mut Team, input: &[f32]) {
         let pixels = input.len() / INPUT_CHANNELS;
         self.columns.resize(BLOCKS * pixels * PART);
-        for (panels, columns) in self.panels.iter().zip(self.columns.chunks_exact_mut(pixels * PART)) {
+        for (panels, columns) in self
+            .panels
+            .iter()
+            .zip(self.columns.chunks_exact_mut(pixels * PART))
+        {
             team.split_rows(columns, PART, 1, |first, columns| {
-                let rows = &input[first * INPUT_CHANNELS..][..columns.len() / PART * INPUT_CHANNELS];
-                product(Rows::Matrix(rows), panels, Start::Zero, Finish::Plain, columns);
+                let rows =
+                    &input[first * INPUT_CHANNELS..][..columns.len() / PART * INPUT_CHANNELS];
+                product(
+                    Rows::Matrix(rows),
+                    panels,
+                    Start::Zero,
+                    Finish::Plain,
+                    columns,
+                );
             });
         }
     }
@@ -138,7 +154,8 @@ impl Unfold {
         &self.columns[(block * pixels + pixel) * PART..][..PART]
     }
 
-    /// First half of the backward pass: what each input pixel sees of the gradient grad back to the images, `[n, 5, 11, 128]`.
+    /// First half of the backward pass: what each input pixel sees of the gradient grad back to the
+    /// images, `[n, 5, 11, 128]`.
     pub(super) fn gather(&mut self, grad: &[f32]) {
         let images = grad.len() / (ROWS * ROW);
         self.columns.resize(BLOCKS * INPUTS * images * PART);
@@ -155,10 +172,11 @@ impl Unfold {
         }
     }
 
-    /// Second half: the gradient with respect to the inputs of some images, `[3 · images, 1024]`, the first of which is number `first` of the batch; zero where
-    /// `gate` is.
+    /// Second half: the gradient with respect to the inputs of some images, `[3 · images, 1024]`,
+    /// the first of which is number `first` of the batch; zero where `gate` is.
     ///
-    /// The weights are the left operand, read where they lie, and not packed for it: pixels are few, weights are many.
+    /// The weights are the left operand, read where they lie, and not packed for it: pixels are
+    /// few, weights are many.
     pub(super) fn backward(
         &self,
         parameters: &[f32],
@@ -199,18 +217,28 @@ impl Unfold {
         }
     }
 
-    /// At least the sum of the weights' gradient's squares (Cauchy and Schwarz): if it is finite, so is each of them.
+    /// At least the sum of the weights' gradient's squares (Cauchy and Schwarz): if it is finite,
+    /// so is each of them.
     pub(super) fn gradient_bound(&self, isa: Isa, input: &[f32]) -> f64 {
         squares(isa, input) * squares(isa, &self.columns)
     }
 
     /// The weights in blocks.
-    pub(super) fn blocks<'a>(&'a mut self, parameters: &'a mut [f32], moments: [&'a mut [f32]; 2]) -> Vec<Block<'a>> {
+    pub(super) fn blocks<'a>(
+        &'a mut self,
+        parameters: &'a mut [f32],
+        moments: [&'a mut [f32]; 2],
+    ) -> Vec<Block<'a>> {
         let range = self.place.weight.clone();
         let [first, second] = moments.map(|moment| moment[range.clone()].chunks_exact_mut(BLOCK));
         let columns = self.columns.chunks_exact(self.columns.len() / BLOCKS);
         let weights = parameters[range].chunks_exact_mut(BLOCK);
-        let blocks = self.panels.iter_mut().zip(columns).zip(weights).zip(first.zip(second));
+        let blocks = self
+            .panels
+            .iter_mut()
+            .zip(columns)
+            .zip(weights)
+            .zip(first.zip(second));
         blocks
             .map(|(((panels, columns), weights), (first, second))| Block {
                 panels,
@@ -229,9 +257,16 @@ impl Unfold {
 
 impl Block<'_> {
     /// The gradient of this block's weights, `[1024, PART]`. `input`: `[3 n, 1024]`.
-    pub(super) fn gradient<'a>(&self, isa: Isa, input: &[f32], scratch: &'a mut UnfoldScratch) -> &'a [f32] {
+    pub(super) fn gradient<'a>(
+        &self,
+        isa: Isa,
+        input: &[f32],
+        scratch: &'a mut UnfoldScratch,
+    ) -> &'a [f32] {
         let UnfoldScratch {
-            team, gradient: found, ..
+            team,
+            gradient: found,
+            ..
         } = scratch;
         found.resize(BLOCK);
         let left = Matrix::of_rows(input, INPUT_CHANNELS);
@@ -242,7 +277,13 @@ impl Block<'_> {
     /// Moves the weights against the gradient left by [`Block::gradient`], and packs them.
     pub(super) fn step(&mut self, isa: Isa, adam: AdamStep, scratch: &mut UnfoldScratch) {
         let [first, second] = &mut self.moments;
-        adam.apply(&mut scratch.team, isa, self.weights, &scratch.gradient, [first, second]);
+        adam.apply(
+            &mut scratch.team,
+            isa,
+            self.weights,
+            &scratch.gradient,
+            [first, second],
+        );
         self.panels.pack(Matrix::of_rows(self.weights, PART));
     }
 }

@@ -1,7 +1,9 @@
-//! Drives one target for as long as wanted, following coverage. Started by `launch/fuzz.sh`, which builds it with the counters this takes.
+//! Drives one target for as long as wanted, following coverage. Started by `launch/fuzz.sh`, which
+//! builds it with the counters this takes.
 //!
-//! `SKEIN_FUZZ_TARGET` names the target; without it the targets are listed. Arguments are libFuzzer's; the first is the folder of the growing corpus,
-//! into which the target's samples and its committed inputs are written first.
+//! `SKEIN_FUZZ_TARGET` names the target; without it the targets are listed. Arguments are
+//! libFuzzer's; the first is the folder of the growing corpus, into which the target's samples and
+//! its committed inputs are written first.
 
 #![no_main]
 
@@ -60,7 +62,10 @@ fn list() -> ! {
 /// Writes the inputs there are into the folder that is the first argument, if it is one.
 fn begin() {
     let driven = driven();
-    let Some(folder) = env::args().nth(1).filter(|folder| Path::new(folder).is_dir()) else {
+    let Some(folder) = env::args()
+        .nth(1)
+        .filter(|folder| Path::new(folder).is_dir())
+    else {
         return;
     };
     for (number, input) in driven.inputs.iter().enumerate() {
@@ -75,7 +80,8 @@ fuzz_target!(init: begin(), |bytes: &[u8]| {
     driven().target.exercise(bytes);
 });
 
-// Half of the time by libFuzzer's own mutations, which know what was compared with what; half by ours, which know words and numbers.
+// Half of the time by libFuzzer's own mutations, which know what was compared with what; half by
+// ours, which know words and numbers.
 fuzz_mutator!(|data: &mut [u8], size: usize, max_size: usize, seed: u32| {
     let mut rng = Pcg64Mcg::seed_from_u64(seed.into());
     if rng.random() {

@@ -1,5 +1,5 @@
-//! What a learner resumes from: each file of a checkpoint under a manifest that matches it, so that what stands behind the checksums is reached; and the
-//! metrics that it goes on with.
+//! What a learner resumes from: each file of a checkpoint under a manifest that matches it, so that
+//! what stands behind the checksums is reached; and the metrics that it goes on with.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, LazyLock};
 
-use skein_learner::checkpoint::{CheckpointState, CheckpointStore, EpochOrder, Progress, checkpoint_directory};
+use skein_learner::checkpoint::{
+    CheckpointState, CheckpointStore, EpochOrder, Progress, checkpoint_directory,
+};
 use skein_learner::disk::Disk;
 use skein_learner::episodes::assembly::Keep;
 use skein_learner::metrics::{EpisodeRow, EpisodesCsv, EventFile, EventWriter};
@@ -59,7 +61,8 @@ pub(super) const EVENT_FILES: Target = Target {
 
 /// Episodes that the checkpoint is of.
 const EPISODES: u64 = 7;
-/// What the first byte of an input counts through. The configuration is read only to say what differs, the manifest before all else.
+/// What the first byte of an input counts through. The configuration is read only to say what
+/// differs, the manifest before all else.
 const FILE_NAMES: [&str; 6] = [
     "tensors.safetensors",
     "replay.safetensors",
@@ -327,18 +330,29 @@ fn event_files(bytes: &[u8]) -> Verdict {
             bytes: bytes.parse().ok()?,
         })
     };
-    let files: Vec<EventFile> = bytes.split(|byte| *byte == b'\n').filter_map(file).collect();
+    let files: Vec<EventFile> = bytes
+        .split(|byte| *byte == b'\n')
+        .filter_map(file)
+        .collect();
     with_files(&[("outside", b"untouched")], |folder| {
         let curves = folder.join("tensorboard");
         fs::create_dir_all(&curves).unwrap();
-        fs::write(curves.join("events.out.tfevents.1.skein.000000"), b"12345678").unwrap();
+        fs::write(
+            curves.join("events.out.tfevents.1.skein.000000"),
+            b"12345678",
+        )
+        .unwrap();
         let mut resumed = EventWriter::resume(&curves, files.clone(), 0, &DISK).ok();
         if let Some(writer) = &mut resumed {
             writer.scalars(1, &[("a", 1.0)]).unwrap();
             writer.flush().unwrap();
         }
         fs::remove_dir_all(curves).unwrap();
-        assert_eq!(fs::read(folder.join("outside")).unwrap(), b"untouched", "{files:?}");
+        assert_eq!(
+            fs::read(folder.join("outside")).unwrap(),
+            b"untouched",
+            "{files:?}"
+        );
         // The last one is the file just begun.
         Verdict::of(resumed.filter(|writer| writer.files().len() == files.len() + 1))
     })

@@ -55,7 +55,12 @@ pub(super) const EXPERIMENT: Target = Target {
             match Experiment::load(folder, "fuzzed", None) {
                 Ok(experiment) => {
                     assert!((1..=MOST_ARMS).contains(&experiment.arms.len()));
-                    assert!(experiment.arms.iter().all(|arm| arm.config.validate().is_ok()));
+                    assert!(
+                        experiment
+                            .arms
+                            .iter()
+                            .all(|arm| arm.config.validate().is_ok())
+                    );
                     Verdict::Accepted
                 }
                 Err(error) => {
@@ -104,7 +109,8 @@ fn check(read: Result<Config, ConfigError>) -> Verdict {
     match read {
         Ok(config) => {
             let again = Config::parse(&config.to_toml(), file(), &[]).unwrap();
-            // As text: the simulator's section, which this reader passes on, may hold what is not equal to itself.
+            // As text: the simulator's section, which this reader passes on, may hold what is not
+            // equal to itself.
             assert_eq!(again.to_toml(), config.to_toml());
             assert_eq!(again.digest(), config.digest());
             assert!(SnapshotLayout::of(&config).values() > 0);
@@ -113,7 +119,10 @@ fn check(read: Result<Config, ConfigError>) -> Verdict {
         }
         Err(error) => {
             let told = error.to_string();
-            assert!(told.contains("fuzzed.toml") || told.contains("--set"), "{told}");
+            assert!(
+                told.contains("fuzzed.toml") || told.contains("--set"),
+                "{told}"
+            );
             Verdict::Refused
         }
     }
@@ -146,7 +155,11 @@ fn overridden(bytes: &[u8]) -> Verdict {
 }
 
 fn simulator_samples() -> Vec<Vec<u8>> {
-    let mut samples = vec![toml::to_string(&SimulatorSettings::default()).unwrap().into_bytes()];
+    let mut samples = vec![
+        toml::to_string(&SimulatorSettings::default())
+            .unwrap()
+            .into_bytes(),
+    ];
     samples.extend(
         [
             "max_steps = 3\n[vehicle]\npreset = \"hummingbird\"\nforward_speed_mps = 10.0\ncontrol_period_secs = 0.01\n",

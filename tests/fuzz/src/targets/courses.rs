@@ -1,4 +1,5 @@
-//! Courses: from a file, from a layout that a file may spell, and drawn from ranges. What is accepted can be flown, from every level.
+//! Courses: from a file, from a layout that a file may spell, and drawn from ranges. What is
+//! accepted can be flown, from every level.
 
 use std::sync::Arc;
 
@@ -6,7 +7,8 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_simulator::camera::IMAGE_PIXELS;
 use skein_simulator::course::{
-    Corridor, Course, CourseLayout, GeneratedShape, GeneratorRanges, Opening, Shape, StartArea, WallLabel, WallLayout,
+    Corridor, Course, CourseLayout, GeneratedShape, GeneratorRanges, Opening, Shape, StartArea,
+    WallLabel, WallLayout,
 };
 use skein_simulator::reward::RewardTerms;
 use skein_simulator::simulator::{Outcome, Simulator, SimulatorSettings};
@@ -98,9 +100,14 @@ fn suite_samples() -> Vec<Vec<u8>> {
 }
 
 fn file_samples() -> Vec<Vec<u8>> {
-    ["training", "rearranged_34125", "rearranged_53412", "non_rectangular"]
-        .map(|name| shipped(&format!("configs/courses/{name}.toml")))
-        .to_vec()
+    [
+        "training",
+        "rearranged_34125",
+        "rearranged_53412",
+        "non_rectangular",
+    ]
+    .map(|name| shipped(&format!("configs/courses/{name}.toml")))
+    .to_vec()
 }
 
 /// Scripts whose choices are all in the middle of what is usual, or drawn.
@@ -125,7 +132,8 @@ fn generator_samples() -> Vec<Vec<u8>> {
         .map(|walls| {
             let seed = [walls; 8];
             let shapes = [3, walls, walls + 1, walls + 2];
-            // Before the walls: two ranges, corridor, start, gap; then the thickness and a place for each.
+            // Before the walls: two ranges, corridor, start, gap; then the thickness and a place
+            // for each.
             [
                 &seed[..],
                 &numbers(11),
@@ -138,7 +146,8 @@ fn generator_samples() -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// Flies the first step from the first and the last level: nothing panics, every number is finite, and an episode does not begin in a wall.
+/// Flies the first step from the first and the last level: nothing panics, every number is finite,
+/// and an episode does not begin in a wall.
 pub(super) fn assert_flyable(course: Course) -> Verdict {
     let settings = SimulatorSettings::default();
     let levels = course.levels();
@@ -151,16 +160,29 @@ pub(super) fn assert_flyable(course: Course) -> Verdict {
 /// Flies two steps from `level`.
 pub(super) fn fly(simulator: &mut Simulator, settings: &SimulatorSettings, level: u8) {
     let [mut start, mut disturbances] = [1, 2].map(Pcg64Mcg::seed_from_u64);
-    simulator.reset(level, &mut start, &mut disturbances).unwrap();
+    simulator
+        .reset(level, &mut start, &mut disturbances)
+        .unwrap();
     let mut image = [0; IMAGE_PIXELS];
     for action in [[0.0, 0.0], [1.0, -1.0]] {
         simulator.render(&mut image);
         let report = simulator.step(action).unwrap();
         let state = simulator.state();
-        let numbers = [state.position_m.coords, state.velocity_mps, state.body_rates_radps];
-        assert!(numbers.iter().flatten().all(|value| value.is_finite()), "{state:?}");
+        let numbers = [
+            state.position_m.coords,
+            state.velocity_mps,
+            state.body_rates_radps,
+        ];
         assert!(
-            state.world_from_body.coords.iter().all(|value| value.is_finite()),
+            numbers.iter().flatten().all(|value| value.is_finite()),
+            "{state:?}"
+        );
+        assert!(
+            state
+                .world_from_body
+                .coords
+                .iter()
+                .all(|value| value.is_finite()),
             "{state:?}"
         );
         simulator.render(&mut image);
@@ -224,7 +246,9 @@ fn shape(script: &mut Script<'_>) -> Shape {
     let (width_m, height_m) = (length_m(), length_m());
     match kind {
         0 => Shape::Rectangle { width_m, height_m },
-        1 => Shape::Circle { diameter_m: width_m },
+        1 => Shape::Circle {
+            diameter_m: width_m,
+        },
         2 => Shape::Triangle { width_m, height_m },
         3 => Shape::Diamond { width_m, height_m },
         4 => Shape::Cross {
@@ -241,7 +265,8 @@ fn shape(script: &mut Script<'_>) -> Shape {
     }
 }
 
-/// Corners around the centre or anywhere: some polygons are simple, some are not, some have corners on top of each other.
+/// Corners around the centre or anywhere: some polygons are simple, some are not, some have corners
+/// on top of each other.
 fn polygon(script: &mut Script<'_>) -> Shape {
     let corners = script.u8() % 80;
     let round = script.u8() < 192;
@@ -260,7 +285,8 @@ fn polygon(script: &mut Script<'_>) -> Shape {
 }
 
 fn ranges(script: &mut Script<'_>) -> GeneratorRanges {
-    let mut range = |usual: std::ops::RangeInclusive<f32>| [script.number(usual.clone()), script.number(usual)];
+    let mut range =
+        |usual: std::ops::RangeInclusive<f32>| [script.number(usual.clone()), script.number(usual)];
     let (clearance_m, rotation_deg) = (range(0.6..=1.3), range(-360.0..=360.0));
     let (corridor, start) = (corridor(script), start(script));
     let gap_m = script.number(5.0..=20.0);

@@ -23,13 +23,15 @@ pub struct Target {
     pub longest_bytes: usize,
     /// Its part in a number of executions over all targets: slow ones get fewer.
     pub weight: usize,
-    /// Valid inputs, made by the code that writes them or from what is shipped: no format has to be kept in step by hand.
+    /// Valid inputs, made by the code that writes them or from what is shipped: no format has to be
+    /// kept in step by hand.
     pub samples: fn() -> Vec<Vec<u8>>,
     /// Reads the input; panics when a promise is broken.
     pub run: fn(&[u8]) -> Verdict,
 }
 
-/// What the reader thought of an input. A target of which nothing is ever accepted would try no promise.
+/// What the reader thought of an input. A target of which nothing is ever accepted would try no
+/// promise.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
     /// Something of it was believed.
@@ -102,7 +104,8 @@ fn tagged(kind: u8, content: &[u8]) -> Vec<u8> {
     [&[kind], content].concat()
 }
 
-/// The input as text; what is not UTF-8 is refused by whoever opens a file, before any reader of ours sees it.
+/// The input as text; what is not UTF-8 is refused by whoever opens a file, before any reader of
+/// ours sees it.
 fn text(bytes: &[u8]) -> Option<&str> {
     std::str::from_utf8(bytes).ok()
 }

@@ -1,4 +1,5 @@
-//! Transition and status records in any sequence, through the learner's dispatcher: whatever comes, an episode is committed whole, once and finite, or not at all.
+//! Transition and status records in any sequence, through the learner's dispatcher: whatever comes,
+//! an episode is committed whole, once and finite, or not at all.
 
 use std::collections::BTreeSet;
 use std::mem::offset_of;
@@ -9,7 +10,9 @@ use skein_learner::episode::CommittedEpisode;
 use skein_learner::episodes::assembly::Keep;
 use skein_learner::episodes::dispatcher::{Dispatcher, Order, Place};
 use skein_protocol::config::TransportSection;
-use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, Epoch, PolicyVersion, RunId};
+use skein_protocol::ids::{
+    ActorId, ActorIncarnation, Attempt, EpisodeId, Epoch, PolicyVersion, RunId,
+};
 use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
@@ -65,7 +68,17 @@ fn samples() -> Vec<Vec<u8>> {
         [4, 0, 0, 1, low, high, value]
     };
     vec![
-        [&ATTACH[..], &ISSUE, &STEP, &STEP, &CLOSE, &ISSUE, &STEP, &CLOSE].concat(),
+        [
+            &ATTACH[..],
+            &ISSUE,
+            &STEP,
+            &STEP,
+            &CLOSE,
+            &ISSUE,
+            &STEP,
+            &CLOSE,
+        ]
+        .concat(),
         [
             &ATTACH[..],
             &ISSUE,
@@ -187,7 +200,11 @@ impl Learner {
             actor: ActorId(u32::from(script.u8() % 3)),
             incarnation: ActorIncarnation(u64::from(script.u8() % 4)),
             pid: 1,
-            state: script.one_of(&[ActorState::Serving, ActorState::Serving, ActorState::Leaving]),
+            state: script.one_of(&[
+                ActorState::Serving,
+                ActorState::Serving,
+                ActorState::Leaving,
+            ]),
             newest_policy: None,
             episodes_flown: 0,
             times: Times::default(),
@@ -202,10 +219,12 @@ impl Learner {
                 Ok(Control::Rejoin) => continue,
                 other => panic!("the dispatcher sends tickets and letters, not {other:?}"),
             };
-            let incarnations =
-                (0..3).flat_map(|actor| (0..4).map(move |incarnation| (ActorId(actor), ActorIncarnation(incarnation))));
+            let incarnations = (0..3).flat_map(|actor| {
+                (0..4).map(move |incarnation| (ActorId(actor), ActorIncarnation(incarnation)))
+            });
             // Other actors came by records of random bytes and hold theirs for ever.
-            for (actor, incarnation) in incarnations.filter(|&(actor, incarnation)| message.is_for(actor, incarnation))
+            for (actor, incarnation) in
+                incarnations.filter(|&(actor, incarnation)| message.is_for(actor, incarnation))
             {
                 self.held.push(Held {
                     ticket: ticket.clone(),
@@ -218,7 +237,11 @@ impl Learner {
     }
 
     /// The next record of a ticket, as it should be but for what `change` makes of it.
-    fn send(&mut self, script: &mut Script<'_>, change: fn(&mut TransitionRecord, &mut Script<'_>)) {
+    fn send(
+        &mut self,
+        script: &mut Script<'_>,
+        change: fn(&mut TransitionRecord, &mut Script<'_>),
+    ) {
         let (which, end) = (usize::from(script.u8()), script.u8() % 4);
         let count = self.held.len();
         let Some(held) = self.held.get_mut(which % count.max(1)) else {
@@ -240,7 +263,10 @@ impl Learner {
     fn receive(&mut self, record: &TransitionRecord) {
         // A hopeless episode ends a run; here the others are flown on.
         if let Ok(Some((place, episode))) = self.dispatcher.on_record(record, self.now) {
-            assert!(self.committed.insert(place), "{place:?} was committed twice");
+            assert!(
+                self.committed.insert(place),
+                "{place:?} was committed twice"
+            );
             assert_sound(&episode);
         }
     }
@@ -269,11 +295,18 @@ fn assert_sound(episode: &CommittedEpisode) {
         (episode.policy_version, episode.level),
         (ticket.policy_version, ticket.start_level)
     );
-    assert_eq!(episode.depth.is_some(), keep(episode.episode.0) == Keep::Depth);
+    assert_eq!(
+        episode.depth.is_some(),
+        keep(episode.episode.0) == Keep::Depth
+    );
     assert!(episode.observations.len() <= LONGEST_EPISODE);
     assert!(episode.walls_passed <= episode.course_walls);
     let codes = episode.observations.iter();
-    assert!(codes.flat_map(|seen| &seen.latent[LATENT..]).all(|&value| value == 0.0));
+    assert!(
+        codes
+            .flat_map(|seen| &seen.latent[LATENT..])
+            .all(|&value| value == 0.0)
+    );
     let actions = episode.actions.iter().flatten();
     assert!(actions.clone().all(|action| action.abs() <= 1.0));
     let seen = episode.observations.iter().flat_map(|seen| {

@@ -1,4 +1,5 @@
-//! The replay buffer's content, as a checkpoint whose checksums are right may hold it: what is restored can be drawn from and goes on.
+//! The replay buffer's content, as a checkpoint whose checksums are right may hold it: what is
+//! restored can be drawn from and goes on.
 
 use std::sync::Arc;
 
@@ -19,7 +20,14 @@ pub(super) const REPLAY: Target = Target {
     reads: "contents of a replay buffer, spelt by a script of lengths and numbers",
     longest_bytes: 512,
     weight: USUAL / 10,
-    samples: || vec![Vec::new(), vec![0; 40], [2, 3, 1].repeat(20), (0..=255).collect()],
+    samples: || {
+        vec![
+            Vec::new(),
+            vec![0; 40],
+            [2, 3, 1].repeat(20),
+            (0..=255).collect(),
+        ]
+    },
     run: restore,
 };
 
@@ -58,14 +66,16 @@ fn restore(bytes: &[u8]) -> Verdict {
     }
     // An episode more: taken in, or refused for want of room for its images.
     let _ = replay.insert(episode());
-    let encode = |images: &[u8]| Ok::<_, ()>(vec![[0.5; LONGEST_LATENT]; images.len() / IMAGE_PIXELS]);
+    let encode =
+        |images: &[u8]| Ok::<_, ()>(vec![[0.5; LONGEST_LATENT]; images.len() / IMAGE_PIXELS]);
     replay.renew_latents(8, encode).unwrap();
     replay.freeze();
     assert_eq!(replay.image_count(), None);
     Verdict::Accepted
 }
 
-/// The same content where a policy learns from the images: what is taken is drawn from, with its images, and gone on with until images are given up.
+/// The same content where a policy learns from the images: what is taken is drawn from, with its
+/// images, and gone on with until images are given up.
 fn restore_end_to_end(state: ReplayState) {
     let mut config = config();
     config.learning.encoder = EncoderTraining::EndToEnd;
@@ -77,7 +87,10 @@ fn restore_end_to_end(state: ReplayState) {
     for _ in 0..3 {
         replay.insert(episode()).unwrap();
         replay.sample(&mut rng, 4, &mut drawn);
-        assert_eq!([drawn.images.len(), drawn.next_images.len()], [4 * IMAGE_PIXELS; 2]);
+        assert_eq!(
+            [drawn.images.len(), drawn.next_images.len()],
+            [4 * IMAGE_PIXELS; 2]
+        );
     }
 }
 
@@ -96,7 +109,9 @@ fn ring(script: &mut Script<'_>, capacity: usize) -> RingState {
         255 => script.u64(),
         few => u64::from(few % 64),
     };
-    let filled = usize::try_from(inserted).unwrap_or(usize::MAX).min(capacity);
+    let filled = usize::try_from(inserted)
+        .unwrap_or(usize::MAX)
+        .min(capacity);
     let extra = usize::from(script.u8() == 255);
     let numbers = match script.u8() % 3 {
         0 => filled + extra,

@@ -1,4 +1,5 @@
-//! What plots are drawn from: `episodes.csv`, `evaluation_trajectories.csv`, and the images beside their reconstructions.
+//! What plots are drawn from: `episodes.csv`, `evaluation_trajectories.csv`, and the images beside
+//! their reconstructions.
 
 use std::sync::LazyLock;
 
@@ -40,11 +41,17 @@ pub(super) const CURVES: Target = Target {
     run: |bytes| {
         let file = match bytes.split_first() {
             Some((128.., file)) => file.to_vec(),
-            _ => bytes.split(|byte| *byte == b'\n').flat_map(framed).collect(),
+            _ => bytes
+                .split(|byte| *byte == b'\n')
+                .flat_map(framed)
+                .collect(),
         };
         with_files(&[("events.out.tfevents.1", &file)], |folder| {
             if let Err(error) = read_curves(folder) {
-                assert!(error.to_string().contains("events.out.tfevents.1"), "{error}");
+                assert!(
+                    error.to_string().contains("events.out.tfevents.1"),
+                    "{error}"
+                );
                 return Verdict::Refused;
             }
             Verdict::Accepted
@@ -52,7 +59,8 @@ pub(super) const CURVES: Target = Target {
     },
 };
 
-/// One message as it stands in an event file: length, masked CRC-32C of the length, message, masked CRC-32C of the message.
+/// One message as it stands in an event file: length, masked CRC-32C of the length, message, masked
+/// CRC-32C of the message.
 fn framed(message: &[u8]) -> Vec<u8> {
     let length = (message.len() as u64).to_le_bytes();
     let masked = |bytes: &[u8]| {
@@ -79,7 +87,11 @@ fn curve_samples() -> Vec<Vec<u8>> {
     let read = with_files(&[("events.out.tfevents.1", &framed(&message))], |folder| {
         read_curves(folder).unwrap()
     });
-    assert_eq!(read["return"][&7], [1.5], "the sample is an event of another version");
+    assert_eq!(
+        read["return"][&7],
+        [1.5],
+        "the sample is an event of another version"
+    );
     vec![message.clone(), tagged(128, &framed(&message))]
 }
 
@@ -135,7 +147,9 @@ fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory) -> Verdict) -> Verdic
         return Verdict::Refused;
     };
     let name = NAMES[usize::from(kind) % NAMES.len()];
-    with_files(&[(name, content)], |folder| read(&RunDirectory::new(folder)))
+    with_files(&[(name, content)], |folder| {
+        read(&RunDirectory::new(folder))
+    })
 }
 
 fn samples() -> Vec<Vec<u8>> {

@@ -1,4 +1,5 @@
-//! What lies in a run's directory besides configuration and snapshots, and what its learner says on standard output.
+//! What lies in a run's directory besides configuration and snapshots, and what its learner says on
+//! standard output.
 
 use std::sync::LazyLock;
 
@@ -38,10 +39,13 @@ pub(super) const ANNOUNCEMENT: Target = Target {
     },
     run: |bytes| {
         let read = serde_json::from_slice::<Announcement>(bytes).ok();
-        let joined = read.filter(|announcement| announcement.check(&IDENTIFIED.0, &IDENTIFIED.1).is_ok());
+        let joined =
+            read.filter(|announcement| announcement.check(&IDENTIFIED.0, &IDENTIFIED.1).is_ok());
         if let Some(announcement) = &joined {
-            // LearnerIncarnation and process are the learner's to choose; in all else it is what we would say.
-            let mut mine = Announcement::new(&IDENTIFIED.0, announcement.incarnation, &IDENTIFIED.1);
+            // LearnerIncarnation and process are the learner's to choose; in all else it is what we
+            // would say.
+            let mut mine =
+                Announcement::new(&IDENTIFIED.0, announcement.incarnation, &IDENTIFIED.1);
             mine.pid = announcement.pid;
             assert_eq!(announcement, &mine);
         }
@@ -95,7 +99,10 @@ fn identity(bytes: &[u8]) -> Verdict {
                 Verdict::Accepted
             }
             Err(error) => {
-                assert!(error.to_string().contains(&folder.display().to_string()), "{error}");
+                assert!(
+                    error.to_string().contains(&folder.display().to_string()),
+                    "{error}"
+                );
                 Verdict::Refused
             }
         },
@@ -114,14 +121,18 @@ fn result_samples() -> Vec<Vec<u8>> {
         policy_sha256: "1024266715d59141".to_owned(),
         courses: vec![CourseEvaluation::of("training", 5, &scores)],
     };
-    // Read, not made: it has fields for whatever a run may come to, and a reader that knows fewer of them reads it too.
+    // Read, not made: it has fields for whatever a run may come to, and a reader that knows fewer
+    // of them reads it too.
     let summary = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"1024266715d59141","final_version":80,
         "best_version":70,"best_confirmed_walls_passed":4.9,"episodes":800,"steps":42837,"updates":20418,"vae_updates":400,
         "evaluation_episodes":400,"tickets_reissued":0,"records_refused":0,"wall_secs":333.3,
         "stages":[{"thread":"actors","stage":"physics","count":42000,"secs":12.5},{"thread":"training","stage":"idle","count":80,"secs":200.0}]}"#;
     let read: Summary = serde_json::from_str(summary).unwrap();
     let written = serde_json::to_vec(&read).unwrap();
-    vec![tagged(0, &serde_json::to_vec(&report).unwrap()), tagged(1, &written)]
+    vec![
+        tagged(0, &serde_json::to_vec(&report).unwrap()),
+        tagged(1, &written),
+    ]
 }
 
 fn results(bytes: &[u8]) -> Verdict {
@@ -160,7 +171,10 @@ fn progress_samples() -> Vec<Vec<u8>> {
     let understood = sample
         .split(|byte| *byte == b'\n')
         .all(|line| serde_json::from_slice::<Progress>(line).is_ok());
-    assert!(understood, "the samples are the progress of another version");
+    assert!(
+        understood,
+        "the samples are the progress of another version"
+    );
     vec![sample]
 }
 

@@ -1,4 +1,5 @@
-//! Status and control records and tickets of segments, bit for bit: what is believed says the same when it is written again.
+//! Status and control records and tickets of segments, bit for bit: what is believed says the same
+//! when it is written again.
 
 use std::time::Duration;
 
@@ -49,9 +50,20 @@ fn signal_samples() -> Vec<Vec<u8>> {
         flown: vec![[0.5, -1.0]; 3].into(),
     };
     vec![
-        bytes_of(&SegmentRecord::fly(&ticket, &segment, ActorId(3), ActorIncarnation(7))).to_vec(),
+        bytes_of(&SegmentRecord::fly(
+            &ticket,
+            &segment,
+            ActorId(3),
+            ActorIncarnation(7),
+        ))
+        .to_vec(),
         bytes_of(&StatusRecord::new(run, &status)).to_vec(),
-        bytes_of(&ControlRecord::fly(&ticket, ActorId(3), ActorIncarnation(7))).to_vec(),
+        bytes_of(&ControlRecord::fly(
+            &ticket,
+            ActorId(3),
+            ActorIncarnation(7),
+        ))
+        .to_vec(),
         bytes_of(&ControlRecord::heartbeat(run)).to_vec(),
         bytes_of(&ControlRecord::stop(run)).to_vec(),
         bytes_of(&ControlRecord::rejoin(run, ActorId(3), ActorIncarnation(7))).to_vec(),
@@ -66,7 +78,8 @@ pub(super) fn pod<T: Pod + Zeroable>(bytes: &[u8]) -> T {
     pod_read_unaligned(&padded)
 }
 
-/// All kinds of records begin with their run: taken from there, it never hides the rest from its reader.
+/// All kinds of records begin with their run: taken from there, it never hides the rest from its
+/// reader.
 fn run_of(bytes: &[u8]) -> RunId {
     RunId(pod(bytes))
 }
@@ -97,7 +110,14 @@ fn segment(record: SegmentRecord, run: RunId) -> Option<()> {
         panic!("a record of a segment is a ticket or nothing");
     };
     let segment = ticket.segment.clone().expect("it is of a segment");
-    assert!(segment.steps > 0 && segment.flown.iter().flatten().all(|command| command.abs() <= 1.0));
+    assert!(
+        segment.steps > 0
+            && segment
+                .flown
+                .iter()
+                .flatten()
+                .all(|command| command.abs() <= 1.0)
+    );
     let again = SegmentRecord::fly(&ticket, &segment, ActorId(1), ActorIncarnation(2));
     assert_eq!(again.read(run), Ok(Control::Fly(ticket)));
     Some(())

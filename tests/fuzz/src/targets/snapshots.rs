@@ -1,4 +1,5 @@
-//! Snapshots, from a file and off the wire. A sound one is 3 MB of parameters; inputs change some of them, the header, and the length.
+//! Snapshots, from a file and off the wire. A sound one is 3 MB of parameters; inputs change some
+//! of them, the header, and the length.
 
 use std::cell::RefCell;
 use std::path::Path;
@@ -48,7 +49,9 @@ static SOUND: LazyLock<Sound> = LazyLock::new(|| {
     let layout = SnapshotLayout::of(&config);
     let snapshot = Snapshot {
         version: PolicyVersion(3),
-        values: (0..layout.values()).map(|index| (index as f32).sin()).collect(),
+        values: (0..layout.values())
+            .map(|index| (index as f32).sin())
+            .collect(),
     };
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("sound.safetensors");
@@ -64,11 +67,13 @@ static SOUND: LazyLock<Sound> = LazyLock::new(|| {
 });
 
 thread_local! {
-    /// A sound snapshot's values after room for a header, so that 3 MB need not be copied for each input.
+    /// A sound snapshot's values after room for a header, so that 3 MB need not be copied for each
+    /// input.
     static BUFFER: RefCell<Vec<u8>> = RefCell::new([vec![0; FILE.longest_bytes], SOUND.values.clone()].concat());
 }
 
-/// The input's first eight bytes are the length of the file's header; the sound one's is right if the rest is as long.
+/// The input's first eight bytes are the length of the file's header; the sound one's is right if
+/// the rest is as long.
 fn file(bytes: &[u8]) -> Verdict {
     BUFFER.with_borrow_mut(|buffer| {
         let start = FILE.longest_bytes - bytes.len();
@@ -77,8 +82,8 @@ fn file(bytes: &[u8]) -> Verdict {
         if let Some(length) = buffer[start..FILE.longest_bytes].first_chunk_mut::<8>() {
             *length = (bytes.len() as u64 - 8).to_le_bytes();
         }
-        let sound =
-            [&buffer[start..], bytes].map(|file| match Snapshot::parse(file, Path::new("fuzzed.safetensors")) {
+        let sound = [&buffer[start..], bytes].map(|file| {
+            match Snapshot::parse(file, Path::new("fuzzed.safetensors")) {
                 Ok((snapshot, config)) => {
                     check(&snapshot, &SnapshotLayout::of(&config));
                     Some(snapshot)
@@ -87,7 +92,8 @@ fn file(bytes: &[u8]) -> Verdict {
                     assert!(error.to_string().contains("fuzzed.safetensors"), "{error}");
                     None
                 }
-            });
+            }
+        });
         Verdict::of(sound.into_iter().flatten().next())
     })
 }
@@ -97,7 +103,8 @@ fn check(snapshot: &Snapshot, layout: &SnapshotLayout) {
     assert!(snapshot.values.iter().all(|value| value.is_finite()));
 }
 
-/// A header, whether the checksum is made right, bytes cut off, and triples of a place and what is written there.
+/// A header, whether the checksum is made right, bytes cut off, and triples of a place and what is
+/// written there.
 fn received_samples() -> Vec<Vec<u8>> {
     let header = SOUND.snapshot.header(RUN, &SOUND.layout);
     let sample = |script: &[u8]| [bytes_of(&header), script].concat();

@@ -38,7 +38,10 @@ fn refusal(from: &str, to: &str) -> String {
 #[track_caller]
 fn assert_says(message: &str, parts: &[&str]) {
     assert!(message.starts_with("configs/courses/x.toml: "), "{message}");
-    assert!(!message.contains('\n'), "{message:?} has more than one line");
+    assert!(
+        !message.contains('\n'),
+        "{message:?} has more than one line"
+    );
     for part in parts {
         assert!(message.contains(part), "{part:?} is missing in: {message}");
     }
@@ -47,7 +50,11 @@ fn assert_says(message: &str, parts: &[&str]) {
 #[test]
 fn order_puts_walls_into_the_corridor() {
     let course = Course::parse(GOOD, "x.toml").unwrap();
-    let placed: Vec<_> = course.walls().iter().map(|wall| (wall.label().0, wall.x_m())).collect();
+    let placed: Vec<_> = course
+        .walls()
+        .iter()
+        .map(|wall| (wall.label().0, wall.x_m()))
+        .collect();
     assert_eq!(placed, [(7, 10.0), (4, 20.0)]);
     assert_eq!(course.levels(), 2);
 }
@@ -55,8 +62,14 @@ fn order_puts_walls_into_the_corridor() {
 #[test]
 fn an_unknown_key_is_named_with_its_wall_and_line() {
     let message = refusal("diameter_m = 2.2", "diameter_m = 2.2\nradius_m = 1.1");
-    assert_says(&message, &["wall 7", "radius_m", "unknown field", "line 25"]);
-    assert_says(&refusal("name =", "nmae = 3\nname ="), &["course", "nmae", "line 2"]);
+    assert_says(
+        &message,
+        &["wall 7", "radius_m", "unknown field", "line 25"],
+    );
+    assert_says(
+        &refusal("name =", "nmae = 3\nname ="),
+        &["course", "nmae", "line 2"],
+    );
 }
 
 #[test]
@@ -74,7 +87,11 @@ fn a_value_of_the_wrong_kind_is_named_with_its_wall_line_and_key() {
         "",
         "course: line 6: key corridor: missing field `length_m`",
     );
-    says("name = \"two walls\"\n", "", "course: line 1: missing field `name`");
+    says(
+        "name = \"two walls\"\n",
+        "",
+        "course: line 1: missing field `name`",
+    );
     says(
         "height_m = 2.5",
         "height_m = 2.5\nheight_m = 2",
@@ -93,14 +110,23 @@ fn a_file_that_is_no_toml_is_refused_by_wall_line_and_key() {
         &refusal("diameter_m = 2.2", "diameter_m = = 2.2"),
         &["wall 7: line 24: key diameter_m: "],
     );
-    assert_says(&refusal("[start]", "[start"), &["course: line 10: key start: "]);
+    assert_says(
+        &refusal("[start]", "[start"),
+        &["course: line 10: key start: "],
+    );
 }
 
 #[test]
 fn keys_are_those_of_the_shape() {
-    assert_says(&refusal("diameter_m = 2.2", ""), &["wall 7", "diameter_m is missing"]);
+    assert_says(
+        &refusal("diameter_m = 2.2", ""),
+        &["wall 7", "diameter_m is missing"],
+    );
     let foreign = refusal("diameter_m = 2.2", "diameter_m = 2.2\narm_m = 1.0");
-    assert_says(&foreign, &["wall 7", "arm_m does not belong to a circle", "remove it"]);
+    assert_says(
+        &foreign,
+        &["wall 7", "arm_m does not belong to a circle", "remove it"],
+    );
 }
 
 #[test]
@@ -129,10 +155,17 @@ fn an_opening_over_the_rim_is_refused() {
 
 #[test]
 fn a_polygon_that_crosses_itself_is_refused() {
-    let bow_tie = "shape = \"polygon\"\npoints_m = [[-1.5, -1.5], [1.5, 1.5], [1.5, -1.5], [-1.5, 1.5]]\n";
+    let bow_tie =
+        "shape = \"polygon\"\npoints_m = [[-1.5, -1.5], [1.5, 1.5], [1.5, -1.5], [-1.5, 1.5]]\n";
     let text = bow_tie.to_owned() + "centre_m = [0.0, 3.0]";
-    let message = refusal("shape = \"circle\"\ncentre_m = [-1.0, 4.0]\ndiameter_m = 2.2", &text);
-    assert_says(&message, &["wall 7", "crosses or touches itself (edges 1 and 3)"]);
+    let message = refusal(
+        "shape = \"circle\"\ncentre_m = [-1.0, 4.0]\ndiameter_m = 2.2",
+        &text,
+    );
+    assert_says(
+        &message,
+        &["wall 7", "crosses or touches itself (edges 1 and 3)"],
+    );
 }
 
 #[test]
@@ -141,15 +174,24 @@ fn walls_too_close_or_outside_are_refused() {
         &refusal("[10.0, 20.0]", "[10.0, 14.0]"),
         &["wall 4", "leaves 2.50 m", "move the wall back"],
     );
-    assert_says(&refusal("[10.0, 20.0]", "[10.0, 29.5]"), &["wall 4", "wall_x_m = 29.5"]);
-    assert_says(&refusal("[10.0, 20.0]", "[20.0, 10.0]"), &["wall 4", "wall_x_m"]);
+    assert_says(
+        &refusal("[10.0, 20.0]", "[10.0, 29.5]"),
+        &["wall 4", "wall_x_m = 29.5"],
+    );
+    assert_says(
+        &refusal("[10.0, 20.0]", "[20.0, 10.0]"),
+        &["wall 4", "wall_x_m"],
+    );
 }
 
 #[test]
 fn order_must_match_walls_and_places() {
     assert_says(&refusal("[7, 4]", "[7, 5]"), &["order names wall 5"]);
     assert_says(&refusal("[7, 4]", "[7, 7]"), &["wall 7", "order"]);
-    assert_says(&refusal("[7, 4]", "[7]"), &["order has 1 walls and wall_x_m 2 places"]);
+    assert_says(
+        &refusal("[7, 4]", "[7]"),
+        &["order has 1 walls and wall_x_m 2 places"],
+    );
     assert_says(&refusal("label = 7", "label = 4"), &["wall 4", "label"]);
 }
 
@@ -166,5 +208,8 @@ fn numbers_that_are_none_are_refused() {
         assert!(error.contains(key), "{error}");
     }
     assert_says(&refusal("[10.0, 20.0]", "[10.0, nan]"), &["wall 4", "NaN"]);
-    assert_says(&refusal("[-1.0, 4.0]", "[nan, 4.0]"), &["wall 7", "centre_m = NaN"]);
+    assert_says(
+        &refusal("[-1.0, 4.0]", "[nan, 4.0]"),
+        &["wall 7", "centre_m = NaN"],
+    );
 }

@@ -20,12 +20,20 @@ pub(super) fn polygon(rng: &mut impl Rng) -> Shape {
 
 pub(super) fn trapezoid(rng: &mut impl Rng) -> Shape {
     let (upper, height) = (rng.random_range(0.25..=0.4), rng.random_range(0.35..=0.5));
-    let points_m = vec![[-0.5, -height], [0.5, -height], [upper, height], [-upper, height]];
+    let points_m = vec![
+        [-0.5, -height],
+        [0.5, -height],
+        [upper, height],
+        [-upper, height],
+    ];
     Shape::Polygon { points_m }
 }
 
 pub(super) fn t(rng: &mut impl Rng) -> Shape {
-    let (stem, bar) = (rng.random_range(0.225..=0.325), rng.random_range(0.45..=0.65));
+    let (stem, bar) = (
+        rng.random_range(0.225..=0.325),
+        rng.random_range(0.45..=0.65),
+    );
     let under = 0.5 - bar;
     mirrored(&[[stem, -0.5], [stem, under], [0.5, under], [0.5, 0.5]])
 }
@@ -59,7 +67,14 @@ pub(super) fn keyhole(rng: &mut impl Rng) -> Shape {
     let head = (0..=sides).map(|corner| {
         let share = half_slot + (1.0 - 2.0 * half_slot) * corner as f32 / sides as f32;
         let is_neck = corner == 0 || corner == sides;
-        polar(share, if is_neck { 1.0 } else { rng.random_range(0.85..=1.15) })
+        polar(
+            share,
+            if is_neck {
+                1.0
+            } else {
+                rng.random_range(0.85..=1.15)
+            },
+        )
     });
     let mut points_m: Vec<_> = head.collect();
     points_m.extend([-1.0, 1.0].map(|side| [neck + length, side * taper * edge]));
@@ -73,9 +88,17 @@ pub(super) fn crescent(rng: &mut impl Rng) -> Shape {
     let beside: f32 = rng.random_range(0.9..=1.3);
     // Half of the angle under which either centre sees where the two edges cross.
     let crossing = (beside / 2.0).acos() / TAU;
-    let outer = (0..=OUTER).map(|corner| polar(crossing + (1.0 - 2.0 * crossing) * corner as f32 / OUTER as f32, 1.0));
+    let outer = (0..=OUTER).map(|corner| {
+        polar(
+            crossing + (1.0 - 2.0 * crossing) * corner as f32 / OUTER as f32,
+            1.0,
+        )
+    });
     let inner = (1..INNER).map(|corner| {
-        let [y, z] = polar(0.5 + crossing - 2.0 * crossing * corner as f32 / INNER as f32, 1.0);
+        let [y, z] = polar(
+            0.5 + crossing - 2.0 * crossing * corner as f32 / INNER as f32,
+            1.0,
+        );
         [beside + y, z]
     });
     let points_m = outer.chain(inner).collect();

@@ -1,7 +1,8 @@
 //! A run that is disturbed while it goes on.
 //!
-//! What is done to it is a [`Script`]'s business. Here is what every script needs: the hand that kills, freezes and attaches, and the eye on
-//! supervisor, crews and episodes, so that what happens by itself is told from what was done.
+//! What is done to it is a [`Script`]'s business. Here is what every script needs: the hand that
+//! kills, freezes and attaches, and the eye on supervisor, crews and episodes, so that what happens
+//! by itself is told from what was done.
 
 mod supervisor;
 
@@ -21,7 +22,8 @@ use crate::plan::{Disturbance, Manner, Reach};
 use crate::recorder::Recorder;
 use crate::stage::{EpisodeCount, LOOK, Stage, wait};
 
-/// Without a new episode for so long, a run is stuck: the longest pause of a sound one is its evaluation.
+/// Without a new episode for so long, a run is stuck: the longest pause of a sound one is its
+/// evaluation.
 const STUCK: Duration = Duration::from_secs(300);
 /// How long a killed process may take to be gone: the kernel gives its memory back first.
 const DEATH: Duration = Duration::from_secs(2);
@@ -83,7 +85,12 @@ pub(crate) enum Spared {
 
 impl<'a> Storm<'a> {
     /// Over the run that `supervisor` has just been started for.
-    pub(crate) fn new(stage: &'a Stage, supervisor: Child, recorder: Recorder, spared: Spared) -> Self {
+    pub(crate) fn new(
+        stage: &'a Stage,
+        supervisor: Child,
+        recorder: Recorder,
+        spared: Spared,
+    ) -> Self {
         Self {
             stage,
             supervisor: Supervisor::Running {
@@ -169,7 +176,10 @@ impl<'a> Storm<'a> {
         if victims.is_empty() {
             return Ok(Attempt::NobodyThere);
         }
-        self.note("disturbed", &json!({ "disturbance": what, "pids": victims }))?;
+        self.note(
+            "disturbed",
+            &json!({ "disturbance": what, "pids": victims }),
+        )?;
         *self.tally.entry(name(&what)).or_default() += 1;
         Ok(Attempt::Done)
     }
@@ -185,7 +195,9 @@ impl<'a> Storm<'a> {
             .skip(spared)
             .filter(|process| self.frozen.iter().all(|(frozen, _)| frozen != process))
             .collect();
-        candidates.get(choice as usize % candidates.len().max(1)).cloned()
+        candidates
+            .get(choice as usize % candidates.len().max(1))
+            .cloned()
     }
 
     fn strike(&self, role: Role, choice: u32, signal: Signal) -> Vec<i32> {
@@ -220,7 +232,9 @@ impl<'a> Storm<'a> {
     }
 
     fn attach(&mut self, count: u32) -> Result<Vec<i32>> {
-        if !matches!(self.supervisor, Supervisor::Running { .. }) || self.choose(Role::Learner, 0).is_none() {
+        if !matches!(self.supervisor, Supervisor::Running { .. })
+            || self.choose(Role::Learner, 0).is_none()
+        {
             return Ok(Vec::new());
         }
         let crew = self.stage.attach(count)?;
@@ -313,7 +327,8 @@ enum Thaw {
     All,
 }
 
-/// Waits until those that were killed are dead, so that nobody is killed twice; not for ever, because the kernel may have them in its hands.
+/// Waits until those that were killed are dead, so that nobody is killed twice; not for ever,
+/// because the kernel may have them in its hands.
 fn await_death(victims: &[Process]) {
     let end = Instant::now() + DEATH;
     while victims.iter().any(Process::is_alive) && Instant::now() < end {
@@ -333,7 +348,8 @@ fn name(what: &Disturbance) -> &'static str {
         Disturbance::KillLearner => "learners killed",
         Disturbance::FreezeLearner { .. } => "learners frozen",
         Disturbance::KillSupervisor {
-            reach: Reach::Alone, ..
+            reach: Reach::Alone,
+            ..
         } => "supervisors killed",
         Disturbance::KillSupervisor {
             reach: Reach::Everybody,

@@ -1,4 +1,5 @@
-//! The supervisor of a run under fire: its end is told from its death, and after its death the run is resumed.
+//! The supervisor of a run under fire: its end is told from its death, and after its death the run
+//! is resumed.
 
 use std::process::{Child, ExitStatus};
 use std::time::{Duration, Instant};
@@ -11,7 +12,8 @@ use skein_launch::inspection::Role;
 use super::{Storm, await_death, pid};
 use crate::plan::Reach;
 
-/// How long a killed run's processes may keep it from being resumed: a learner that was orphaned ends its epoch and saves.
+/// How long a killed run's processes may keep it from being resumed: a learner that was orphaned
+/// ends its epoch and saves.
 const RESUME: Duration = Duration::from_secs(120);
 /// Between two attempts to resume.
 const RESUME_PAUSE: Duration = Duration::from_millis(500);
@@ -47,7 +49,12 @@ pub(super) enum Told {
 }
 
 impl Storm<'_> {
-    pub(super) fn kill_supervisor(&mut self, reach: Reach, pause_secs: f64, actors: u32) -> Result<Vec<i32>> {
+    pub(super) fn kill_supervisor(
+        &mut self,
+        reach: Reach,
+        pause_secs: f64,
+        actors: u32,
+    ) -> Result<Vec<i32>> {
         let Supervisor::Running { child, .. } = &mut self.supervisor else {
             return Ok(Vec::new());
         };
@@ -56,7 +63,9 @@ impl Storm<'_> {
         child.wait().context("cannot wait for the supervisor")?;
         if reach == Reach::Everybody {
             let others = self.stage.processes();
-            others.iter().for_each(|process| process.signal(Signal::KILL));
+            others
+                .iter()
+                .for_each(|process| process.signal(Signal::KILL));
             await_death(&others);
             victims.extend(others.iter().map(pid));
         }
@@ -74,7 +83,11 @@ impl Storm<'_> {
     /// # Errors
     /// When the supervisor is not there to be told.
     pub(crate) fn interrupt(&mut self) -> Result<()> {
-        let Supervisor::Running { child, told_to_stop } = &mut self.supervisor else {
+        let Supervisor::Running {
+            child,
+            told_to_stop,
+        } = &mut self.supervisor
+        else {
             bail!("there is no supervisor to be told to stop");
         };
         *told_to_stop = Told::ToStop;
@@ -90,7 +103,10 @@ impl Storm<'_> {
                 mut child,
                 told_to_stop,
             } => match child.try_wait()? {
-                None => Supervisor::Running { child, told_to_stop },
+                None => Supervisor::Running {
+                    child,
+                    told_to_stop,
+                },
                 Some(status) => {
                     self.ended(status, told_to_stop)?;
                     Supervisor::Ended
@@ -125,14 +141,18 @@ impl Storm<'_> {
         Ok(())
     }
 
-    fn watch_resumption(&mut self, mut child: Child, give_up_at: Instant, actors: u32) -> Result<Supervisor> {
+    fn watch_resumption(
+        &mut self,
+        mut child: Child,
+        give_up_at: Instant,
+        actors: u32,
+    ) -> Result<Supervisor> {
         let Some(status) = child.try_wait()? else {
-            // It starts actors once its learner has reported: then nothing of the former incarnation is in its way any more.
-            let accepted = self
-                .stage
-                .processes()
-                .iter()
-                .any(|process| process.role() == Role::Actor && process.parent() == Some(child.id()));
+            // It starts actors once its learner has reported: then nothing of the former
+            // incarnation is in its way any more.
+            let accepted = self.stage.processes().iter().any(|process| {
+                process.role() == Role::Actor && process.parent() == Some(child.id())
+            });
             return Ok(if accepted {
                 self.note("resumed", &json!({ "pid": child.id(), "actors": actors }))?;
                 Supervisor::Running {
