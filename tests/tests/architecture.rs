@@ -13,7 +13,9 @@ use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, PackageId};
 use skein_tests::repository;
 
 /// The folders a reader finds, and no others.
-const FOLDERS: [&str; 6] = ["actor", "configs", "launch", "learner", "protocol", "tests"];
+const FOLDERS: [&str; 7] = [
+    "actor", "configs", "docs", "launch", "learner", "protocol", "tests",
+];
 
 /// Whether programs alone are asked, or their tests too.
 #[derive(Clone, Copy, PartialEq)]
