@@ -17,18 +17,18 @@ use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, Throughput};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_actor::agent::Agent;
-use skein_actor::courses::{Courses, Simulators};
-use skein_actor::environment_loop::{Directive, EnvironmentLoop, RecordLink};
 use skein_inference::{Network, Scratch};
 use skein_protocol::config::View;
 use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::seeds::{Purpose, derive};
-use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{RecordKind, TransitionRecord};
 use skein_protocol::{ACTION, IMAGE_PIXELS};
+use skein_rollout::agent::Agent;
+use skein_rollout::courses::{Courses, Simulators};
+use skein_rollout::environment_loop::{Directive, EnvironmentLoop, RecordLink};
+use skein_transport::{ActorPorts, LoanedTransition, ServiceError};
 
 use common::{Learner, ticket};
 

@@ -15,17 +15,17 @@ use std::thread::sleep;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use skein_protocol::config::Config;
-use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{ActorId, ActorIncarnation};
-use skein_protocol::run::{LearnerIncarnation, RunIdentity};
-use skein_protocol::services::{ActorPorts, JoinError, ServiceError};
 use skein_protocol::status::ActorState;
 use skein_protocol::ticket::Ticket;
+use skein_run::fault::{FaultPoint, pass};
+use skein_run::{LearnerIncarnation, RunIdentity};
+use skein_transport::{ActorPorts, JoinError, ServiceError};
 use tracing::{debug, info, info_span, warn};
 
 use self::line::LearnerLine;
-use crate::environment_loop::{EnvironmentLoop, EpisodeError};
 use skein_inference::Network;
+use skein_rollout::environment_loop::{EnvironmentLoop, EpisodeError};
 
 /// Longest time between two looks for a learner, and between two looks whether to end meanwhile.
 const SEEK_INTERVAL: Duration = Duration::from_millis(100);

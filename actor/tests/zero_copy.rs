@@ -8,16 +8,16 @@
 
 use std::sync::Arc;
 
-use skein_actor::agent::Agent;
-use skein_actor::courses::{Courses, Simulators};
-use skein_actor::environment_loop::{Directive, EnvironmentLoop, RecordLink};
 use skein_inference::Network;
 use skein_protocol::config::{Config, Precision};
 use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion};
-use skein_protocol::run::{LearnerLock, RunDirectory};
-use skein_protocol::services::{ActorPorts, LearnerPorts, LoanedTransition, ServiceError};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+use skein_rollout::agent::Agent;
+use skein_rollout::courses::{Courses, Simulators};
+use skein_rollout::environment_loop::{Directive, EnvironmentLoop, RecordLink};
+use skein_run::{LearnerLock, RunDirectory};
+use skein_transport::{ActorPorts, LearnerPorts, LoanedTransition, ServiceError};
 
 /// A byte of memory, whatever address it is mapped to: a file and an offset in it.
 #[derive(Debug, Clone, PartialEq, Eq)]

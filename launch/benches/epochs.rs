@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use serde_json::json;
-use skein_protocol::run::RunDirectory;
 use skein_protocol::summary::Summary;
+use skein_run::RunDirectory;
 
 /// Settings of every run: nothing is learned, and hardly anything evaluated.
 const SETTINGS: [&str; 10] = [
@@ -72,7 +72,9 @@ fn run(episodes: u64, length: u64) -> Summary {
         "the run failed: {}",
         String::from_utf8_lossy(&output.stderr)
     );
-    Summary::of(&RunDirectory::new(&directory)).expect("a finished run has a summary")
+    RunDirectory::new(&directory)
+        .summary()
+        .expect("a finished run has a summary")
 }
 
 fn smoke() -> PathBuf {

@@ -6,9 +6,10 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::run::RunDirectory;
 use skein_protocol::stages::Times;
 use skein_protocol::summary::{Ending, Summary, Trained};
+use skein_run::RunDirectory;
+use skein_run::tables::{evaluation_table, stages_table};
 
 use crate::display::Clock;
 
@@ -20,18 +21,19 @@ pub fn conclusion(run: &RunDirectory) -> String {
         push(
             &mut text,
             &format!(
-                "Best snapshot (version {}), flown without exploration:\n{report}\n",
-                report.policy_version
+                "Best snapshot (version {}), flown without exploration:\n{}\n",
+                report.policy_version,
+                evaluation_table(&report)
             ),
         );
     }
-    if let Some(summary) = Summary::of(run) {
+    if let Some(summary) = run.summary() {
         if let Some(trained) = &summary.trained {
             push(&mut text, &trained_sentence(trained));
         }
         push(&mut text, &sentence(&summary));
         if summary.stages != Times::default() {
-            push(&mut text, &format!("{}\n", summary.stages));
+            push(&mut text, &format!("{}\n", stages_table(&summary.stages)));
         }
     }
     push(&mut text, &format!("{}:", run.root().display()));

@@ -18,10 +18,10 @@ use skein_launch::prepare::{Prepared, ideal_walls_passed, load_courses, prepare}
 use skein_launch::reports;
 use skein_launch::resume::resume;
 use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, SupervisorError};
-use skein_protocol::claims::ActorClaim;
-use skein_protocol::failure::with_causes;
-use skein_protocol::run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::summary::Ending;
+use skein_run::ActorClaim;
+use skein_run::failure::with_causes;
+use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
 
 /// What the system may refuse.
 const RUNTIME: &str = "cannot start the runtime";
@@ -195,13 +195,13 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     print!("{}", conclusion(run));
     // Whoever told the learner alone to stop has interrupted the run as well, and a run may be
     // complete before it heeds an interruption.
-    let ended = match Summary::of(run).map(|summary| summary.ending) {
+    let ended = match run.summary().map(|summary| summary.ending) {
         Some(Ending::Completed) => Ended::Finished,
         Some(Ending::Interrupted) => Ended::Interrupted,
         None => ended,
     };
     if ended == Ended::Interrupted {
-        if Summary::of(run).is_none() {
+        if run.summary().is_none() {
             let newest = run.newest_checkpoint();
             let kept = newest.map_or("there is no checkpoint yet".to_owned(), |episodes| {
                 format!("the newest checkpoint is of episode {episodes}")

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use skein_protocol::run::{LockError, PlaceError, RunDirectory, RunError, SupervisorLock};
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::summary::Ending;
+use skein_run::{LockError, PlaceError, RunDirectory, RunError, SupervisorLock};
 
 use crate::prepare::room::{check_folders, check_shared_memory};
 use crate::prepare::{PrepareError, Prepared, check, load_courses};
@@ -106,7 +106,7 @@ pub fn resume(
         Ok::<_, PlaceError>((!identity.is_learner_alive()?).then_some(()))
     })?
     .ok_or_else(under_way)?;
-    if let Some(summary) = Summary::of(&run)
+    if let Some(summary) = run.summary()
         && summary.ending == Ending::Completed
     {
         return Err(ResumeError::Complete {

@@ -9,9 +9,10 @@ use serde::Serialize;
 use skein_protocol::config::{Config, CoursesSection};
 use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
 use skein_protocol::ids::PolicyVersion;
-use skein_protocol::run::RunDirectory;
 use skein_protocol::transition::Outcome;
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, durable};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use skein_run::RunDirectory;
+use skein_run::durable;
 
 use crate::episode::CommittedEpisode;
 use crate::trainer::Trainer;

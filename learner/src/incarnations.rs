@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 use std::{fs, io};
 
-use skein_protocol::durable;
+use skein_run::durable;
 
 const HEADER: &str = "incarnation,unix_secs,episodes\n";
 

@@ -8,11 +8,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, Result};
 use clap::Parser;
 use skein_learner::training::{self, TrainingError};
-use skein_protocol::allocation::keep_freed_memory;
-use skein_protocol::failure::{EXIT_START_AGAIN, with_causes};
-use skein_protocol::logging::{LogFormat, log_to_file};
-use skein_protocol::run::{LearnerLock, RunDirectory};
 use skein_protocol::summary::{Ending, Summary};
+use skein_run::allocation::keep_freed_memory;
+use skein_run::failure::{EXIT_START_AGAIN, with_causes};
+use skein_run::logging::{LogFormat, log_to_file};
+use skein_run::{LearnerLock, RunDirectory};
 use tokio::signal::unix::{SignalKind, signal};
 
 /// The learner of a run: hands out tickets, trains on the episodes that come back, publishes
@@ -62,7 +62,10 @@ fn run(arguments: &Arguments) -> Result<()> {
     tracing::info!(run = %identity.run, incarnation = %lock.incarnation(), seed = config.run.seed, device = %config.run.device, "learner starts");
     let stop = stop_on_signals().context("cannot listen to signals")?;
     // A summary that cannot be read is made again, from the last checkpoint.
-    if Summary::of(&directory).is_some_and(|summary| summary.ending == Ending::Completed) {
+    if directory
+        .summary()
+        .is_some_and(|summary| summary.ending == Ending::Completed)
+    {
         let root = directory.root().display();
         tracing::info!("the run is complete: nothing is left to do");
         eprintln!("skein-learner: the run in {root} is complete: nothing is left to do");

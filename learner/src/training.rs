@@ -19,13 +19,13 @@ use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use skein_protocol::config::Config;
-use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::Phase;
-use skein_protocol::run::{LearnerIncarnation, RunDirectory, RunIdentity};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{Ending, Summary};
+use skein_run::fault::{FaultPoint, pass};
+use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity};
 
 use crate::checkpoint::{CheckpointWriter, EpochOrder, Progress};
 use crate::curriculum;

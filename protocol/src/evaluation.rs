@@ -1,9 +1,5 @@
 //! `evaluation.json`: how a snapshot flies, course by course.
 
-use std::fmt;
-
-use comfy_table::presets::UTF8_FULL_CONDENSED;
-use comfy_table::{CellAlignment, Table};
 use serde::{Deserialize, Serialize};
 
 use crate::ids::PolicyVersion;
@@ -129,62 +125,6 @@ impl Failures {
     }
 }
 
-/// Counts one after the other, a dot for none; one dot for nothing at all.
-fn counts(values: &[u64]) -> String {
-    if values.iter().all(|&value| value == 0) {
-        return "·".to_owned();
-    }
-    let shown = |&value: &u64| {
-        if value == 0 {
-            "·".to_owned()
-        } else {
-            value.to_string()
-        }
-    };
-    values.iter().map(shown).collect::<Vec<_>>().join(" ")
-}
-
-impl fmt::Display for EvaluationReport {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut table = Table::new();
-        table.load_preset(UTF8_FULL_CONDENSED);
-        table.set_header([
-            "course",
-            "episodes",
-            "R",
-            "completed",
-            "passed wall\n1, 2, …",
-            "return",
-            "hit wall\n1, 2, …",
-            "hit corridor\nbefore 1, …, end",
-            "timed out\nbefore 1, …, end",
-        ]);
-        for course in &self.courses {
-            let walls: Vec<String> = course.walls_passed.iter().map(u64::to_string).collect();
-            let failed =
-                |by: fn(&Failures) -> u64| course.failures.iter().map(by).collect::<Vec<_>>();
-            // Behind the last wall there is none to hit.
-            let mut hit_wall = failed(|failures| failures.hit_wall);
-            hit_wall.truncate(walls.len());
-            table.add_row([
-                course.course.clone(),
-                course.episodes.to_string(),
-                format!("{:.3}", course.r),
-                format!("{:.1} %", 100.0 * course.completed),
-                walls.join(" "),
-                format!("{:.2}", course.mean_return),
-                counts(&hit_wall),
-                counts(&failed(|failures| failures.hit_corridor)),
-                counts(&failed(|failures| failures.timed_out)),
-            ]);
-        }
-        for column in table.column_iter_mut().skip(1) {
-            column.set_cell_alignment(CellAlignment::Right);
-        }
-        write!(f, "{table}")
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -242,16 +182,6 @@ mod tests {
                 failures(0, 1, 0),
                 failures(0, 1, 0)
             ]
-        );
-        let report = EvaluationReport {
-            policy_version: PolicyVersion(1),
-            policy_sha256: String::new(),
-            courses: vec![evaluation],
-        };
-        let table = report.to_string();
-        assert!(
-            table.contains("┆    · 2 · ┆") && table.contains("· · 1 1"),
-            "{table}"
         );
     }
 

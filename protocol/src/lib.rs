@@ -1,27 +1,18 @@
-//! The contract between Skein's processes.
+//! What Skein's processes agree on: types and formats, and nothing that does anything with them.
 //!
-//! Everything that two processes must agree on is defined here, and nothing else: who flies what
-//! ([`ticket`], [`segment`]), what a flown step looks like on the wire ([`transition`]), what a
-//! policy snapshot contains ([`snapshot`]), the iceoryx2 services that carry them ([`services`]),
-//! the configuration of a run ([`config`]) and the files it leaves ([`run`], [`evaluation`],
-//! [`summary`]), and what their time is counted by ([`stages`]); and what all of our programs do
-//! alike ([`allocation`], [`logging`]). It knows neither libtorch nor the physics engine, so that
-//! every process can afford to depend on it.
+//! Who flies what ([`ticket`], [`segment`]), what a flown step looks like on the wire
+//! ([`transition`]), what a policy snapshot contains ([`snapshot`]), what an actor reports
+//! ([`status`], [`stages`]), the configuration of a run ([`config`]), the formats of the files it
+//! leaves ([`evaluation`], [`summary`]) and of its progress ([`progress`]). The transport that
+//! carries the records is `skein-transport`; where files lie and which processes use them is
+//! `skein-run`.
 
-pub mod allocation;
-pub mod claims;
 pub mod config;
-pub mod durable;
 pub mod evaluation;
-pub mod failure;
-pub mod fault;
 pub mod ids;
-pub mod logging;
 pub mod progress;
-pub mod run;
 pub mod seeds;
 pub mod segment;
-pub mod services;
 pub mod snapshot;
 pub mod stages;
 pub mod status;
@@ -54,3 +45,15 @@ pub const TRUE_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
 /// them tanh saturates or the noise vanishes (as in the authors' implementation of
 /// arXiv:1812.05905).
 pub const LOG_STD: (f32, f32) = (-20.0, 2.0);
+
+/// Sizes of the records that cross the transport; equal in processes that can read each other's.
+pub fn record_layout() -> String {
+    format!(
+        "transition {} control {} segment {} status {} snapshot header {}",
+        size_of::<transition::TransitionRecord>(),
+        size_of::<ticket::ControlRecord>(),
+        size_of::<segment::SegmentRecord>(),
+        size_of::<status::StatusRecord>(),
+        size_of::<snapshot::SnapshotHeader>(),
+    )
+}

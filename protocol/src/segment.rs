@@ -11,7 +11,6 @@
 use std::sync::Arc;
 
 use bytemuck::{Pod, Zeroable};
-use iceoryx2::prelude::ZeroCopySend;
 
 use crate::ACTION;
 use crate::ids::{ActorId, ActorIncarnation, RunId};
@@ -30,9 +29,8 @@ pub struct Segment {
 }
 
 /// The [`Ticket`] of a segment on the wire.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-#[type_name("skein.SegmentRecord.v1")]
 pub struct SegmentRecord {
     ticket: ControlRecord,
     steps: u32,

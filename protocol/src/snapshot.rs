@@ -11,14 +11,13 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use bytemuck::{Pod, Zeroable};
-use iceoryx2::prelude::ZeroCopySend;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use sha2::{Digest, Sha256};
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
+use crate::ACTION;
 use crate::config::{AlgorithmName, Config, View};
 use crate::ids::{PolicyVersion, RunId};
-use crate::{ACTION, durable};
 
 /// Channels of the encoder's four 4×4 convolutions of stride 2; the first is the image's (paper,
 /// section 3.3; widths as in arXiv:1803.10122).
@@ -170,9 +169,8 @@ impl SnapshotLayout {
 }
 
 /// What precedes a snapshot's values in shared memory.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 #[repr(C)]
-#[type_name("skein.SnapshotHeader.v1")]
 pub struct SnapshotHeader {
     /// The run.
     pub run: u64,
@@ -317,17 +315,12 @@ impl Snapshot {
         digest.iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// Writes the snapshot as safetensors, with `config` in its metadata,
-    /// [portable](Config::portable); on disk in its place, or not at all.
+    /// The snapshot as a safetensors file, with `config` in its metadata,
+    /// [portable](Config::portable).
     ///
-    /// # Errors
-    /// [`SnapshotError::Io`] names the file.
-    pub fn save(
-        &self,
-        path: &Path,
-        layout: &SnapshotLayout,
-        config: &Config,
-    ) -> Result<(), SnapshotError> {
+    /// # Panics
+    /// When the snapshot has another number of values than `layout`.
+    pub fn to_file(&self, layout: &SnapshotLayout, config: &Config) -> Vec<u8> {
         let bytes: &[u8] = bytemuck::cast_slice(&self.values);
         let views = layout.tensors().iter().map(|tensor| {
             let range = tensor.range.start * size_of::<f32>()..tensor.range.end * size_of::<f32>();
@@ -345,16 +338,7 @@ impl Snapshot {
             (VERSION_KEY.to_owned(), version),
             (CONFIG_KEY.to_owned(), config),
         ]);
-        let file = safetensors::serialize(views, Some(metadata)).map_err(|error| {
-            SnapshotError::Format {
-                path: path.to_owned(),
-                problem: error.to_string(),
-            }
-        })?;
-        durable::replace(path, &file).map_err(|source| SnapshotError::Io {
-            path: path.to_owned(),
-            source,
-        })
+        safetensors::serialize(views, Some(metadata)).expect("names and shapes are plain data")
     }
 
     /// Reads a snapshot file and the configuration it was trained with, which names its courses'
@@ -567,7 +551,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("best.safetensors");
         let saved = snapshot(&layout);
-        saved.save(&path, &layout, &config).unwrap();
+        fs::write(&path, saved.to_file(&layout, &config)).unwrap();
         let (loaded, loaded_config) = Snapshot::load(&path).unwrap();
         assert_eq!(loaded, saved);
         assert_eq!(loaded.sha256(), saved.sha256());

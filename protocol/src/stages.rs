@@ -4,13 +4,9 @@
 //! thread's stages are its whole time and their shares sum to one, and a lap costs a single reading
 //! of the clock. Nothing that is learned depends on any of it.
 
-use std::fmt;
 use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
-use comfy_table::presets::UTF8_FULL_CONDENSED;
-use comfy_table::{CellAlignment, Table};
-use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
 /// Whose time it is.
@@ -31,14 +27,6 @@ impl Thread {
             Self::Actors => "actors",
             Self::Receiving => "receiving",
             Self::Training => "training",
-        }
-    }
-
-    const fn title(self) -> &'static str {
-        match self {
-            Self::Actors => "actors, together",
-            Self::Receiving => "learner: receiving",
-            Self::Training => "learner: training",
         }
     }
 }
@@ -137,7 +125,7 @@ pub const ACTOR_STAGES: usize = {
 };
 
 /// Time, and what was done in it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 #[repr(C)]
 pub struct Tally {
     /// How often.
@@ -236,7 +224,7 @@ impl Times {
     }
 
     /// Stages that occurred.
-    fn occurred(&self) -> impl Iterator<Item = (Stage, Tally)> {
+    pub fn occurred(&self) -> impl Iterator<Item = (Stage, Tally)> {
         let all = Stage::ALL.iter().map(|stage| (*stage, self.of(*stage)));
         all.filter(|(_, tally)| *tally != Tally::default())
     }
@@ -276,60 +264,6 @@ impl From<Vec<Row>> for Times {
             }
         }
         times
-    }
-}
-
-/// A table: a row a stage, in the order of the data's way.
-impl fmt::Display for Times {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut table = Table::new();
-        table.load_preset(UTF8_FULL_CONDENSED);
-        table.set_header([
-            "where the time went",
-            "stage",
-            "count",
-            "total",
-            "each",
-            "share",
-        ]);
-        let mut thread = None;
-        for (stage, tally) in self.occurred() {
-            let of_thread = self.total_nanos(stage.thread());
-            let title = if thread.replace(stage.thread()) == Some(stage.thread()) {
-                ""
-            } else {
-                stage.thread().title()
-            };
-            table.add_row([
-                title.to_owned(),
-                stage.name().to_owned(),
-                some(tally.count, tally.count.to_string()),
-                format!("{:.2} s", tally.secs()),
-                some(tally.count, each(tally)),
-                format!(
-                    "{:.1} %",
-                    100.0 * tally.nanos as f64 / of_thread.max(1) as f64
-                ),
-            ]);
-        }
-        for column in table.column_iter_mut().skip(2) {
-            column.set_cell_alignment(CellAlignment::Right);
-        }
-        write!(f, "{table}")
-    }
-}
-
-/// `text`, unless there is nothing to be counted.
-fn some(count: u64, text: String) -> String {
-    if count == 0 { String::new() } else { text }
-}
-
-fn each(tally: Tally) -> String {
-    let secs = tally.secs() / tally.count.max(1) as f64;
-    match secs {
-        0.0..1e-3 => format!("{:.2} µs", secs * 1e6),
-        1e-3..1.0 => format!("{:.2} ms", secs * 1e3),
-        _ => format!("{secs:.2} s"),
     }
 }
 

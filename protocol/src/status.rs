@@ -2,16 +2,14 @@
 //! incarnations.
 
 use bytemuck::{Pod, Zeroable};
-use iceoryx2::prelude::ZeroCopySend;
 
 use crate::ids::{ActorId, ActorIncarnation, PolicyVersion, RunId};
 use crate::stages::{ACTOR_STAGES, Tally, Times};
 
 /// Sign of incarnation of an actor, sent at its start, when it finds nothing to fly, at every
 /// heartbeat and at its end.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
-#[type_name("skein.StatusRecord.v2")]
 pub struct StatusRecord {
     run: u64,
     incarnation: u64,

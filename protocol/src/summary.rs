@@ -1,14 +1,11 @@
 //! `summary.json`: what a run came to.
 
 use std::collections::BTreeMap;
-use std::io;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::durable;
 use crate::ids::{PolicyVersion, RunId};
-use crate::run::RunDirectory;
 use crate::stages::Times;
 
 /// What a run came to.
@@ -76,18 +73,14 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// That of `run`; `None` if it has none, or none that can be read.
-    pub fn of(run: &RunDirectory) -> Option<Self> {
-        serde_json::from_slice(&std::fs::read(run.summary_json()).ok()?).ok()
+    /// Reads the summary at `path`; `None` if there is none that can be read.
+    pub fn load(path: &Path) -> Option<Self> {
+        serde_json::from_slice(&std::fs::read(path).ok()?).ok()
     }
 
-    /// Puts it at `path`, at once or not at all.
-    ///
-    /// # Errors
-    /// Of the file system.
-    pub fn save(&self, path: &Path) -> io::Result<()> {
-        let json = serde_json::to_string_pretty(self).map_err(io::Error::other)?;
-        durable::replace(path, json.as_bytes())
+    /// The summary as JSON, for its file.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string_pretty(self).expect("a summary is plain data")
     }
 }
 
@@ -128,9 +121,8 @@ mod tests {
     #[test]
     fn a_saved_summary_is_loaded_and_a_damaged_one_is_no_summary() {
         let directory = tempfile::tempdir().unwrap();
-        let run = RunDirectory::new(directory.path());
-        let path = run.summary_json();
-        assert_eq!(Summary::of(&run), None);
+        let path = directory.path().join("summary.json");
+        assert_eq!(Summary::load(&path), None);
         let mut stages = Times::default();
         stages.add(Stage::Publish, 3, Duration::from_millis(500));
         let summary = Summary {
@@ -163,20 +155,20 @@ mod tests {
             stages,
             thread_cpu_secs: BTreeMap::from([("receiver".to_owned(), 0.25)]),
         };
-        summary.save(&path).unwrap();
-        assert_eq!(Summary::of(&run), Some(summary));
+        std::fs::write(&path, summary.to_json()).unwrap();
+        assert_eq!(Summary::load(&path), Some(summary));
         std::fs::write(&path, "{").unwrap();
-        assert_eq!(Summary::of(&run), None);
+        assert_eq!(Summary::load(&path), None);
     }
 
     #[test]
     fn a_summary_from_before_there_were_stages_is_read() {
         let directory = tempfile::tempdir().unwrap();
-        let run = RunDirectory::new(directory.path());
+        let path = directory.path().join("summary.json");
         let old = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"ab","final_version":80,"best_version":70,
             "best_confirmed_walls_passed":4.9,"episodes":800,"steps":42837,"updates":20418,"vae_updates":400,"evaluation_episodes":400,
             "tickets_reissued":0,"records_refused":0,"wall_secs":333.3,"phase_secs":{"publish":12.5}}"#;
-        std::fs::write(run.summary_json(), old).unwrap();
-        assert_eq!(Summary::of(&run).unwrap().stages, Times::default());
+        std::fs::write(&path, old).unwrap();
+        assert_eq!(Summary::load(&path).unwrap().stages, Times::default());
     }
 }

@@ -6,7 +6,6 @@
 //! room for more.
 
 use bytemuck::{Pod, Zeroable};
-use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion, RunId};
@@ -80,9 +79,8 @@ pub enum Control {
 }
 
 /// [`Control`] on the wire, addressed to one actor or, for heartbeats and the stop, to all.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
-#[type_name("skein.ControlRecord.v1")]
 pub struct ControlRecord {
     run: u64,
     to_incarnation: u64,

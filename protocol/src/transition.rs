@@ -7,7 +7,6 @@
 //! bytes are written once.
 
 use bytemuck::{Pod, Zeroable};
-use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
 use crate::ids::{ActorId, ActorIncarnation};
@@ -20,9 +19,8 @@ pub const LARGEST_NUMBER: f32 = 1e7;
 
 /// One step of an episode on the wire. Every bit pattern is a valid value of every field's type;
 /// [`TransitionRecord::check`] says whether it makes sense.
-#[derive(Debug, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
-#[type_name("skein.TransitionRecord.v4")]
 pub struct TransitionRecord {
     /// The run.
     pub run: u64,

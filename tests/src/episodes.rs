@@ -3,8 +3,8 @@
 use std::fs;
 
 use serde::Deserialize;
-use skein_protocol::run::RunDirectory;
 use skein_protocol::summary::Summary;
+use skein_run::RunDirectory;
 
 /// A row of `episodes.csv`.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]

@@ -11,8 +11,8 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde::de::DeserializeOwned;
 use skein_launch::inspection::{Process, Role, compare, leftovers, processes_of};
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::run::{RunDirectory, sweep_leftovers};
 use skein_protocol::summary::Summary;
+use skein_run::{RunDirectory, sweep_leftovers};
 use tempfile::TempDir;
 
 use crate::episodes::{Episode, Learned, episodes};

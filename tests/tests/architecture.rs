@@ -80,47 +80,81 @@ fn every_package_keeps_to_its_side_of_the_fence() {
         .iter()
         .map(|package| package.name.to_string())
         .collect();
-    let torch = ["tch", "torch-sys"];
-    let physics = ["rapier3d", "parry3d"];
+    let torch = &["tch", "torch-sys"][..];
+    let physics = &["rapier3d", "parry3d"][..];
+    let transport = &["iceoryx2", "iceoryx2-bb-posix"][..];
+    let tokio = &["tokio"][..];
     for (package, allowed, forbidden) in [
+        ("skein-simulator", &[][..], &[torch, transport, tokio][..]),
+        ("skein-protocol", &[], &[torch, physics, transport, tokio]),
         (
-            "skein-simulator",
-            &[][..],
-            [&torch[..], &["iceoryx2"]].concat(),
+            "skein-run",
+            &["skein-protocol"],
+            &[torch, physics, transport, tokio],
         ),
-        ("skein-protocol", &[], [torch, physics].concat()),
+        (
+            "skein-transport",
+            &["skein-protocol", "skein-run"],
+            &[torch, physics, tokio],
+        ),
+        ("skein-kernels", &[], &[torch, physics, transport, tokio]),
+        (
+            "skein-inference",
+            &["skein-kernels", "skein-protocol"],
+            &[torch, physics, transport, tokio],
+        ),
+        (
+            "skein-rollout",
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-run",
+                "skein-simulator",
+            ],
+            &[torch, transport, tokio],
+        ),
         (
             "skein-actor",
             &[
                 "skein-inference",
                 "skein-kernels",
                 "skein-protocol",
+                "skein-rollout",
+                "skein-run",
                 "skein-simulator",
+                "skein-transport",
             ],
-            torch.to_vec(),
+            &[torch, tokio],
         ),
-        (
-            "skein-inference",
-            &["skein-kernels", "skein-protocol"],
-            [torch, physics].concat(),
-        ),
-        ("skein-kernels", &[], [torch, physics].concat()),
         (
             "skein-learner",
-            &["skein-inference", "skein-kernels", "skein-protocol"],
-            physics.to_vec(),
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-run",
+                "skein-transport",
+            ],
+            &[physics],
         ),
         (
             "skein-launch",
-            &["skein-kernels", "skein-protocol", "skein-simulator"],
-            torch.to_vec(),
+            &[
+                "skein-kernels",
+                "skein-protocol",
+                "skein-run",
+                "skein-simulator",
+                "skein-transport",
+            ],
+            &[torch],
         ),
     ] {
         for of in [Of::Programs, Of::Tests] {
             let found = dependencies(&metadata, package, of);
             let ours: Vec<_> = found.intersection(&of_ours).map(String::as_str).collect();
             assert_eq!(ours, allowed, "packages of ours that {package} depends on");
-            for fenced in &forbidden {
+            for fenced in forbidden.iter().copied().flatten() {
                 assert!(!found.contains(*fenced), "{package} depends on {fenced}");
             }
         }
@@ -133,8 +167,10 @@ fn what_is_fenced_in_is_found_where_it_belongs() {
     for (package, inside) in [
         ("skein-learner", "tch"),
         ("skein-simulator", "rapier3d"),
-        ("skein-protocol", "iceoryx2"),
-        ("skein-actor", "rapier3d"),
+        ("skein-transport", "iceoryx2"),
+        ("skein-transport", "iceoryx2-bb-posix"),
+        ("skein-learner", "tokio"),
+        ("skein-rollout", "rapier3d"),
     ] {
         assert!(
             dependencies(&metadata, package, Of::Programs).contains(inside),

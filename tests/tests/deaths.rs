@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use skein_launch::inspection::{Footprint, footprint};
-use skein_protocol::run::RunIdentity;
+use skein_run::RunIdentity;
 use skein_tests::{Ended, Recipe, Role, Running, episodes, run_program};
 
 /// Long enough to be disturbed several times.

@@ -9,7 +9,7 @@
 use std::collections::BTreeSet;
 
 use rustix::process::Signal;
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 use skein_tests::{Ended, Process, Recipe, Role, processes_of};
 
 /// The actors that flew training episodes.

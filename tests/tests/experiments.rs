@@ -15,8 +15,8 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 use skein_launch::inspection::compare;
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::run::RunDirectory;
 use skein_protocol::summary::{Ending, Summary};
+use skein_run::RunDirectory;
 use skein_tests::{Output, Recipe, episodes, leftovers, program, repository, run_program};
 
 /// An experiment of four runs takes a tenth of it on an idle machine.
@@ -109,7 +109,8 @@ fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
 }
 
 fn completed(run: &RunDirectory) -> bool {
-    Summary::of(run).is_some_and(|summary| summary.ending == Ending::Completed)
+    run.summary()
+        .is_some_and(|summary| summary.ending == Ending::Completed)
 }
 
 #[test]
@@ -230,7 +231,7 @@ fn assert_published(scene: &Scene, report: &str) {
     let lines =
         fs::read_to_string(scene.path("launch/pictures/experiments/tiny_runs.csv")).unwrap();
     for (arm, seed) in [("one-part", 1), ("half", 1), ("one-part", 2), ("half", 2)] {
-        let learned = Summary::of(&scene.run(arm, seed)).unwrap().policy_sha256;
+        let learned = scene.run(arm, seed).summary().unwrap().policy_sha256;
         let line = lines
             .lines()
             .find(|line| line.starts_with(&format!("{arm},{seed},")));

@@ -10,7 +10,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 use skein_tests::{Recipe, episodes, leftovers, processes_of, program, repository};
 
 fn recipe() -> Recipe {

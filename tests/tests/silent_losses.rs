@@ -20,12 +20,12 @@ use skein_learner::episodes::dispatcher::{Dispatcher, Order, Place};
 use skein_learner::episodes::receiver::EpisodeReceiver;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, Epoch, PolicyVersion};
-use skein_protocol::run::{LearnerLock, Presence, RunDirectory, RunIdentity};
-use skein_protocol::services::{ActorPorts, LearnerPorts};
 use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind};
+use skein_run::{LearnerLock, Presence, RunDirectory, RunIdentity};
+use skein_transport::{ActorPorts, LearnerPorts};
 
 /// Steps of every episode here.
 const STEPS: u32 = 4;

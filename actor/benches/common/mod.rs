@@ -7,10 +7,10 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::config::{Config, Observation};
 use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion, RunId};
-use skein_protocol::run::{LearnerLock, RunDirectory, RunIdentity};
-use skein_protocol::services::LearnerPorts;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+use skein_run::{LearnerLock, RunDirectory, RunIdentity};
+use skein_transport::LearnerPorts;
 
 /// As in `local.toml`.
 pub(crate) const OBSERVATION: Observation = Observation::LatentVelocity;

@@ -5,20 +5,20 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{ActorId, ActorIncarnation};
-use skein_protocol::run::RunIdentity;
-use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, Ticket};
 use skein_protocol::transition::RecordKind;
+use skein_run::RunIdentity;
+use skein_run::fault::{FaultPoint, pass};
+use skein_transport::{ActorPorts, LoanedTransition, ServiceError};
 use tracing::{debug, warn};
 
 use super::{Ending, Parting, Service};
-use crate::environment_loop::{Directive, RecordLink};
 use crate::weights::Weights;
 use skein_inference::Network;
+use skein_rollout::environment_loop::{Directive, RecordLink};
 
 /// The actor's end of the line to the learner: hears tickets, snapshots and the stop, sends records
 /// and heartbeats.

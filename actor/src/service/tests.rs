@@ -1,19 +1,19 @@
+use std::path::Path;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
 use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion};
-use skein_protocol::run::{LearnerLock, Presence, RunDirectory};
-use skein_protocol::services::LearnerPorts;
-use skein_protocol::snapshot::SnapshotLayout;
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{Stage, Thread};
 use skein_protocol::status::ActorStatus;
 use skein_protocol::ticket::{ControlRecord, CourseChoice, Exploration};
 use skein_protocol::transition::{Outcome, RecordKind};
+use skein_run::{LearnerLock, Presence, RunDirectory};
+use skein_transport::LearnerPorts;
 
 use super::*;
-use crate::agent::Agent;
-use crate::courses::{Courses, Simulators};
-use crate::testing::{config, random_snapshot};
+use skein_rollout::agent::Agent;
+use skein_rollout::courses::{Courses, Simulators};
 
 const ACTOR: ActorId = ActorId(0);
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -32,7 +32,12 @@ impl Run {
     fn start(learner_silence_secs: f64) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
-        let mut config = config("");
+        let mut config = Config::default();
+        config.sac.hidden_width = 16;
+        let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+        for path in config.courses.paths_mut() {
+            *path = configs.join(&*path);
+        }
         config.transport.max_actors = 2;
         config.transport.learner_silence_secs = learner_silence_secs;
         run.create(&config).unwrap();
@@ -84,9 +89,11 @@ impl Run {
     }
 
     fn publish(&self, version: u64) {
-        self.learner()
-            .publish(&random_snapshot(&SnapshotLayout::of(&self.config), version))
-            .unwrap();
+        let snapshot = Snapshot {
+            version: PolicyVersion(version),
+            values: vec![0.01; SnapshotLayout::of(&self.config).values()],
+        };
+        self.learner().publish(&snapshot).unwrap();
         self.learner().wake_actors().unwrap();
     }
 

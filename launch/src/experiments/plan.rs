@@ -5,9 +5,9 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use skein_protocol::config::Config;
-use skein_protocol::failure::with_causes;
-use skein_protocol::run::RunDirectory;
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::summary::Ending;
+use skein_run::RunDirectory;
+use skein_run::failure::with_causes;
 
 use super::definition::Experiment;
 use crate::prepare;
@@ -237,7 +237,7 @@ impl PlannedRun {
                 differences.join(", ")
             ));
         }
-        match Summary::of(&self.directory) {
+        match self.directory.summary() {
             Some(summary) if summary.ending == Ending::Completed => {
                 let is_flown = self
                     .suite_json

@@ -14,8 +14,8 @@ use std::process::{self, Stdio};
 use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process};
-use skein_protocol::durable;
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
+use skein_run::durable;
 use tokio::process::{Child, Command};
 use tokio::sync::mpsc;
 use tokio::time::sleep;

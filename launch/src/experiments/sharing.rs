@@ -5,7 +5,7 @@ use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 
 use super::plan::{Plan, PlanError, PlannedRun, State, io_at};
 use super::results::RunResult;

@@ -6,7 +6,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use skein_protocol::ids::RunId;
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 
 use super::processes::processes_of;
 

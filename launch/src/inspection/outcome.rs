@@ -5,10 +5,10 @@ use std::fs;
 use std::path::Path;
 
 use csv::StringRecord;
-use skein_protocol::failure::with_causes;
-use skein_protocol::run::RunDirectory;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::summary::Summary;
+use skein_run::RunDirectory;
+use skein_run::failure::with_causes;
 
 use super::curves::{Curves, read_curves};
 

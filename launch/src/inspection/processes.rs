@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use rustix::process::{Pid, Signal, kill_process};
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 
 /// A process that was alive when it was looked for.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -9,7 +9,7 @@ use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use skein_protocol::config::{Config, CoursesSection};
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 
 use super::PrepareError;
 

@@ -4,7 +4,7 @@ use std::io;
 use std::path::PathBuf;
 
 use skein_protocol::config::ConfigError;
-use skein_protocol::run::RunError;
+use skein_run::RunError;
 use skein_simulator::course::{CourseError, RangesError};
 use skein_simulator::simulator::SimulatorError;
 

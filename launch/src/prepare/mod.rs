@@ -15,7 +15,7 @@ pub(crate) mod tests;
 use std::path::Path;
 
 use skein_protocol::config::Config;
-use skein_protocol::run::{RunDirectory, RunIdentity};
+use skein_run::{RunDirectory, RunIdentity};
 use skein_simulator::simulator::SimulatorSettings;
 
 pub(crate) use checks::check;

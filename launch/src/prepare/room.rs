@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::statvfs;
 use skein_protocol::config::{Config, CriticInput, EncoderTraining};
-use skein_protocol::services::shared_memory_needed;
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::{ACTION, IMAGE_PIXELS, TRUE_STATE};
+use skein_transport::shared_memory_needed;
 
 /// Where iceoryx2's segments lie.
 const SHARED_MEMORY: &str = "/dev/shm";

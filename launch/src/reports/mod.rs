@@ -13,7 +13,7 @@ mod trajectories;
 use std::io;
 use std::path::PathBuf;
 
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 
 use crate::prepare::NamedCourse;
 

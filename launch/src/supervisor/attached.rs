@@ -1,7 +1,6 @@
 //! Actors that were added to a run under way. Its learner is none of their supervisor's business:
 //! they find it, and its next incarnations, by themselves.
 
-use skein_protocol::summary::Summary;
 use tokio::sync::mpsc;
 use tokio::time::{Duration, Instant, interval};
 
@@ -59,7 +58,7 @@ pub async fn attach(
     dismiss(&mut crew, &mut inbox, interrupts).await;
     match crew.last_failure() {
         // Whoever came or was started again as the run ended heard nothing of its end.
-        Some(GivenUp::LearnerGone) if Summary::of(&plan.run).is_some() => Ok(ended),
+        Some(GivenUp::LearnerGone) if plan.run.summary().is_some() => Ok(ended),
         Some(reason) if ended == Ended::Finished => Err(match reason {
             GivenUp::LearnerGone => SupervisorError::LearnerGone(plan.run.root().to_owned()),
             GivenUp::KeepsDying(_) => SupervisorError::NoActors(reason.to_string()),

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use skein_protocol::ids::ActorId;
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep};
 

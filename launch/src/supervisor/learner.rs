@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use skein_protocol::failure::EXIT_START_AGAIN;
 use skein_protocol::progress::Progress;
+use skein_run::failure::EXIT_START_AGAIN;
 use tokio::io::{AsyncBufReadExt, BufReader, Lines};
 use tokio::process::ChildStdout;
 use tokio::sync::{mpsc, watch};

@@ -33,7 +33,7 @@ use std::time::Duration;
 use skein_protocol::config::Config;
 use skein_protocol::ids::ActorId;
 use skein_protocol::progress::Progress;
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 
 use process::Exit;
 

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
 use rustix::process::{Pid, Signal, kill_process};
-use skein_protocol::failure::{EXIT_LEARNER_GONE, EXIT_START_AGAIN};
+use skein_run::failure::{EXIT_LEARNER_GONE, EXIT_START_AGAIN};
 use tokio::process::{Child, Command};
 use tokio::sync::watch;
 

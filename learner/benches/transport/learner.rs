@@ -13,9 +13,9 @@ use skein_learner::episodes::receiver::{Batch, EpisodeReceiver};
 use skein_learner::threads::cpu_secs;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{Attempt, EpisodeId, Epoch, PolicyVersion};
-use skein_protocol::run::{LearnerLock, RunDirectory, RunIdentity};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::TransitionRecord;
+use skein_run::{LearnerLock, RunDirectory, RunIdentity};
 use tempfile::TempDir;
 
 use crate::SYNTHETIC_ACTOR;

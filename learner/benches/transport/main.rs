@@ -25,7 +25,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use skein_learner::episodes::assembly::Keep;
-use skein_protocol::allocation::keep_freed_memory;
+use skein_run::allocation::keep_freed_memory;
 
 use crate::learner::{Learner, Load, Throughput};
 use crate::report::report;

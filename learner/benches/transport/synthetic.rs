@@ -7,12 +7,12 @@ use std::time::{Duration, Instant};
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, ActorIncarnation, PolicyVersion};
-use skein_protocol::run::{Presence, RunDirectory};
-use skein_protocol::services::{ActorPorts, LoanedTransition};
 use skein_protocol::stages::Times;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind};
+use skein_run::{Presence, RunDirectory};
+use skein_transport::{ActorPorts, LoanedTransition};
 
 /// Steps of every episode: as many as from one end of the corridor to the other.
 pub(crate) const STEPS: u32 = 120;

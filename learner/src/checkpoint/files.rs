@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, View};
-use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, durable};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use skein_run::durable;
+use skein_run::fault::{FaultPoint, pass};
 
 use super::manifest::Manifest;
 use super::{CheckpointError, CheckpointState, Progress};

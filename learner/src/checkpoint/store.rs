@@ -10,8 +10,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use skein_protocol::config::Config;
-use skein_protocol::durable;
-use skein_protocol::fault::{FaultPoint, pass};
+use skein_run::durable;
+use skein_run::fault::{FaultPoint, pass};
 use tracing::warn;
 
 use super::manifest::{self, Manifest};

@@ -12,13 +12,13 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use skein_protocol::config::Config;
-use skein_protocol::failure::with_causes;
 use skein_protocol::ids::Epoch;
-use skein_protocol::run::{LearnerIncarnation, RunIdentity};
-use skein_protocol::services::{LearnerPorts, LearnerWaker};
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::Times;
 use skein_protocol::ticket::Ticket;
+use skein_run::failure::with_causes;
+use skein_run::{LearnerIncarnation, RunIdentity};
+use skein_transport::{LearnerPorts, LearnerWaker};
 
 use super::assembly::Keep;
 use super::dispatcher::{Dispatcher, HopelessEpisode};

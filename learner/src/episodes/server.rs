@@ -12,13 +12,13 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use skein_protocol::config::Config;
-use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::RunId;
-use skein_protocol::run::RunIdentity;
-use skein_protocol::services::{LearnerPorts, ServiceError};
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::{ControlRecord, Message};
+use skein_run::RunIdentity;
+use skein_run::fault::{FaultPoint, pass};
+use skein_transport::{LearnerPorts, ServiceError};
 
 use super::dispatcher::{Dispatcher, HopelessEpisode, Order, Place};
 use super::receiver::{Command, ReceiverError, Shared};

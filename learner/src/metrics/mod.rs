@@ -13,7 +13,7 @@ mod window;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 
 use crate::disk::Disk;
 use crate::episode::CommittedEpisode;

@@ -3,12 +3,12 @@
 
 use std::ops::Range;
 
-use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::Phase;
 use skein_protocol::stages::Stage;
 use skein_protocol::summary::Trained;
 use skein_protocol::ticket::Ticket;
+use skein_run::fault::{FaultPoint, pass};
 
 use super::{Training, TrainingError};
 use crate::best::{is_better, is_candidate};

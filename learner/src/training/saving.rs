@@ -9,13 +9,13 @@ use std::time::Instant;
 use std::{fs, io};
 
 use skein_protocol::config::Config;
-use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::progress::{self, Phase};
-use skein_protocol::run::{LearnerIncarnation, RunDirectory, RunIdentity};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{Ending, Summary};
+use skein_run::fault::{FaultPoint, pass};
+use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity, save_snapshot};
 
 use super::{EpochCurves, StopWatch, Training, TrainingError};
 use crate::checkpoint::{
@@ -177,9 +177,9 @@ impl<'a> Training<'a> {
         path: &Path,
     ) -> Result<(), TrainingError> {
         let snapshot = self.kept_snapshot(version)?;
-        Ok(self
-            .disk
-            .with_room(path, || snapshot.save(path, &self.layout, self.config))?)
+        Ok(self.disk.with_room(path, || {
+            save_snapshot(&snapshot, path, &self.layout, self.config)
+        })?)
     }
 
     pub(super) fn checkpoint_if_due(&mut self) -> Result<(), TrainingError> {
@@ -302,7 +302,7 @@ fn save_summary(
 ) -> Result<(), TrainingError> {
     pass(FaultPoint::LearnerBeforeSummary);
     let path = directory.summary_json();
-    disk.with_room(&path, || summary.save(&path))
+    disk.with_room(&path, || directory.save_summary(summary))
         .map_err(file_error(&path))
 }
 

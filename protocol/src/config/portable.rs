@@ -27,7 +27,7 @@ impl Config {
     }
 
     /// The digest of the configuration whose portable text is `portable`.
-    pub(crate) fn digest_of(portable: &str) -> u64 {
+    pub fn digest_of(portable: &str) -> u64 {
         xxh3_64(portable.as_bytes())
     }
 

@@ -90,37 +90,4 @@ fn whatever_a_file_says_is_a_time_and_stages_of_another_version_are_left_out() {
     };
     assert_eq!(times.of(Stage::Camera), most);
     assert_eq!(times.occurred().count(), 2);
-    assert!(times.to_string().contains("100.0 %"));
-}
-
-#[test]
-fn the_table_has_a_row_a_stage_and_the_shares_of_a_thread_sum_to_one() {
-    let table = sample().to_string();
-    let mut shares = Vec::new();
-    let rows = table.lines().filter(|line| line.contains('%'));
-    for (row, stage) in rows.zip(Stage::ALL) {
-        let cells: Vec<_> = row.trim_matches('│').split('┆').map(str::trim).collect();
-        assert_eq!((cells[1], cells[2]), (stage.name(), "7"));
-        let share: f64 = cells[5].trim_end_matches(" %").parse().unwrap();
-        shares.push((stage.thread(), share));
-    }
-    assert_eq!(shares.len(), STAGES);
-    for thread in [Thread::Actors, Thread::Receiving, Thread::Training] {
-        assert_eq!(table.matches(thread.title()).count(), 1, "{table}");
-        let own = shares.iter().filter(|(of, _)| *of == thread);
-        let sum: f64 = own.map(|(_, share)| share).sum();
-        assert!(
-            (sum - 100.0).abs() < 0.05 * STAGES as f64,
-            "{sum} in\n{table}"
-        );
-    }
-}
-
-#[test]
-fn times_are_told_in_units_that_one_can_read() {
-    let told = |nanos| each(Tally { count: 10, nanos });
-    assert_eq!(told(1_300), "0.13 µs");
-    assert_eq!(told(2_500_000), "250.00 µs");
-    assert_eq!(told(12_300_000), "1.23 ms");
-    assert_eq!(told(120_000_000_000), "12.00 s");
 }

@@ -14,7 +14,7 @@ use skein_launch::benchmarks::figures::Figures;
 use skein_launch::benchmarks::machine::{Core, Machine};
 use skein_launch::benchmarks::table::{Judging, Table};
 use skein_launch::reports::growth;
-use skein_protocol::failure::with_causes;
+use skein_run::failure::with_causes;
 
 /// Lists the benchmarks, and tells what they measured.
 #[derive(Debug, Parser)]

@@ -21,9 +21,9 @@ use anyhow::{Context, Result, bail};
 use clap::Parser;
 use skein_launch::inspection::{compare, leftovers};
 use skein_protocol::config::Config;
-use skein_protocol::failure::with_causes;
-use skein_protocol::run::RunDirectory;
 use skein_protocol::summary::Summary;
+use skein_run::RunDirectory;
+use skein_run::failure::with_causes;
 
 use cost::Cost;
 use plan::{Subject, Wanted};

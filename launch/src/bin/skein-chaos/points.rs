@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, Result};
 use serde_json::json;
-use skein_protocol::fault::FaultPoint;
+use skein_run::fault::FaultPoint;
 
 use crate::plan::Disturbance;
 use crate::storm::{Script, Storm};

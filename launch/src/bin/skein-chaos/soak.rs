@@ -15,7 +15,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_launch::inspection::{Footprint, Process, Role, Usage, footprint};
 use skein_protocol::ids::RunId;
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 
 use crate::plan::{Disturbance, Manner};
 use crate::statistics::{Trend, commonest};

@@ -11,9 +11,9 @@ use anyhow::{Context, Result, bail};
 use rustix::process::Signal;
 use skein_launch::inspection::{Process, processes_of};
 use skein_launch::orphans::signal_when_orphaned;
-use skein_protocol::fault::FAULTS;
-use skein_protocol::run::RunDirectory;
 use skein_protocol::summary::{Ending, Summary};
+use skein_run::RunDirectory;
+use skein_run::fault::FAULTS;
 
 /// Between two looks at what is waited for.
 pub(crate) const LOOK: Duration = Duration::from_millis(10);

@@ -14,7 +14,7 @@ use skein_launch::experiments::report::{Findings, Publication};
 use skein_launch::experiments::results;
 use skein_launch::experiments::runner::{self, Manner, Session};
 use skein_launch::interrupts::{INTERRUPTED, interrupts, runtime};
-use skein_protocol::failure::with_causes;
+use skein_run::failure::with_causes;
 
 /// Runs an experiment with several seeds, and tells what it found.
 #[derive(Debug, Parser)]

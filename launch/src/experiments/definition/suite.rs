@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use skein_protocol::failure::with_causes;
+use skein_run::failure::with_causes;
 use skein_simulator::simulator::SimulatorSettings;
 use skein_simulator::suite::Suite;
 use toml::{Table, Value};

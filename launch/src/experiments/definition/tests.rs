@@ -22,7 +22,7 @@ fn load(text: &str, episodes: Option<u64>) -> Result<Experiment, String> {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("test.toml"), text).unwrap();
     Experiment::load(folder.path(), "test", episodes)
-        .map_err(|error| skein_protocol::failure::with_causes(&error))
+        .map_err(|error| skein_run::failure::with_causes(&error))
 }
 
 const ARM: &str = "[[arm]]\nname = \"a\"\nlabel = \"A\"\n";

@@ -11,9 +11,9 @@ use skein_protocol::config::Config;
 use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::progress::Progress;
-use skein_protocol::run::{Announcement, LearnerIncarnation, RunDirectory, RunIdentity};
 use skein_protocol::summary::Summary;
 use skein_protocol::transition::Outcome;
+use skein_run::{Announcement, LearnerIncarnation, RunDirectory, RunIdentity};
 
 use super::{Target, USUAL, Verdict, tagged};
 use crate::scratch::with_files;

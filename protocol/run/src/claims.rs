@@ -9,8 +9,8 @@ use std::path::PathBuf;
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 
-use crate::ids::ActorId;
-use crate::run::{RunDirectory, RunError};
+use crate::{RunDirectory, RunError};
+use skein_protocol::ids::ActorId;
 
 /// An actor's number, which nobody else has while this is alive: a lock on the actor's log.
 #[derive(Debug)]
@@ -60,7 +60,7 @@ fn locked(path: PathBuf, file: std::io::Result<File>) -> Result<Option<File>, Ru
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Config;
+    use skein_protocol::config::Config;
 
     #[test]
     fn a_number_is_free_again_when_its_actor_is_gone() {

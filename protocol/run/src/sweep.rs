@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 
 use super::identity::LearnerIncarnation;
 use super::place::{is_still_at, make_folder, open_folder, open_private, run_of, user};
-use crate::ids::RunId;
+use skein_protocol::ids::RunId;
 
 /// Where the transport of runs lies.
 #[derive(Debug)]

@@ -145,7 +145,7 @@ impl RunIdentity {
     ///
     /// # Errors
     /// [`PlaceError`] when the file cannot be written.
-    pub(crate) fn announce(&self, announcement: &Announcement) -> Result<(), PlaceError> {
+    pub fn announce(&self, announcement: &Announcement) -> Result<(), PlaceError> {
         let path = self.announcement_file();
         let aside = path.with_extension("new");
         let json = serde_json::to_vec(announcement).expect("an announcement is plain data");
@@ -190,7 +190,7 @@ fn remove_announcement(path: &std::path::Path) -> Result<(), PlaceError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Config;
+    use skein_protocol::config::Config;
 
     #[test]
     fn a_second_learner_is_refused_on_the_run_and_on_a_copy_of_its_directory() {

@@ -17,11 +17,11 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use serde::{Deserialize, Serialize};
 
 use super::place::{PlaceError, is_locked};
-use crate::PROTOCOL_VERSION;
-use crate::config::Config;
-use crate::ids::RunId;
-use crate::services::record_layout;
-use crate::snapshot::SnapshotLayout;
+use skein_protocol::PROTOCOL_VERSION;
+use skein_protocol::config::Config;
+use skein_protocol::ids::RunId;
+use skein_protocol::record_layout;
+use skein_protocol::snapshot::SnapshotLayout;
 
 /// Who a run is: what its processes need to find each other, and nobody else.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -95,12 +95,12 @@ impl RunIdentity {
     }
 
     /// Where iceoryx2 keeps the services of an incarnation.
-    pub(crate) fn incarnation_folder(&self, incarnation: LearnerIncarnation) -> PathBuf {
+    pub fn incarnation_folder(&self, incarnation: LearnerIncarnation) -> PathBuf {
         self.transport_folder().join(incarnation.to_string())
     }
 
     /// First characters of every shared-memory segment of an incarnation.
-    pub(crate) fn incarnation_prefix(&self, incarnation: LearnerIncarnation) -> String {
+    pub fn incarnation_prefix(&self, incarnation: LearnerIncarnation) -> String {
         format!("{}{incarnation}_", self.shared_memory_prefix())
     }
 
@@ -109,16 +109,13 @@ impl RunIdentity {
     ///
     /// # Errors
     /// When the segments cannot be looked at or changed.
-    pub(crate) fn close_to_others(&self, incarnation: LearnerIncarnation) -> io::Result<()> {
+    pub fn close_to_others(&self, incarnation: LearnerIncarnation) -> io::Result<()> {
         self.shared_memory(incarnation)
             .try_for_each(|segment| fs::set_permissions(segment, fs::Permissions::from_mode(0o600)))
     }
 
     /// The shared-memory segments of `incarnation`.
-    pub(crate) fn shared_memory(
-        &self,
-        incarnation: LearnerIncarnation,
-    ) -> impl Iterator<Item = PathBuf> {
+    pub fn shared_memory(&self, incarnation: LearnerIncarnation) -> impl Iterator<Item = PathBuf> {
         super::sweep::MACHINE.segments(&self.incarnation_prefix(incarnation))
     }
 

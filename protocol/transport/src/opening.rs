@@ -4,15 +4,16 @@ use iceoryx2::node::Node;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::event;
 
+use super::wire::Wire;
 use super::{Ipc, ServiceError, failed};
-use crate::PROTOCOL_VERSION;
-use crate::config::{Config, TransportSection};
-use crate::run::RunIdentity;
-use crate::segment::SegmentRecord;
-use crate::snapshot::{SnapshotHeader, SnapshotLayout};
-use crate::status::StatusRecord;
-use crate::ticket::ControlRecord;
-use crate::transition::TransitionRecord;
+use skein_protocol::PROTOCOL_VERSION;
+use skein_protocol::config::{Config, TransportSection};
+use skein_protocol::segment::SegmentRecord;
+use skein_protocol::snapshot::{SnapshotHeader, SnapshotLayout};
+use skein_protocol::status::StatusRecord;
+use skein_protocol::ticket::ControlRecord;
+use skein_protocol::transition::TransitionRecord;
+use skein_run::RunIdentity;
 
 /// Records the learner holds while it looks at them.
 const BORROWED_RECORDS: usize = 2;
@@ -97,14 +98,18 @@ impl<'a> Opener<'a> {
         &self,
         config: &Config,
     ) -> Result<
-        iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, TransitionRecord, ()>,
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<
+            Ipc,
+            Wire<TransitionRecord>,
+            (),
+        >,
         ServiceError,
     > {
         let name = service_name("transitions")?;
         let builder = || {
             self.node
                 .service_builder(&name)
-                .publish_subscribe::<TransitionRecord>()
+                .publish_subscribe::<Wire<TransitionRecord>>()
                 .payload_alignment(Alignment::new(64).expect("64 is a power of two"))
                 .max_publishers(self.actors)
                 .max_subscribers(1)
@@ -122,14 +127,18 @@ impl<'a> Opener<'a> {
     pub(super) fn status(
         &self,
     ) -> Result<
-        iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, StatusRecord, ()>,
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<
+            Ipc,
+            Wire<StatusRecord>,
+            (),
+        >,
         ServiceError,
     > {
         let name = service_name("status")?;
         let builder = || {
             self.node
                 .service_builder(&name)
-                .publish_subscribe::<StatusRecord>()
+                .publish_subscribe::<Wire<StatusRecord>>()
                 .max_publishers(self.actors)
                 .max_subscribers(1)
                 .max_nodes(self.nodes())
@@ -147,14 +156,18 @@ impl<'a> Opener<'a> {
         &self,
         config: &Config,
     ) -> Result<
-        iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, ControlRecord, ()>,
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<
+            Ipc,
+            Wire<ControlRecord>,
+            (),
+        >,
         ServiceError,
     > {
         let name = service_name("control")?;
         let builder = || {
             self.node
                 .service_builder(&name)
-                .publish_subscribe::<ControlRecord>()
+                .publish_subscribe::<Wire<ControlRecord>>()
                 .max_publishers(1)
                 .max_subscribers(self.actors)
                 .max_nodes(self.nodes())
@@ -169,14 +182,18 @@ impl<'a> Opener<'a> {
     pub(super) fn segments(
         &self,
     ) -> Result<
-        iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, SegmentRecord, ()>,
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<
+            Ipc,
+            Wire<SegmentRecord>,
+            (),
+        >,
         ServiceError,
     > {
         let name = service_name("segments")?;
         let builder = || {
             self.node
                 .service_builder(&name)
-                .publish_subscribe::<SegmentRecord>()
+                .publish_subscribe::<Wire<SegmentRecord>>()
                 .max_publishers(1)
                 .max_subscribers(self.actors)
                 .max_nodes(self.nodes())
@@ -193,7 +210,11 @@ impl<'a> Opener<'a> {
     pub(super) fn weights(
         &self,
     ) -> Result<
-        iceoryx2::service::port_factory::publish_subscribe::PortFactory<Ipc, [u8], SnapshotHeader>,
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<
+            Ipc,
+            [u8],
+            Wire<SnapshotHeader>,
+        >,
         ServiceError,
     > {
         let name = service_name("weights")?;
@@ -201,7 +222,7 @@ impl<'a> Opener<'a> {
             self.node
                 .service_builder(&name)
                 .publish_subscribe::<[u8]>()
-                .user_header::<SnapshotHeader>()
+                .user_header::<Wire<SnapshotHeader>>()
                 .max_publishers(1)
                 .max_subscribers(self.actors)
                 .max_nodes(self.nodes())

@@ -33,7 +33,7 @@ pub(crate) fn config(simulator: &str) -> Config {
         ..Config::default()
     };
     config.sac.hidden_width = 16;
-    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
     let courses = &mut config.courses;
     for path in courses.paths_mut() {
         *path = configs.join(&*path);

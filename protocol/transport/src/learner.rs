@@ -15,18 +15,16 @@ use super::dead::Reclaimer;
 use super::joining::JoinError;
 use super::memory::reserve;
 use super::opening::{Manner, Opener, control_slots};
+use super::wire::{ReceivedTransition, Wire};
 use super::{Ipc, ServiceError, failed, node, wait};
-use crate::config::Config;
-use crate::fault::{FaultPoint, pass};
-use crate::run::{Announcement, LearnerIncarnation, RunIdentity};
-use crate::segment::SegmentRecord;
-use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
-use crate::status::StatusRecord;
-use crate::ticket::{ControlRecord, Message};
-use crate::transition::TransitionRecord;
-
-/// A transition record in shared memory, received.
-pub type ReceivedTransition = iceoryx2::sample::Sample<Ipc, TransitionRecord, ()>;
+use skein_protocol::config::Config;
+use skein_protocol::segment::SegmentRecord;
+use skein_protocol::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
+use skein_protocol::status::StatusRecord;
+use skein_protocol::ticket::{ControlRecord, Message};
+use skein_protocol::transition::TransitionRecord;
+use skein_run::fault::{FaultPoint, pass};
+use skein_run::{Announcement, LearnerIncarnation, RunIdentity};
 
 /// Snapshots that exist at once in shared memory: the history, one being written, and those that
 /// slow readers still hold.
@@ -41,11 +39,11 @@ pub struct LearnerPorts {
     /// What of it lies in shared memory from its start to its end.
     shared_memory: Vec<PathBuf>,
     layout: SnapshotLayout,
-    transitions: Subscriber<Ipc, TransitionRecord, ()>,
-    status: Subscriber<Ipc, StatusRecord, ()>,
-    control: Publisher<Ipc, ControlRecord, ()>,
-    segments: Publisher<Ipc, SegmentRecord, ()>,
-    weights: Publisher<Ipc, [u8], SnapshotHeader>,
+    transitions: Subscriber<Ipc, Wire<TransitionRecord>, ()>,
+    status: Subscriber<Ipc, Wire<StatusRecord>, ()>,
+    control: Publisher<Ipc, Wire<ControlRecord>, ()>,
+    segments: Publisher<Ipc, Wire<SegmentRecord>, ()>,
+    weights: Publisher<Ipc, [u8], Wire<SnapshotHeader>>,
     wake: Listener<Ipc>,
     wake_actors: Notifier<Ipc>,
     node: Node<Ipc>,
@@ -61,7 +59,7 @@ pub struct LearnerWaker {
 
 impl LearnerPorts {
     /// Opens the learner's ends of every service for its new `incarnation`, on the thread that will
-    /// use them, and announces it. For who holds the [`LearnerLock`](crate::run::LearnerLock).
+    /// use them, and announces it. For who holds the [`LearnerLock`](skein_run::LearnerLock).
     ///
     /// # Errors
     /// [`JoinError`] says which service and why.
@@ -158,9 +156,11 @@ impl LearnerPorts {
     /// # Errors
     /// [`ServiceError`] when an actor's memory cannot be mapped.
     pub fn receive_transition(&self) -> Result<Option<ReceivedTransition>, ServiceError> {
-        self.transitions
+        let sample = self
+            .transitions
             .receive()
-            .map_err(failed("transitions", "receiving"))
+            .map_err(failed("transitions", "receiving"))?;
+        Ok(sample.map(ReceivedTransition))
     }
 
     /// The next status record, if one has arrived.
@@ -172,7 +172,7 @@ impl LearnerPorts {
             .status
             .receive()
             .map_err(failed("status", "receiving"))?;
-        Ok(sample.map(|sample| *sample))
+        Ok(sample.map(|sample| sample.0))
     }
 
     /// Sends `message` to the actors connected now; a lost one is made good by the ticket's
@@ -185,7 +185,7 @@ impl LearnerPorts {
             Message::Control(record) => self.send_control(*record),
             Message::Segment(record) => self
                 .segments
-                .send_copy(**record)
+                .send_copy(Wire(**record))
                 .map(drop)
                 .map_err(failed("segments", "sending")),
         }
@@ -197,7 +197,7 @@ impl LearnerPorts {
     /// [`ServiceError`] when there is no memory to send it in.
     pub fn send_control(&self, record: ControlRecord) -> Result<(), ServiceError> {
         self.control
-            .send_copy(record)
+            .send_copy(Wire(record))
             .map(drop)
             .map_err(failed("control", "sending"))
     }
@@ -212,7 +212,7 @@ impl LearnerPorts {
             .weights
             .loan_slice_uninit(bytes.len())
             .map_err(failed("weights", "loaning"))?;
-        *sample.user_header_mut() = snapshot.header(self.identity.run, &self.layout);
+        *sample.user_header_mut() = Wire(snapshot.header(self.identity.run, &self.layout));
         let sample = sample.write_from_slice(bytes);
         pass(FaultPoint::LearnerPublishing);
         sample.send().map_err(failed("weights", "sending"))?;

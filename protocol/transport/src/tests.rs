@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use super::opening::{Manner, Opener};
 use super::*;
-use crate::config::Config;
-use crate::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion, RunId};
-use crate::run::{LearnerLock, RunDirectory};
-use crate::snapshot::{Snapshot, SnapshotLayout};
-use crate::ticket::{CourseChoice, Exploration, Ticket};
+use skein_protocol::config::Config;
+use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion, RunId};
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+use skein_run::{LearnerLock, RunDirectory};
 
 pub(super) struct Run {
     pub(super) identity: RunIdentity,

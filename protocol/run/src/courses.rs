@@ -8,7 +8,7 @@ use std::path::Path;
 use xxhash_rust::xxh3::xxh3_64;
 
 use super::RunError;
-use crate::config::Config;
+use skein_protocol::config::Config;
 
 /// Checksum of each file in `folder`, by its name; of a folder that does not exist, none.
 pub(super) fn checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {

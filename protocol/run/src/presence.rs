@@ -10,7 +10,7 @@ use rustix::fs::Mode;
 use super::identity::RunIdentity;
 use super::place::{PlaceError, is_still_at, make_folder, open_folder, open_private};
 use super::sweep::{MACHINE, Machine};
-use crate::ids::RunId;
+use skein_protocol::ids::RunId;
 
 /// How long a folder may be in the process of being removed.
 const PATIENCE: Duration = Duration::from_secs(5);

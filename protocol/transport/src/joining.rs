@@ -1,8 +1,8 @@
 //! Joining a run: its services are there while its learner incarnations.
 
 use super::ServiceError;
-use crate::config::Config;
-use crate::run::{Announcement, Difference, PlaceError, RunIdentity};
+use skein_protocol::config::Config;
+use skein_run::{Announcement, Difference, PlaceError, RunIdentity};
 
 /// Why a process could not join the learner of a run.
 #[derive(Debug, thiserror::Error)]

@@ -19,6 +19,12 @@
 //!
 //! Services carry protocol version, run, configuration and snapshot layout as attributes: a process
 //! that differs in one of them is refused on opening.
+//!
+//! [`TransitionRecord`]: skein_protocol::transition::TransitionRecord
+//! [`StatusRecord`]: skein_protocol::status::StatusRecord
+//! [`ControlRecord`]: skein_protocol::ticket::ControlRecord
+//! [`SegmentRecord`]: skein_protocol::segment::SegmentRecord
+//! [`SnapshotHeader`]: skein_protocol::snapshot::SnapshotHeader
 
 mod actor;
 mod dead;
@@ -28,6 +34,7 @@ mod memory;
 mod opening;
 #[cfg(test)]
 mod tests;
+mod wire;
 
 use std::fmt::Debug;
 use std::os::unix::ffi::OsStrExt;
@@ -38,17 +45,12 @@ use iceoryx2::node::Node;
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::prelude::*;
 
-use crate::run::{LearnerIncarnation, RunIdentity};
-use crate::segment::SegmentRecord;
-use crate::snapshot::SnapshotHeader;
-use crate::status::StatusRecord;
-use crate::ticket::ControlRecord;
-use crate::transition::TransitionRecord;
-
-pub use actor::{ActorPorts, LoanedTransition};
+pub use actor::ActorPorts;
 pub use joining::JoinError;
-pub use learner::{LearnerPorts, LearnerWaker, ReceivedTransition};
+pub use learner::{LearnerPorts, LearnerWaker};
 pub use memory::shared_memory_needed;
+use skein_run::{LearnerIncarnation, RunIdentity};
+pub use wire::{LoanedTransition, ReceivedTransition};
 
 type Ipc = ipc::Service;
 
@@ -130,19 +132,6 @@ fn transport_config(
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
     Ok(config)
-}
-
-/// What the records that cross the transport look like; equal in processes that can read each
-/// other's.
-pub(crate) fn record_layout() -> String {
-    format!(
-        "transition {} control {} segment {} status {} snapshot header {}",
-        size_of::<TransitionRecord>(),
-        size_of::<ControlRecord>(),
-        size_of::<SegmentRecord>(),
-        size_of::<StatusRecord>(),
-        size_of::<SnapshotHeader>(),
-    )
 }
 
 fn node(

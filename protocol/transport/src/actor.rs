@@ -13,18 +13,17 @@ use iceoryx2::prelude::*;
 use super::joining::{JoinError, learner_of};
 use super::memory::{let_go, reserve};
 use super::opening::{Manner, Opener};
+use super::wire::{LoanedTransition, Wire};
 use super::{Ipc, ServiceError, failed, node, wait};
-use crate::config::Config;
-use crate::ids::RunId;
-use crate::run::{LearnerIncarnation, RunIdentity};
-use crate::segment::SegmentRecord;
-use crate::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
-use crate::status::StatusRecord;
-use crate::ticket::{ControlRecord, Message};
-use crate::transition::TransitionRecord;
+use skein_protocol::config::Config;
+use skein_protocol::ids::RunId;
+use skein_protocol::segment::SegmentRecord;
+use skein_protocol::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
+use skein_protocol::status::StatusRecord;
+use skein_protocol::ticket::{ControlRecord, Message};
+use skein_protocol::transition::TransitionRecord;
+use skein_run::{LearnerIncarnation, RunIdentity};
 
-/// A transition record in shared memory, being written.
-pub type LoanedTransition = iceoryx2::sample_mut::SampleMut<Ipc, TransitionRecord, ()>;
 /// Samples an actor loans at one time: the record being completed and the next one, whose image its
 /// reward needs.
 const LOANED_RECORDS: usize = 2;
@@ -34,11 +33,11 @@ pub struct ActorPorts {
     run: RunId,
     incarnation: LearnerIncarnation,
     layout: SnapshotLayout,
-    transitions: Publisher<Ipc, TransitionRecord, ()>,
-    status: Publisher<Ipc, StatusRecord, ()>,
-    control: Subscriber<Ipc, ControlRecord, ()>,
-    segments: Subscriber<Ipc, SegmentRecord, ()>,
-    weights: Subscriber<Ipc, [u8], SnapshotHeader>,
+    transitions: Publisher<Ipc, Wire<TransitionRecord>, ()>,
+    status: Publisher<Ipc, Wire<StatusRecord>, ()>,
+    control: Subscriber<Ipc, Wire<ControlRecord>, ()>,
+    segments: Subscriber<Ipc, Wire<SegmentRecord>, ()>,
+    weights: Subscriber<Ipc, [u8], Wire<SnapshotHeader>>,
     wake: Listener<Ipc>,
     wake_learner: Notifier<Ipc>,
     // Held so that the node outlives its ports and is seen as alive.
@@ -143,7 +142,7 @@ impl ActorPorts {
             .map_err(failed("transitions", "loaning"))?;
         // SAFETY: the record is plain data, for which every bit pattern is valid, and the memory is
         // a shared mapping that the operating system and iceoryx2 have initialised with zeros.
-        Ok(unsafe { sample.assume_init() })
+        Ok(LoanedTransition(unsafe { sample.assume_init() }))
     }
 
     /// Sends a record without a copy. That it arrives is not promised: the learner counts.
@@ -152,6 +151,7 @@ impl ActorPorts {
     /// [`ServiceError`] when the connection is broken.
     pub fn send_transition(&self, record: LoanedTransition) -> Result<(), ServiceError> {
         record
+            .0
             .send()
             .map(drop)
             .map_err(failed("transitions", "sending"))
@@ -163,7 +163,7 @@ impl ActorPorts {
     /// [`ServiceError`] when there is no memory to send it in.
     pub fn send_status(&self, record: StatusRecord) -> Result<(), ServiceError> {
         self.status
-            .send_copy(record)
+            .send_copy(Wire(record))
             .map(drop)
             .map_err(failed("status", "sending"))
     }
@@ -178,13 +178,13 @@ impl ActorPorts {
             .receive()
             .map_err(failed("control", "receiving"))?
         {
-            return Ok(Some(Message::Control(*sample)));
+            return Ok(Some(Message::Control(sample.0)));
         }
         let sample = self
             .segments
             .receive()
             .map_err(failed("segments", "receiving"))?;
-        Ok(sample.map(|sample| Message::Segment(Box::new(*sample))))
+        Ok(sample.map(|sample| Message::Segment(Box::new(sample.0))))
     }
 
     /// The next snapshot, if one has arrived; the inner result says whether it can be flown.
@@ -193,14 +193,15 @@ impl ActorPorts {
     /// [`ServiceError`] when the learner's memory cannot be mapped.
     pub fn receive_snapshot(
         &self,
-    ) -> Result<Option<Result<Snapshot, crate::snapshot::SnapshotError>>, ServiceError> {
+    ) -> Result<Option<Result<Snapshot, skein_protocol::snapshot::SnapshotError>>, ServiceError>
+    {
         let sample = self
             .weights
             .receive()
             .map_err(failed("weights", "receiving"))?;
         Ok(sample.map(|sample| {
             let received = Snapshot::receive(
-                sample.user_header(),
+                &sample.user_header().0,
                 sample.payload(),
                 self.run,
                 &self.layout,

@@ -1,21 +1,22 @@
-//! `skein-evaluate`: flies a trained snapshot and counts.
+//! Evaluation from the command line: flies a trained snapshot, prints and writes how it fares.
+//!
+//! `skein-evaluate` and `skein evaluate` share what is here.
 
 use std::fs::{self, File, OpenOptions};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::sync::Arc;
 
+use crate::courses::Courses;
+use crate::evaluation::{Evaluation, Keep, MAX_THREADS};
+use crate::recording::{COLUMNS, check_recordable, write_recording};
 use anyhow::{Context, bail};
 use clap::{Args, Parser};
-use skein_actor::courses::Courses;
-use skein_actor::evaluation::{Evaluation, Keep, MAX_THREADS};
-use skein_actor::recording::{COLUMNS, check_recordable, write_recording};
 use skein_kernels::Isa;
 use skein_protocol::config::Config;
-use skein_protocol::failure::with_causes;
-use skein_protocol::run::RunDirectory;
 use skein_protocol::snapshot::Snapshot;
+use skein_run::RunDirectory;
+use skein_run::tables::evaluation_table;
 use skein_simulator::camera::Instructions;
 use skein_simulator::suite::{EntryCourses, MOST_EPISODES, Suite, SuiteEntry};
 
@@ -29,9 +30,9 @@ use skein_simulator::suite::{EntryCourses, MOST_EPISODES, Suite, SuiteEntry};
 /// episodes that passed wall i. Beside it stands what the other episodes failed by: which wall they
 /// hit, or before which one they hit the corridor or ran out of steps. Walls are counted in the
 /// order in which they are met.
-#[derive(Parser)]
-#[command(version, after_long_help = columns_help())]
-struct Arguments {
+#[derive(Debug, Parser)]
+#[command(name = "skein-evaluate", version, after_long_help = columns_help())]
+pub struct Arguments {
     #[command(flatten)]
     subject: Subject,
     /// A course file to fly, once for each course. By default the evaluation courses of the run
@@ -59,7 +60,7 @@ struct Arguments {
 }
 
 /// What is flown.
-#[derive(Args)]
+#[derive(Debug, Args)]
 #[group(required = true, multiple = false)]
 struct Subject {
     /// Directory of a run: its best snapshot is flown, or the latest where none has been confirmed
@@ -71,17 +72,11 @@ struct Subject {
     snapshot: Option<PathBuf>,
 }
 
-fn main() -> ExitCode {
-    match run(&Arguments::parse()) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("skein-evaluate: {}", with_causes(error.as_ref()));
-            ExitCode::FAILURE
-        }
-    }
-}
-
-fn run(arguments: &Arguments) -> anyhow::Result<()> {
+/// Flies what `arguments` ask for, prints the table and writes the files.
+///
+/// # Errors
+/// An error names the file or option at fault.
+pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let Some(file) = &arguments.json {
         check_writable(file)?;
     }
@@ -129,7 +124,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let evaluated = evaluation.run()?;
 
-    println!("{}", evaluated.report);
+    println!("{}", evaluation_table(&evaluated.report));
     if let Some(file) = &arguments.json {
         let json =
             serde_json::to_string_pretty(&evaluated.report).context("the result is no JSON")?;

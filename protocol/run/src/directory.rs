@@ -1,12 +1,4 @@
-//! A run on this machine: who it is, where everything in its directory lies, who of it lives, and
-//! what it leaves in shared memory.
-
-mod courses;
-mod identity;
-mod lock;
-mod place;
-mod presence;
-mod sweep;
+//! The run's directory: where everything in it lies, and how it is created and opened.
 
 use std::fs;
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
@@ -14,16 +6,10 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use crate::PROTOCOL_VERSION;
-use crate::config::{Config, ConfigError};
-use crate::durable;
-use crate::ids::ActorId;
-
-pub use identity::{Announcement, Difference, LearnerIncarnation, RunIdentity};
-pub use lock::{LearnerLock, LockError, SupervisorLock};
-pub use place::PlaceError;
-pub use presence::Presence;
-pub use sweep::{Swept, sweep_leftovers};
+use crate::{RunIdentity, courses, durable};
+use skein_protocol::PROTOCOL_VERSION;
+use skein_protocol::config::{Config, ConfigError};
+use skein_protocol::ids::ActorId;
 
 /// Paths within a run's directory.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -57,7 +43,7 @@ impl RunDirectory {
         courses => "courses",
         /// One log file a process.
         logs => "logs",
-        /// Locked by the learner while it lives, see [`LearnerLock`].
+        /// Locked by the learner while it lives, see [`LearnerLock`](crate::LearnerLock).
         learner_lock => "learner.lock",
         /// One row per start of the learner: incarnation,unix_secs,episodes it went on from.
         incarnations_csv => "incarnations.csv",
@@ -73,13 +59,13 @@ impl RunDirectory {
         latest_snapshot => "snapshots/latest.safetensors",
         /// Everything needed to go on.
         checkpoints => "checkpoints",
-        /// [`EvaluationReport`](crate::evaluation::EvaluationReport) of the best snapshot.
+        /// [`EvaluationReport`](skein_protocol::evaluation::EvaluationReport) of the best snapshot.
         evaluation_json => "evaluation.json",
         /// Where the evaluation episodes flew: course,episode,step,x_m,y_m,z_m,outcome.
         evaluation_trajectories_csv => "evaluation_trajectories.csv",
         /// Depth images and their reconstructions: `depth` and `reconstruction`, u8 `[n, 72, 128]`.
         reconstructions => "reconstructions.safetensors",
-        /// [`Summary`](crate::summary::Summary).
+        /// [`Summary`](skein_protocol::summary::Summary).
         summary_json => "summary.json",
         /// PNG files.
         plots => "plots",

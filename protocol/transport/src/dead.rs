@@ -16,7 +16,7 @@ use iceoryx2::prelude::*;
 use iceoryx2_bb_posix::unique_system_id::UniqueSystemId;
 
 use super::{Ipc, ServiceError, failed};
-use crate::run::{LearnerIncarnation, RunIdentity};
+use skein_run::{LearnerIncarnation, RunIdentity};
 
 /// Nobody takes as long to come, from the first file of its node to the lock by which others see
 /// that it incarnations. Who was stopped meanwhile finds its files gone, fails to join, and tries

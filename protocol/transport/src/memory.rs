@@ -13,12 +13,12 @@ use rustix::mm::{Advice, madvise};
 use super::learner::SNAPSHOT_SLOTS;
 use super::opening::{control_buffer, control_slots, segment_slots, transition_buffer};
 use super::{ServiceError, failed};
-use crate::config::Config;
-use crate::run::{LearnerIncarnation, RunIdentity};
-use crate::segment::SegmentRecord;
-use crate::snapshot::SnapshotLayout;
-use crate::ticket::ControlRecord;
-use crate::transition::TransitionRecord;
+use skein_protocol::config::Config;
+use skein_protocol::segment::SegmentRecord;
+use skein_protocol::snapshot::SnapshotLayout;
+use skein_protocol::ticket::ControlRecord;
+use skein_protocol::transition::TransitionRecord;
+use skein_run::{LearnerIncarnation, RunIdentity};
 
 /// iceoryx2's header of a sample and what aligns it, generously.
 const SAMPLE_OVERHEAD: usize = 128;

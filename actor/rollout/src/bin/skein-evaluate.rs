@@ -1,0 +1,17 @@
+//! `skein-evaluate`: flies a trained snapshot and counts.
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use skein_rollout::evaluate::{Arguments, run};
+use skein_run::failure::with_causes;
+
+fn main() -> ExitCode {
+    match run(&Arguments::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("skein-evaluate: {}", with_causes(error.as_ref()));
+            ExitCode::FAILURE
+        }
+    }
+}
