@@ -1,6 +1,7 @@
 //! The environment step, half a second of an episode: physics alone, and with the depth image.
 //!
-//! An iteration is a whole episode through the training course, flown by the oracle, with its reset.
+//! An iteration is a whole episode through the training course, flown by the oracle, with its
+//! reset.
 
 use std::hint::black_box;
 use std::path::Path;

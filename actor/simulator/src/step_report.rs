@@ -2,7 +2,7 @@
 //!
 //! A module of its own, so that the reward can be computed from it without the simulator.
 
-/// How an episode ended.
+/// End of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum EpisodeOutcome {
     /// The body touched the corridor, a wall or an opening's edge: a terminal state.
@@ -14,7 +14,7 @@ pub enum EpisodeOutcome {
     TimedOut,
 }
 
-/// Whether the drone passed a wall in a step.
+/// `Yes` if the drone passed a wall in a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum LevelUp {
     /// It passed none.
@@ -23,7 +23,7 @@ pub enum LevelUp {
     Yes,
 }
 
-/// What the body hit in a collision.
+/// Obstacle that the body hit in a collision.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Obstacle {
     /// A wall or the edge of its opening, by its place in course order from 1. A body that touches
@@ -38,10 +38,10 @@ pub enum Obstacle {
 pub struct StepReport {
     /// Walls passed in this episode so far.
     pub walls_passed: u8,
-    /// Whether the drone passed one of them in this step.
+    /// `Yes` if the drone passed one of them in this step.
     pub level_up: LevelUp,
-    /// How the episode ended, if it ended in this step.
+    /// End of the episode, if it ended in this step.
     pub outcome: Option<EpisodeOutcome>,
-    /// What the body hit, if `outcome` is [`EpisodeOutcome::Collided`].
+    /// Obstacle that the body hit, if `outcome` is [`EpisodeOutcome::Collided`].
     pub hit: Option<Obstacle>,
 }

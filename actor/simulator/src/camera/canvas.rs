@@ -4,8 +4,8 @@
 //! row + c`. So a surface is drawn without a division or a texture, and the nearer of two surfaces
 //! has the larger inverse.
 //!
-//! Parity decides which pixels lie inside an outline. Each edge flips every pixel to its right, in a
-//! row of 128 bits at once, so that holes and inward corners need no triangles. Two surfaces that
+//! Parity decides which pixels lie inside an outline. Each edge flips every pixel to its right, in
+//! a row of 128 bits at once, so that holes and inward corners need no triangles. Two surfaces that
 //! share an edge compute the same pixel for it, so no crack opens between them.
 
 use super::settings::MIDDLE_PX;

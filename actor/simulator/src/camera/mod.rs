@@ -86,8 +86,8 @@ impl DepthCamera {
         (self.draw)(self, &view, ImageErrors::None, image);
     }
 
-    /// Draws the same image with the camera's errors, if it has any; see [`DepthNoiseSettings`]. The
-    /// same `key`, pose and settings give the same errors.
+    /// Draws the same image with the camera's errors, if it has any; see [`DepthNoiseSettings`].
+    /// The same `key`, pose and settings give the same errors.
     pub fn render_with_noise(
         &mut self,
         world_from_body: &Isometry3<f32>,

@@ -239,8 +239,9 @@ impl SceneFace {
 /// Closes an outline along the near plane.
 ///
 /// The cuts lie on one line, and the face lies between the first and second, the third and fourth,
-/// and so on. Closing each loop separately would put edges of the rim and of the hole on top of each
-/// other. They cancel only as far as their arithmetic agrees, which left a slit of near pixels.
+/// and so on. Closing each loop separately would put edges of the rim and of the hole on top of
+/// each other. They cancel only as far as their arithmetic agrees, which left a slit of near
+/// pixels.
 fn close_along_cuts(cuts: &mut [ImagePoint], canvas: &mut DepthCanvas) {
     let extent = |along: fn(&ImagePoint) -> f32| {
         let (least, most) = cuts
@@ -269,8 +270,8 @@ impl Projection {
         }
     }
 
-    /// Returns the point where the edge from `beyond` to `before` meets the near plane. Both faces of
-    /// an edge pass the same two points.
+    /// Returns the point where the edge from `beyond` to `before` meets the near plane. Both faces
+    /// of an edge pass the same two points.
     #[inline(always)]
     fn cross_near_plane(&self, beyond: Vector3<f32>, before: Vector3<f32>) -> ImagePoint {
         let share = (beyond.z - self.near_m) / (beyond.z - before.z);

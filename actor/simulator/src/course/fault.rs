@@ -1,4 +1,4 @@
-//! Why a course cannot be flown, and what to change.
+//! Reasons why a course cannot be flown, and what to change.
 
 use std::fmt;
 
@@ -22,7 +22,7 @@ impl fmt::Display for FaultLocation {
     }
 }
 
-/// Why a course is refused: the wall, the key and the remedy.
+/// Reason why a course is refused: the wall, the key and the remedy.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CourseFault {
     /// A number out of bounds, or NaN.

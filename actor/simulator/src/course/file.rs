@@ -15,7 +15,7 @@ use super::{
 };
 use crate::text::read_text;
 
-/// Why a course file cannot be used.
+/// Reason why a course file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CourseError {
     /// The file cannot be read.

@@ -130,7 +130,7 @@ impl GeneratedShape {
     }
 }
 
-/// Why no course can be drawn from ranges.
+/// Reason why no course can be drawn from ranges.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RangesError {
     /// A range with reversed bounds, or with a bound that is not finite or too small.
@@ -159,7 +159,7 @@ pub enum RangesError {
     NothingFits {
         /// The wall.
         wall: WallLabel,
-        /// Why the last attempt was refused.
+        /// Reason why the last attempt was refused.
         last: CourseFault,
     },
 }

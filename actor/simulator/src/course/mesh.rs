@@ -56,8 +56,8 @@ impl Mesh {
         mesh
     }
 
-    /// Returns the triangles as vertex numbers, counter-clockwise seen from the free side, each with
-    /// the number of its surface.
+    /// Returns the triangles as vertex numbers, counter-clockwise seen from the free side, each
+    /// with the number of its surface.
     #[must_use]
     pub fn triangles(&self) -> Vec<([u32; 3], usize)> {
         let mut earcut = Earcut::new();

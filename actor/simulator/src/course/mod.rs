@@ -322,15 +322,15 @@ impl Wall {
         &self.opening
     }
 
-    /// Returns the opening's corners `[y, z]` in metres, counter-clockwise with y to the right and z
-    /// up.
+    /// Returns the opening's corners `[y, z]` in metres, counter-clockwise with y to the right and
+    /// z up.
     #[must_use]
     pub fn outline(&self) -> &[[f32; 2]] {
         &self.outline
     }
 
-    /// Returns the point to fly through: the centre `[y, z]` of the widest circle inside the opening,
-    /// metres.
+    /// Returns the point to fly through: the centre `[y, z]` of the widest circle inside the
+    /// opening, metres.
     #[must_use]
     pub fn safe_point(&self) -> [f32; 2] {
         self.safe_point

@@ -24,8 +24,8 @@ pub(crate) struct Gust {
 }
 
 impl Gust {
-    /// Returns the gusts of the episode with this seed; `None` in calm air. The first force is drawn
-    /// from the stationary distribution, so the episode starts in the middle of a gust.
+    /// Returns the gusts of the episode with this seed; `None` in calm air. The first force is
+    /// drawn from the stationary distribution, so the episode starts in the middle of a gust.
     pub(crate) fn new(settings: &GustSettings, dt_secs: f32, seed: u64) -> Option<Self> {
         if settings.force_rms_n == 0.0 {
             return None;

@@ -16,7 +16,8 @@ use crate::vehicle::{Preset, VehicleSettings, VehicleState};
 /// Returns all disturbances at once, and strong.
 fn stormy() -> DisturbanceSettings {
     toml::from_str(
-        "mass_spread = 0.2\nlatency_periods = 1\ngust.force_rms_n = 0.15\ndepth.model = \"stereo\"\ndepth.dropout_share = 0.1\n",
+        "mass_spread = 0.2\nlatency_periods = 1\ngust.force_rms_n = 0.15\n\
+         depth.model = \"stereo\"\ndepth.dropout_share = 0.1\n",
     )
     .unwrap()
 }

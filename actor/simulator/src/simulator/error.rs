@@ -1,4 +1,4 @@
-//! Why a simulator cannot be built, and why a step fails.
+//! Errors of building a simulator and of flying a step.
 
 use rapier3d::parry::shape::TriMeshBuilderError;
 
@@ -7,7 +7,7 @@ use crate::disturbances::DisturbanceSettingsError;
 use crate::reward::RewardSettingsError;
 use crate::vehicle::VehicleSettingsError;
 
-/// Why a simulator cannot be built.
+/// Reason why a simulator cannot be built.
 #[derive(Debug, thiserror::Error)]
 pub enum SimulatorError {
     /// A vehicle setting is out of bounds.
@@ -37,14 +37,14 @@ pub enum SimulatorError {
     },
 }
 
-/// Why a step fails. The episode is over then; [`Simulator::reset`](super::Simulator::reset)
+/// Reason why a step fails. The episode is over then; [`Simulator::reset`](super::Simulator::reset)
 /// starts another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum SimulationError {
     /// A number became NaN or infinite.
     #[error("{what} is not finite in step {step}: the episode is aborted")]
     NonFinite {
-        /// What is not finite.
+        /// Name of the number.
         what: &'static str,
         /// The step's number within the episode, from 1.
         step: u32,

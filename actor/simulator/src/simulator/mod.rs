@@ -2,7 +2,7 @@
 //! [`Simulator::step`] flies one control period, [`Simulator::render`] draws the depth image.
 //!
 //! An episode is a pure function of course, settings, start, disturbances and actions. A number
-//! that is not finite never leaves the step in which it appears: the step returns
+//! that is not finite never survives the step in which it appears: the step returns
 //! [`SimulationError::NonFinite`] and the episode is over.
 
 mod error;

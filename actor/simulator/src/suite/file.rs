@@ -13,7 +13,7 @@ use crate::text::read_text;
 /// Most entries of a suite.
 const MOST_ENTRIES: usize = 64;
 
-/// Why a suite cannot be flown.
+/// Reason why a suite cannot be flown.
 #[derive(Debug, thiserror::Error)]
 pub enum SuiteError {
     /// The file cannot be read.
@@ -52,7 +52,7 @@ pub enum SuiteError {
     },
 }
 
-/// Why an entry of a suite cannot be flown.
+/// Reason why an entry of a suite cannot be flown.
 #[derive(Debug, thiserror::Error)]
 pub enum SuiteEntryError {
     /// Another entry has the same name.
@@ -141,8 +141,8 @@ impl Suite {
         Self::parse(&text, path)
     }
 
-    /// Reads a suite from the text of a suite file. `path` serves errors, and its folder is the base
-    /// of relative course paths.
+    /// Reads a suite from the text of a suite file. `path` serves errors, and its folder is the
+    /// base of relative course paths.
     ///
     /// # Errors
     /// Like [`Suite::load`].

@@ -57,8 +57,8 @@ pub enum EntryCourses {
 }
 
 impl EntryCourses {
-    /// Returns the number of the course that episode `episode`, from 0, flies. Episodes with the same
-    /// number fly the same course.
+    /// Returns the number of the course that episode `episode`, from 0, flies. Episodes with the
+    /// same number fly the same course.
     #[must_use]
     pub fn number_of(&self, episode: u64) -> u64 {
         match self {

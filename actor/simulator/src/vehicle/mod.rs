@@ -36,7 +36,8 @@ pub struct VehicleState {
 }
 
 impl VehicleState {
-    /// Returns the state of a level, motionless drone at `position_m` that faces along the corridor.
+    /// Returns the state of a level, motionless drone at `position_m` that faces along the
+    /// corridor.
     pub fn at_rest(position_m: Point3<f32>) -> Self {
         Self {
             position_m,

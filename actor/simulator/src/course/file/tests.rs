@@ -102,7 +102,8 @@ fn a_value_of_the_wrong_kind_is_named_with_its_wall_line_and_key() {
     says(
         "\"rectangle\"",
         "\"oblong\"",
-        "wall 4: line 16: key shape: unknown variant `oblong`, expected one of `rectangle`, `circle`, `triangle`, `diamond`, `cross`, `l`, `polygon`",
+        "wall 4: line 16: key shape: unknown variant `oblong`, expected one of `rectangle`, \
+         `circle`, `triangle`, `diamond`, `cross`, `l`, `polygon`",
     );
 }
 
