@@ -10,7 +10,7 @@ use super::{Course, Wall};
 
 /// Part of the course to which a surface belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum SurfaceKind {
+pub(crate) enum SurfaceKind {
     /// Floor, ceiling and sides of the corridor, and the end behind the start.
     Corridor,
     /// The wall at the corridor's end: the destination.
@@ -22,25 +22,25 @@ pub enum SurfaceKind {
 
 /// A flat face, visible from the side to which its normal points.
 #[derive(Debug, Clone, PartialEq)]
-pub struct MeshSurface {
+pub(crate) struct MeshSurface {
     /// Part of the course to which it belongs.
-    pub kind: SurfaceKind,
+    pub(crate) kind: SurfaceKind,
     /// Closed loops of vertex numbers: the rim and, in a wall, the opening. They do not touch each
     /// other.
-    pub loops: Vec<Vec<u32>>,
+    pub(crate) loops: Vec<Vec<u32>>,
     /// Unit vector into the free space, world frame.
-    pub normal: Vector3<f32>,
+    pub(crate) normal: Vector3<f32>,
     /// `normal . p` for every point `p` of the surface, metres.
-    pub offset_m: f32,
+    pub(crate) offset_m: f32,
 }
 
 /// Surfaces of a course, and their corners in the world frame.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Mesh {
+pub(crate) struct Mesh {
     /// Corners, metres.
-    pub vertices: Vec<Point3<f32>>,
+    pub(crate) vertices: Vec<Point3<f32>>,
     /// Faces.
-    pub surfaces: Vec<MeshSurface>,
+    pub(crate) surfaces: Vec<MeshSurface>,
 }
 
 impl Mesh {
@@ -58,8 +58,7 @@ impl Mesh {
 
     /// Returns the triangles as vertex numbers, counter-clockwise seen from the free side, each
     /// with the number of its surface.
-    #[must_use]
-    pub fn triangles(&self) -> Vec<([u32; 3], usize)> {
+    pub(crate) fn triangles(&self) -> Vec<([u32; 3], usize)> {
         let mut earcut = Earcut::new();
         let mut corners: Vec<u32> = Vec::new();
         let mut triangles = Vec::new();

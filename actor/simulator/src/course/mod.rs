@@ -2,7 +2,7 @@
 //!
 //! Every [`Course`] can be flown: [`Course::new`] refuses anything else and names the wall, the key
 //! and the remedy. So neither the physics nor the camera checks again. The drone sees and hits the
-//! same [`Mesh`] of surfaces.
+//! same mesh of surfaces.
 //!
 //! World frame: x forward along the corridor from 0, y to the left from the middle, z up from the
 //! floor; metres.
@@ -25,7 +25,7 @@ use serde::{Deserialize, Serialize};
 pub use fault::{CourseFault, FaultLocation, NoSuchLevel};
 pub use file::CourseError;
 pub use generator::{GeneratedShape, GeneratorRanges, RangesError};
-pub use mesh::{Mesh, MeshSurface, SurfaceKind};
+pub(crate) use mesh::{Mesh, MeshSurface, SurfaceKind};
 pub use opening::{CIRCLE_SIDES, Opening, Shape};
 
 /// Width and length of the drone's body, metres. Source: AirSim's generic quadrotor mesh, 0.98 x
@@ -205,7 +205,7 @@ impl Course {
     ///
     /// # Panics
     /// If `order` is not a permutation of the walls' places.
-    pub fn reordered(&self, order: &[usize]) -> Result<Self, CourseFault> {
+    pub(crate) fn reordered(&self, order: &[usize]) -> Result<Self, CourseFault> {
         assert_eq!(
             order.len(),
             self.walls.len(),
@@ -271,7 +271,7 @@ impl Course {
     ///
     /// # Errors
     /// [`NoSuchLevel`] if the course has fewer walls.
-    pub fn start_position(
+    pub(crate) fn start_position(
         &self,
         level: u8,
         rng: &mut impl Rng,
@@ -297,8 +297,7 @@ impl Course {
     }
 
     /// Returns all surfaces of the course, seen from the inside.
-    #[must_use]
-    pub fn mesh(&self) -> Mesh {
+    pub(crate) fn mesh(&self) -> Mesh {
         Mesh::of(self)
     }
 }

@@ -129,8 +129,7 @@ impl Default for DepthNoiseSettings {
 
 impl DepthNoiseSettings {
     /// Returns the standard deviation σ of a reading at `depth_m`, metres.
-    #[must_use]
-    pub fn sigma_m(&self, depth_m: f32) -> f32 {
+    pub(crate) fn sigma_m(&self, depth_m: f32) -> f32 {
         (self.sigma_quadratic_per_m * depth_m + self.sigma_linear) * depth_m + self.sigma_constant_m
     }
 }
