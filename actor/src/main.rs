@@ -18,7 +18,7 @@ use skein_run::allocation::return_large_blocks;
 use skein_run::failure::{EXIT_LEARNER_GONE, with_causes};
 use skein_run::logging::{LogFormat, log_to_file};
 use skein_run::{Presence, RunDirectory};
-use skein_simulator::camera::Instructions;
+use skein_simulator::camera::InstructionSet;
 use tracing::{error, info};
 
 /// Flies for a run, beside its learner and other actors, until the run is over.
@@ -74,7 +74,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
     log_to_file(&log, LogFormat::from_environment())
         .with_context(|| format!("cannot write {}", log.display()))?;
 
-    let (isa, camera) = (Isa::best(), Instructions::best());
+    let (isa, camera) = (Isa::best(), InstructionSet::best());
     let encoder = config.vae.encoder_precision;
     info!(%actor, pid = std::process::id(), run = %identity.run, %isa, %camera, %encoder, "actor started");
     let _presence = Presence::enter(&identity)?;

@@ -61,7 +61,7 @@ pub struct CommittedEpisode {
     pub actions: Vec<[f32; ACTION]>,
     /// `[T]`.
     pub rewards: Vec<f32>,
-    /// Terms of each reward: collision, level-up, destination, action; `[T]`.
+    /// Terms of each reward: collision, level-up, destination, open view; `[T]`.
     pub reward_terms: Vec<[f32; 4]>,
     /// Whether a wall was crossed or the destination reached in the step; `[T]`.
     pub level_up: Vec<bool>,

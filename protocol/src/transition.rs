@@ -57,7 +57,7 @@ pub struct TransitionRecord {
     pub action: [f32; ACTION],
     /// Sum of `reward_terms`.
     pub reward: f32,
-    /// The paper's four terms: collision, level-up, destination, action.
+    /// The paper's four terms: collision, level-up, destination, open view.
     pub reward_terms: [f32; 4],
     /// 1 when a wall was crossed or the destination reached in this step.
     pub level_up: u8,

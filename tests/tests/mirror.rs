@@ -11,7 +11,7 @@ use skein_protocol::{ACTION, IMAGE_PIXELS, LONGEST_LATENT};
 use skein_simulator::course::{
     Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout,
 };
-use skein_simulator::simulator::{Ahead, GroundTruth, Simulator, SimulatorSettings};
+use skein_simulator::simulator::{GroundTruth, OpeningAhead, Simulator, SimulatorSettings};
 
 const STEPS: usize = 15;
 
@@ -146,7 +146,7 @@ fn the_mirror_image_of_an_episode_is_the_episode_through_the_mirrored_course() {
 fn all_that_points_to_the_left_points_to_the_right_in_the_mirror_and_nothing_else_is_turned() {
     // `side` is 1 for the episode, -1 for its mirror image.
     let truth = |side: f32| {
-        let ahead = |distance_m: f32| Ahead {
+        let ahead = |distance_m: f32| OpeningAhead {
             distance_m,
             offset_m: [side * 1.5, 2.5],
             clearance_m: 0.9,

@@ -9,7 +9,7 @@ use skein_protocol::config::{Config, CoursesSection};
 use skein_protocol::ids::EpisodeId;
 use skein_protocol::ticket::{CourseChoice, Ticket};
 use skein_simulator::course::{Course, CourseError, RangesError};
-use skein_simulator::disturbances::DisturbanceFault;
+use skein_simulator::disturbances::DisturbanceSettingsError;
 use skein_simulator::simulator::{Simulator, SimulatorError, SimulatorSettings};
 use skein_simulator::suite::{EntryCourses, Suite, SuiteEntry};
 
@@ -93,7 +93,7 @@ impl Courses {
         let entry = |entry: SuiteEntry| {
             entry
                 .disturbances
-                .check(&settings.vehicle, &settings.camera)
+                .validate(&settings.vehicle, settings.camera.range_m)
                 .map_err(|source| CoursesError::Disturbances {
                     entry: entry.name.clone(),
                     source,
@@ -257,7 +257,7 @@ pub enum CoursesError {
         /// The entry.
         entry: String,
         /// Why.
-        source: DisturbanceFault,
+        source: DisturbanceSettingsError,
     },
 }
 

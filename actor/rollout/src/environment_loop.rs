@@ -20,7 +20,9 @@ use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
 use skein_simulator::course::{Course, NoSuchLevel};
 use skein_simulator::reward::{RewardSettings, RewardTerms};
-use skein_simulator::simulator::{self, LevelUp, Obstacle, SimulationError, Simulator, StepReport};
+use skein_simulator::simulator::{
+    EpisodeOutcome, LevelUp, Obstacle, SimulationError, Simulator, StepReport,
+};
 
 use crate::agent::Agent;
 use crate::courses::{NoCourse, Simulators};
@@ -320,12 +322,12 @@ fn complete(
         reward.collision,
         reward.level_up,
         reward.destination,
-        reward.action,
+        reward.open_view,
     ];
-    let arrived = report.outcome == Some(simulator::Outcome::ReachedEnd);
+    let arrived = report.outcome == Some(EpisodeOutcome::ReachedEnd);
     record.level_up = u8::from(report.level_up == LevelUp::Yes || arrived);
-    record.terminated = u8::from(arrived || report.outcome == Some(simulator::Outcome::Collided));
-    record.truncated = u8::from(report.outcome == Some(simulator::Outcome::TimedOut));
+    record.terminated = u8::from(arrived || report.outcome == Some(EpisodeOutcome::Collided));
+    record.truncated = u8::from(report.outcome == Some(EpisodeOutcome::TimedOut));
 }
 
 /// Makes a record with an observation the episode's last; returns what the episode came to.
@@ -373,11 +375,11 @@ fn give_up<L: RecordLink>(
 }
 
 /// The simulator and the protocol know nothing of each other; here they meet.
-fn outcome(ended: simulator::Outcome) -> Outcome {
+fn outcome(ended: EpisodeOutcome) -> Outcome {
     match ended {
-        simulator::Outcome::Collided => Outcome::Collided,
-        simulator::Outcome::ReachedEnd => Outcome::ReachedEnd,
-        simulator::Outcome::TimedOut => Outcome::TimedOut,
+        EpisodeOutcome::Collided => Outcome::Collided,
+        EpisodeOutcome::ReachedEnd => Outcome::ReachedEnd,
+        EpisodeOutcome::TimedOut => Outcome::TimedOut,
     }
 }
 

@@ -17,7 +17,7 @@ use skein_protocol::config::Config;
 use skein_protocol::snapshot::Snapshot;
 use skein_run::RunDirectory;
 use skein_run::tables::evaluation_table;
-use skein_simulator::camera::Instructions;
+use skein_simulator::camera::InstructionSet;
 use skein_simulator::suite::{EntryCourses, MOST_EPISODES, Suite, SuiteEntry};
 
 /// Flies a trained snapshot through courses and prints how it fares.
@@ -117,7 +117,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "networks are computed with {}, the encoder in {}; images are drawn with {}",
         Isa::best(),
         config.vae.encoder_precision,
-        Instructions::best()
+        InstructionSet::best()
     );
     for note in shapes_trained_on(&config, &courses) {
         eprintln!("{note}");

@@ -1,8 +1,8 @@
-//! The depth camera: frames a second drawn, drawn with a stereo camera's errors, and traced ray by
-//! ray in the same scene.
+//! The depth camera: frames per second when drawn, drawn with a stereo camera's errors, and traced
+//! ray by ray.
 //!
-//! An iteration is an episode's worth of poses through the whole corridor, leaning as drones do, so
-//! that near walls and open corridor are in it as they are in training.
+//! An iteration renders the poses of an episode through the whole corridor, tilted like a drone, so
+//! that near walls and open corridor occur as in training.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -13,9 +13,9 @@ use skein_simulator::camera::{CameraSettings, DepthCamera, IMAGE_PIXELS, Referen
 use skein_simulator::course::Course;
 use skein_simulator::disturbances::{DepthModel, DepthNoiseSettings};
 
-/// Poses drawn an iteration.
+/// Poses drawn in an iteration.
 const DRAWN: usize = 240;
-/// Poses traced an iteration: every twelfth of those drawn.
+/// Poses traced in an iteration: every twelfth of those drawn.
 const TRACED: usize = DRAWN / 12;
 
 fn main() {
@@ -32,13 +32,13 @@ fn camera(criterion: &mut Criterion, name: &str) {
         .expect("shipped courses can be flown");
     let settings = CameraSettings::default();
     let mut camera = DepthCamera::new(&settings, &course)
-        .expect("default settings make sense")
+        .expect("default settings are valid")
         .with_noise(&DepthNoiseSettings {
             model: DepthModel::Stereo,
             ..Default::default()
         });
     let reference =
-        ReferenceCamera::new(&settings, &course).expect("a course's surfaces are a mesh");
+        ReferenceCamera::new(&settings, &course).expect("a course's surfaces form a mesh");
     let poses: Vec<_> = (0..DRAWN).map(|number| pose(&course, number)).collect();
     let mut image = [0; IMAGE_PIXELS];
 
@@ -72,7 +72,7 @@ fn camera(criterion: &mut Criterion, name: &str) {
     group.finish();
 }
 
-/// A pose of an episode that goes to each opening in turn.
+/// Returns a pose of an episode that flies through each opening in turn.
 fn pose(course: &Course, number: usize) -> Isometry3<f32> {
     let x = 1.0 + (course.corridor().length_m - 2.0) * number as f32 / DRAWN as f32;
     let ahead = course

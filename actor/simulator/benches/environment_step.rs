@@ -1,7 +1,7 @@
-//! The environment step: half a second of episode, physics alone and with the image after it.
+//! The environment step, half a second of an episode: physics alone, and with the depth image.
 //!
-//! An iteration is a whole episode through the training course, the oracle steering, reset
-//! included.
+//! An iteration is a whole episode through the training course, flown by the oracle, with its
+//! reset.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -16,7 +16,7 @@ use skein_simulator::oracle::Oracle;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 use skein_simulator::vehicle::{Preset, VehicleSettings};
 
-/// Seed of the one start that is flown from.
+/// Seed of the start position.
 const START: u64 = 1;
 
 #[derive(Clone, Copy)]
@@ -45,7 +45,7 @@ fn main() {
             ..Default::default()
         };
         let mut simulator =
-            Simulator::new(Arc::clone(&course), &settings).expect("default settings make sense");
+            Simulator::new(Arc::clone(&course), &settings).expect("default settings are valid");
         group.throughput(Throughput::Elements(fly(&mut simulator, Camera::Off)));
         for (camera, what) in [(Camera::Off, "physics"), (Camera::On, "with_camera")] {
             group.bench_function(BenchmarkId::new(what, name), |bencher| {
@@ -57,7 +57,7 @@ fn main() {
     criterion.final_summary();
 }
 
-/// Flies once through the course; the number of steps it took.
+/// Flies once through the course and returns the number of steps.
 fn fly(simulator: &mut Simulator, camera: Camera) -> u64 {
     let mut image = [0; IMAGE_PIXELS];
     let mut rng = Pcg64Mcg::seed_from_u64(START);

@@ -1,9 +1,9 @@
 //! Flies the oracle through every shipped course with every drone and prints how many episodes
-//! arrived.
+//! reach the end.
 //!
 //! `cargo run --release -p skein-simulator --example oracle_episode [episodes]` (100 per course,
-//! drone and start level by default). Below 99 % either the course or the drone is wrong. What the
-//! same policy makes of an evaluation suite: `oracle_suite`.
+//! drone and start level by default). Below 99 %, the course or the drone is wrong. The example
+//! `oracle_suite` flies the oracle through an evaluation suite.
 
 use std::error::Error;
 use std::path::Path;
@@ -13,7 +13,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_simulator::course::Course;
 use skein_simulator::oracle::Oracle;
-use skein_simulator::simulator::{Outcome, Simulator, SimulatorSettings};
+use skein_simulator::simulator::{EpisodeOutcome, Simulator, SimulatorSettings};
 use skein_simulator::vehicle::{Preset, VehicleSettings};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -49,7 +49,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             for level in 1..=course.levels() {
                 let mut arrived = 0;
                 for episode in 0..episodes {
-                    if fly(&mut simulator, level, episode)? == Outcome::ReachedEnd {
+                    if fly(&mut simulator, level, episode)? == EpisodeOutcome::ReachedEnd {
                         arrived += 1;
                     }
                 }
@@ -61,7 +61,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-fn fly(simulator: &mut Simulator, level: u8, seed: u64) -> Result<Outcome, Box<dyn Error>> {
+fn fly(simulator: &mut Simulator, level: u8, seed: u64) -> Result<EpisodeOutcome, Box<dyn Error>> {
     let [mut start, mut calm] = [seed, 0].map(Pcg64Mcg::seed_from_u64);
     simulator.reset(level, &mut start, &mut calm)?;
     loop {

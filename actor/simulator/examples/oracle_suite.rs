@@ -1,10 +1,11 @@
-//! Flies the oracle through an evaluation suite: what a policy that knows where it is, and where
-//! the openings are, makes of the same episodes.
+//! Flies the oracle through an evaluation suite, for comparison with a policy.
 //!
 //! `cargo run --release -p skein-simulator --example oracle_suite [suite] [episodes]`
-//! (configs/evaluations/generalist.toml, and as many episodes as it says, by default). A policy's
-//! distance from it is what the policy could learn; the oracle's own distance from 100 % is the
-//! drone's, or its simple rule's. Depth noise does nothing to it, for it does not look.
+//! (by default configs/evaluations/generalist.toml and its number of episodes).
+//!
+//! The gap between a policy and the oracle is what the policy could still learn. The gap between
+//! the oracle and 100 % is due to the drone or to the oracle's simple rule. Depth noise has no
+//! effect on the oracle, because it does not use the image.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -13,7 +14,9 @@ use std::sync::Arc;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_simulator::oracle::Oracle;
-use skein_simulator::simulator::{Obstacle, Outcome, Simulator, SimulatorSettings, StepReport};
+use skein_simulator::simulator::{
+    EpisodeOutcome, Obstacle, Simulator, SimulatorSettings, StepReport,
+};
 use skein_simulator::suite::{Suite, SuiteEntry};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -35,7 +38,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Flies an entry and says how it went.
+/// Flies an entry and returns its row of the table.
 fn row(entry: &SuiteEntry, episodes: u64) -> Result<String, Box<dyn Error>> {
     let settings = SimulatorSettings {
         disturbances: entry.disturbances.clone(),
@@ -49,7 +52,7 @@ fn row(entry: &SuiteEntry, episodes: u64) -> Result<String, Box<dyn Error>> {
         let report = fly(Simulator::new(Arc::clone(&course), &settings)?, episode)?;
         passed += u64::from(report.walls_passed);
         match (report.outcome, report.hit) {
-            (Some(Outcome::ReachedEnd), _) => arrived += 1,
+            (Some(EpisodeOutcome::ReachedEnd), _) => arrived += 1,
             (_, Some(Obstacle::Wall(_))) => hit_wall += 1,
             (_, Some(Obstacle::Corridor)) => hit_corridor += 1,
             (_, None) => timed_out += 1,
@@ -63,7 +66,7 @@ fn row(entry: &SuiteEntry, episodes: u64) -> Result<String, Box<dyn Error>> {
     ))
 }
 
-/// The last step of an episode from the start of level 1.
+/// Flies an episode from the start of level 1 and returns the report of its last step.
 fn fly(mut simulator: Simulator, seed: u64) -> Result<StepReport, Box<dyn Error>> {
     let [mut start, mut disturbances] = [seed, !seed].map(Pcg64Mcg::seed_from_u64);
     simulator.reset(1, &mut start, &mut disturbances)?;

@@ -1,24 +1,24 @@
-//! A policy that sees the course itself instead of the depth image: proof that a course can be
-//! flown by a given drone.
+//! A scripted expert that knows the course and never looks at the depth image. It proves that a
+//! given drone can fly a course.
 
 use crate::course::{Course, Wall};
 use crate::simulator::walls_ahead;
 use crate::vehicle::VehicleState;
 
-/// Velocity asked for per metre of distance to the safe point, 1/s.
+/// Commanded velocity per metre of distance to the safe point, 1/s.
 const APPROACH_PER_SEC: f32 = 0.8;
 
-/// Share of the present velocity taken off the one asked for, so that a sluggish drone does not
+/// Share of the current velocity subtracted from the command, so that a sluggish drone does not
 /// overshoot.
 const DAMPING: f32 = 0.5;
 
-/// Flies to the next opening's safe point, and behind the last one to the middle of the corridor,
-/// where gusts find the least to blow it into.
+/// Flies to the next opening's safe point, then, behind the last wall, to the middle of the
+/// corridor, where a gust has the longest way to blow it into anything.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Oracle;
 
 impl Oracle {
-    /// The action `[v_y, v_z]` for this moment, each in [-1, 1] m/s.
+    /// Returns the action `[v_y, v_z]` for the state, m/s in the heading frame, each in [-1, 1].
     #[must_use]
     pub fn act(course: &Course, state: &VehicleState) -> [f32; 2] {
         let middle = [0.0, course.corridor().height_m / 2.0];
@@ -47,11 +47,11 @@ mod tests {
 
     use super::*;
     use crate::course::test_course;
-    use crate::simulator::{Outcome, Simulator, SimulatorSettings};
+    use crate::simulator::{EpisodeOutcome, Simulator, SimulatorSettings};
     use crate::vehicle::{Preset, VehicleSettings};
 
-    /// Per course and drone, spread over the levels; `examples/oracle_episode.rs` flies a hundred
-    /// from each.
+    /// Episodes per course and drone, spread over the levels; `examples/oracle_episode.rs` flies a
+    /// hundred from each level.
     const EPISODES: u64 = 10;
 
     #[test]
@@ -86,7 +86,7 @@ mod tests {
                     let at = simulator.state().position_m;
                     assert_eq!(
                         outcome,
-                        Outcome::ReachedEnd,
+                        EpisodeOutcome::ReachedEnd,
                         "{}, {preset:?}, level {level}: at {at}",
                         course.name()
                     );
@@ -95,7 +95,7 @@ mod tests {
         }
     }
 
-    fn fly(simulator: &mut Simulator) -> Outcome {
+    fn fly(simulator: &mut Simulator) -> EpisodeOutcome {
         loop {
             let action = Oracle::act(simulator.course(), &simulator.state());
             if let Some(outcome) = simulator.step(action).unwrap().outcome {

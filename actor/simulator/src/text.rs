@@ -1,22 +1,22 @@
-//! Text files from outside.
+//! Text files from outside the process.
 
 use std::fs;
 use std::io;
 use std::path::Path;
 
-/// Bytes of a file: far more than any course or suite takes.
-const LONGEST: u64 = 1 << 20;
+/// Most bytes of a file: far more than any course or suite needs.
+const MOST_BYTES: u64 = 1 << 20;
 
-/// The text of a file.
+/// Reads a text file.
 ///
 /// # Errors
-/// When it cannot be read, is longer than any that makes sense, or is no regular file: of a pipe or
-/// a device, the end might never come.
+/// If the file cannot be read, exceeds [`MOST_BYTES`], or is not a regular file: reading a pipe or
+/// a device might never end.
 pub(crate) fn read_text(path: &Path) -> io::Result<String> {
     let about = fs::metadata(path)?;
-    if !about.is_file() || about.len() > LONGEST {
+    if !about.is_file() || about.len() > MOST_BYTES {
         return Err(io::Error::other(format!(
-            "is no text file of at most {LONGEST} bytes"
+            "not a regular file of at most {MOST_BYTES} bytes"
         )));
     }
     fs::read_to_string(path)

@@ -1,12 +1,13 @@
-//! The rigid body among the course's surfaces: rapier integrates it, parry says what it touches.
+//! The rigid body among the course's surfaces: rapier integrates it, parry finds what it touches.
 //!
 //! Any contact ends an episode, so contact forces never act and rapier's solver has nothing to
-//! solve: the course is not in rapier's world at all. After each step the body's cuboid is tested,
-//! exactly, against the triangles that the depth camera also draws; a bounding-volume tree makes
-//! that some 0.1 µs when nothing is near. The body moves centimetres a step and is longer than that
-//! in every direction it can move, so it cannot pass a surface between two tests.
+//! solve: the course is not in rapier's world at all. After each physics step, the body's cuboid is
+//! tested exactly against the triangles that the depth camera also draws. A bounding-volume tree
+//! makes that test take some 0.1 µs when nothing is near. The body moves centimetres a step and is
+//! longer than that in every direction it can move, so it cannot pass a surface between two tests.
 //!
-//! rapier and parry speak glam, the rest of this crate nalgebra: they meet here and nowhere else.
+//! rapier and parry use glam, the rest of this crate uses nalgebra: only this file converts between
+//! them.
 
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use rapier3d::dynamics::{MassProperties, RigidBodyBuilder, RigidBodyHandle};
@@ -18,13 +19,13 @@ use rapier3d::pipeline::PhysicsWorld;
 use crate::course::{Course, Mesh, SurfaceKind};
 use crate::vehicle::{Actuation, BodyProperties, GRAVITY_MPS2, VehicleState};
 
-/// What the body touches.
+/// Contact of the body with the course.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Contact {
     Nothing,
     /// The corridor, a wall, or the inside of an opening.
     Obstacle,
-    /// The wall at the corridor's end, and nothing else.
+    /// The wall at the corridor's end and nothing else.
     EndWall,
 }
 
@@ -34,7 +35,7 @@ pub(crate) struct World {
     end_wall_m: f32,
     body_shape: Cuboid,
     nominal: BodyProperties,
-    /// Mass of the body that flies now, kg.
+    /// Mass of the body in the current episode, kg.
     mass_kg: f32,
     dt_secs: f32,
     physics: PhysicsWorld,
@@ -42,10 +43,11 @@ pub(crate) struct World {
 }
 
 impl World {
-    /// Surfaces of `course` and a body at rest at the corridor's start, advancing `dt_secs` a step.
+    /// Builds a world with the surfaces of `course` and a body at rest at the corridor's start. A
+    /// physics step takes `dt_secs`.
     ///
     /// # Errors
-    /// parry's reason if the course's surfaces make no triangle mesh.
+    /// parry's reason if the course's surfaces form no triangle mesh.
     pub(crate) fn new(
         course: &Course,
         properties: BodyProperties,
@@ -64,17 +66,18 @@ impl World {
         })
     }
 
-    /// Puts the body at rest at `position_m`, `mass_factor` times as heavy as it nominally is.
-    /// Physics is rebuilt, so that nothing of an earlier episode remains in rapier's caches: an
-    /// episode is a function of its start and actions alone.
+    /// Puts the body at rest at `position_m`, with `mass_factor` times its nominal mass.
+    ///
+    /// Rebuilds the physics, so that nothing of an earlier episode remains in rapier's caches: an
+    /// episode depends on its start and actions alone.
     pub(crate) fn reset(&mut self, position_m: &Point3<f32>, mass_factor: f32) {
         let body = self.nominal.scaled(mass_factor);
         self.mass_kg = body.mass_kg;
         (self.physics, self.body) = pristine_physics(&body, self.dt_secs, position_m);
     }
 
-    /// Integrates one physics step, in which `gust_n` pushes the body as well (world frame, N). A
-    /// state that is no longer finite shows in [`World::is_quarantined`].
+    /// Integrates one physics step under `actuation` and the gust force `gust_n` (world frame, N).
+    /// If the state is no longer finite, [`World::is_quarantined`] returns `true`.
     pub(crate) fn advance(&mut self, actuation: &Actuation, gust_n: Option<Vector3<f32>>) {
         let body = &mut self.physics.bodies[self.body];
         match actuation {
@@ -93,7 +96,7 @@ impl World {
         self.physics.step();
     }
 
-    /// Pose and motion of the body.
+    /// Returns the body's pose and motion.
     pub(crate) fn state(&self) -> VehicleState {
         let body = &self.physics.bodies[self.body];
         let rotation = body.rotation();
@@ -108,18 +111,18 @@ impl World {
         }
     }
 
-    /// How far along the corridor the body's centre is, m.
+    /// Returns the position of the body's centre along the corridor, m.
     pub(crate) fn position_x_m(&self) -> f32 {
         self.physics.bodies[self.body].translation().x
     }
 
-    /// `true` once rapier has met a pose or velocity that is not finite in the last step and has
+    /// Returns `true` if rapier found a pose or velocity that is not finite in the last step and
     /// switched the body off.
     pub(crate) fn is_quarantined(&self) -> bool {
         !self.physics.quarantine().is_empty()
     }
 
-    /// Which wall of `course` the body touches now, by its place in episode order from 0.
+    /// Returns the wall of `course` that the body touches, by its place in course order from 0.
     pub(crate) fn touched_wall(&self, course: &Course) -> Option<usize> {
         let mesh = course.mesh();
         (0..course.walls().len()).find(|&place| {
@@ -128,12 +131,12 @@ impl World {
         })
     }
 
-    /// What the body touches now.
+    /// Returns what the body touches.
     pub(crate) fn contact(&self) -> Contact {
         let world_from_body = self.physics.bodies[self.body].position();
         let touches_obstacle = self.touches(&self.obstacles);
-        // The end wall fills the whole section: a body that touches nothing else meets it as it
-        // would meet a plane.
+        // The end wall fills the whole cross-section: a body that touches nothing else meets it
+        // like a plane.
         let past_end_wall = self.body_shape.compute_aabb(world_from_body).maxs.x >= self.end_wall_m;
         if touches_obstacle {
             Contact::Obstacle
@@ -148,22 +151,22 @@ impl World {
         let body_from_world = self.physics.bodies[self.body].position().inverse();
         DefaultQueryDispatcher
             .intersection_test(&body_from_world, &self.body_shape, surfaces)
-            // A cuboid against a triangle mesh is a pair that parry's dispatcher knows.
+            // Never an error: parry's dispatcher supports a cuboid against a triangle mesh.
             .is_ok_and(|test| test.intersecting)
     }
 }
 
-/// A rapier world that holds nothing but the body, at rest at `position_m`.
+/// Returns a rapier world that holds only the body, at rest at `position_m`.
 fn pristine_physics(
     properties: &BodyProperties,
     dt_secs: f32,
     position_m: &Point3<f32>,
 ) -> (PhysicsWorld, RigidBodyHandle) {
     let mut physics = PhysicsWorld::new();
-    // Weight is one of the forces in `advance`: the point drone has none.
+    // `advance` adds the weight as a force, because the point drone has none.
     physics.gravity = Vector::ZERO;
     physics.integration_parameters.dt = dt_secs;
-    // Solver iterations are for contacts and joints, of which there are none.
+    // Solver iterations serve contacts and joints, and there are none.
     physics.integration_parameters.num_solver_iterations = 1;
     let mass = MassProperties::new(
         Vector::ZERO,
@@ -179,7 +182,7 @@ fn pristine_physics(
     (physics, body)
 }
 
-/// The surfaces of some kinds, as triangles.
+/// Returns the triangles of the surfaces whose kind is `wanted`.
 fn triangles(
     mesh: &Mesh,
     wanted: impl Fn(SurfaceKind) -> bool,
@@ -239,7 +242,7 @@ mod tests {
             "{}",
             state.velocity_mps
         );
-        // Half a step's length more than g/2, for velocity is stepped before position.
+        // Half a step more than g/2, because velocity is integrated before position.
         assert!(
             (state.position_m.z - (6.0 - 4.905)).abs() < 0.03,
             "{}",
@@ -277,8 +280,8 @@ mod tests {
 
     #[test]
     fn contact_begins_where_surfaces_meet() {
-        // The corridor's left side is at y = 3, its floor at z = 0, the body 0.4 m and 0.1 m to
-        // each side.
+        // The corridor's left side is at y = 3 and its floor at z = 0. The body reaches 0.4 m to
+        // the side and 0.1 m down.
         for (y_m, z_m, contact) in [
             (2.599, 3.5, Contact::Nothing),
             (2.601, 3.5, Contact::Obstacle),
@@ -297,7 +300,7 @@ mod tests {
     fn tilted_body_reaches_lower() {
         let mut world = world_at(Point3::new(5.0, 0.0, 0.15));
         assert_eq!(world.contact(), Contact::Nothing);
-        // Pitched by some 0.25 rad, its corners hang 0.5 m · sin(0.25) below the middle and more.
+        // Pitched by some 0.25 rad, its corners hang at least 0.5 m · sin(0.25) below the middle.
         push(
             &mut world,
             Vector3::z() * 2.0 * 9.81,
@@ -341,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn corridor_is_no_wall() {
+    fn the_corridor_is_not_a_wall() {
         let on_the_floor = world_at(Point3::new(5.0, 0.0, 0.05));
         assert_eq!(on_the_floor.contact(), Contact::Obstacle);
         assert_eq!(on_the_floor.touched_wall(&test_course()), None);

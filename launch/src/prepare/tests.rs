@@ -156,7 +156,7 @@ fn what_cannot_run_is_refused_before_anything_is_created() {
             "[simulator.generator]\nclearance_m = [3.4, 3.4]",
             "evaluation.confirm_on=generated",
             1,
-            vec!["generator", "nothing drawn for wall 1"],
+            vec!["generator", "no opening drawn for wall 1"],
         ),
         (
             "[transport]\nmax_actors = 3",

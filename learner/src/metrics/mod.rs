@@ -184,7 +184,7 @@ impl Metrics {
                 (Scalar::RewardCollision, term(0)),
                 (Scalar::RewardLevelUp, term(1)),
                 (Scalar::RewardDestination, term(2)),
-                (Scalar::RewardAction, term(3)),
+                (Scalar::RewardOpenView, term(3)),
                 (
                     Scalar::WindowReturn,
                     self.windows.total_reward.mean().unwrap_or_default(),

@@ -32,8 +32,8 @@ scalars! {
     RewardLevelUp => "reward/level_up",
     /// What the destination contributed to the return.
     RewardDestination => "reward/destination",
-    /// What the action reward, a clear view ahead, contributed to the return.
-    RewardAction => "reward/action",
+    /// What the open-view term, a reward for looking into open space, contributed to the return.
+    RewardOpenView => "reward/open_view",
     /// Return, averaged over the window.
     WindowReturn => "window/return",
     /// Walls passed, averaged over the window. The paper's Fig. 10.

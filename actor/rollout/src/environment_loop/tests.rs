@@ -191,7 +191,7 @@ fn each_record_holds_what_was_seen_and_the_reward_for_what_came_next() {
             hit: None,
         };
         let expected = RewardTerms::of(&RewardSettings::default(), &report, &pair[1].depth);
-        assert_eq!(pair[0].reward_terms[3], expected.action);
+        assert_eq!(pair[0].reward_terms[3], expected.open_view);
         assert_eq!(pair[0].reward, pair[0].reward_terms.iter().sum::<f32>());
     }
 }

@@ -1,21 +1,21 @@
-//! Courses as TOML files.
+//! Course files, in TOML.
 //!
-//! Walls are defined once, each under its label; `order` puts them into the corridor at the places
-//! `wall_x_m`. So a rearranged course is a changed line of data. A file that is refused is refused
-//! by file, wall and key.
+//! A file defines each wall once, under its label. `order` puts the walls into the corridor at the
+//! positions `wall_x_m`, so a rearranged course differs in one line. An error names the file, the
+//! wall and the key.
 
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::whereabouts::Whereabouts;
+use super::source_location::SourceLocation;
 use super::{
-    Corridor, Course, CourseFault, CourseLayout, Opening, Place, Shape, StartArea, WallLabel,
-    WallLayout,
+    Corridor, Course, CourseFault, CourseLayout, FaultLocation, Opening, Shape, StartArea,
+    WallLabel, WallLayout,
 };
 use crate::text::read_text;
 
-/// Why a course file cannot be flown.
+/// Reason why a course file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CourseError {
     /// The file cannot be read.
@@ -23,28 +23,27 @@ pub enum CourseError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Not TOML, an unknown key, or a value of the wrong kind.
-    #[error("{}: {place}: line {line}: {message}", path.display())]
+    /// The file is not TOML, or has an unknown key or a value of the wrong kind.
+    #[error("{}: {location}: line {line}: {message}", path.display())]
     Syntax {
         /// The file.
         path: PathBuf,
         /// The wall whose definition holds the line.
-        place: Place,
+        location: FaultLocation,
         /// The line, from 1.
         line: usize,
-        /// Which key, and what is wrong, on one line; the parser's own error draws a picture over
-        /// several.
+        /// The key and the problem on one line; the parser's own error takes several.
         message: String,
     },
-    /// The file says something that cannot be flown.
+    /// The file describes a course that cannot be flown.
     #[error("{}: {source}", path.display())]
     Fault {
         /// The file.
         path: PathBuf,
-        /// What and where.
+        /// The fault.
         source: CourseFault,
     },
 }
@@ -63,13 +62,14 @@ impl Course {
         Self::parse(&text, path)
     }
 
-    /// Reads a course from the text of a course file. `path` is named in errors only.
+    /// Reads a course from the text of a course file. `path` serves errors only.
     ///
     /// # Errors
-    /// As [`Course::load`].
+    /// Like [`Course::load`].
     pub fn parse(text: &str, path: impl AsRef<Path>) -> Result<Self, CourseError> {
         let path = path.as_ref();
-        let file: CourseFile = toml::from_str(text).map_err(|error| refused(path, text, &error))?;
+        let file: CourseFile =
+            toml::from_str(text).map_err(|error| syntax_error(path, text, &error))?;
         file.layout()
             .and_then(Self::new)
             .map_err(|source| CourseError::Fault {
@@ -79,9 +79,13 @@ impl Course {
     }
 }
 
-/// The parser's refusal in the words of a course file.
-fn refused(path: &Path, text: &str, error: &toml::de::Error) -> CourseError {
-    let Whereabouts { line, place, key } = Whereabouts::of(error.span().unwrap_or_default(), text);
+/// Converts the parser's error to one that names the wall and the key.
+fn syntax_error(path: &Path, text: &str, error: &toml::de::Error) -> CourseError {
+    let SourceLocation {
+        line,
+        location,
+        key,
+    } = SourceLocation::of(error.span().unwrap_or_default(), text);
     let problem = error.message().trim_end().replace('\n', " ");
     let message = match key {
         Some(key) if !problem.contains(&format!("`{key}`")) => format!("key {key}: {problem}"),
@@ -89,13 +93,13 @@ fn refused(path: &Path, text: &str, error: &toml::de::Error) -> CourseError {
     };
     CourseError::Syntax {
         path: path.to_owned(),
-        place,
+        location,
         line,
         message,
     }
 }
 
-/// A course file as it is written.
+/// Contents of a course file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CourseFile {
@@ -105,13 +109,13 @@ struct CourseFile {
     wall_thickness_m: f32,
     corridor: Corridor,
     start: StartArea,
-    wall: Vec<WallEntry>,
+    wall: Vec<WallTable>,
 }
 
-/// A `[[wall]]`: which of the optional keys must be there depends on the shape.
+/// Contents of a `[[wall]]` table. The shape decides which of the optional keys it needs.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct WallEntry {
+struct WallTable {
     label: WallLabel,
     shape: ShapeName,
     centre_m: [f32; 2],
@@ -176,7 +180,7 @@ impl CourseFile {
     }
 }
 
-impl WallEntry {
+impl WallTable {
     fn opening(mut self) -> Result<Opening, CourseFault> {
         let shape = self.take_shape()?;
         self.refuse_foreign_keys()?;
@@ -187,7 +191,7 @@ impl WallEntry {
         })
     }
 
-    /// Takes the keys of the shape, so that those left over are foreign to it.
+    /// Takes the keys of the shape out of the table; the keys that remain do not belong to it.
     fn take_shape(&mut self) -> Result<Shape, CourseFault> {
         let (wall, shape) = (self.label, self.shape);
         let need = |key: &'static str, value: Option<f32>| {

@@ -1,5 +1,4 @@
-//! Disturbed episodes: what each disturbance does to the drone, and that none does anything when it
-//! is off.
+//! Disturbed episodes: each disturbance has its effect when it is on and none when it is off.
 
 use std::sync::Arc;
 
@@ -11,13 +10,14 @@ use super::*;
 use crate::camera::{CameraSettings, IMAGE_PIXELS};
 use crate::course::{Course, test_course};
 use crate::oracle::Oracle;
-use crate::simulator::{Outcome, Simulator, SimulatorSettings};
+use crate::simulator::{EpisodeOutcome, Simulator, SimulatorSettings};
 use crate::vehicle::{Preset, VehicleSettings, VehicleState};
 
-/// Everything at once, strongly.
+/// Returns all disturbances at once, and strong.
 fn stormy() -> DisturbanceSettings {
     toml::from_str(
-        "mass_spread = 0.2\nlatency_periods = 1\ngust.force_rms_n = 0.15\ndepth.model = \"stereo\"\ndepth.dropout_share = 0.1\n",
+        "mass_spread = 0.2\nlatency_periods = 1\ngust.force_rms_n = 0.15\n\
+         depth.model = \"stereo\"\ndepth.dropout_share = 0.1\n",
     )
     .unwrap()
 }
@@ -43,7 +43,7 @@ fn reset(simulator: &mut Simulator, disturbances_seed: u64) {
     simulator.reset(1, &mut start, &mut disturbances).unwrap();
 }
 
-/// State and image before each step of `actions`, and after the last.
+/// Returns state and image before each step of `actions`, and after the last.
 fn flown(
     simulator: &mut Simulator,
     disturbances_seed: u64,
@@ -64,7 +64,7 @@ fn flown(
 }
 
 #[test]
-fn disturbed_episode_is_a_function_of_its_seeds_whatever_was_flown_before() {
+fn a_disturbed_episode_depends_on_its_seeds_and_not_on_earlier_episodes() {
     let actions = [[0.5, 0.2]; 8];
     let mut used = simulator(Preset::Airsim, stormy());
     let first = flown(&mut used, 5, &actions);
@@ -76,7 +76,7 @@ fn disturbed_episode_is_a_function_of_its_seeds_whatever_was_flown_before() {
 }
 
 #[test]
-fn share_of_episodes_is_disturbed_and_the_others_are_calm_in_every_respect() {
+fn a_share_of_episodes_is_disturbed_and_the_others_are_calm_in_every_respect() {
     let actions = [[0.5, 0.2]; 4];
     let now_and_then = DisturbanceSettings {
         share: 0.3,
@@ -97,7 +97,7 @@ fn share_of_episodes_is_disturbed_and_the_others_are_calm_in_every_respect() {
 }
 
 #[test]
-fn calm_settings_leave_no_trace_of_the_disturbances_generator() {
+fn the_disturbances_generator_has_no_influence_with_disturbances_off() {
     let actions = [[0.5, 0.2]; 8];
     for preset in [Preset::Airsim, Preset::Hummingbird, Preset::Point] {
         let mut calm = simulator(preset, DisturbanceSettings::default());
@@ -108,12 +108,11 @@ fn calm_settings_leave_no_trace_of_the_disturbances_generator() {
     }
 }
 
-/// The oracle's episodes from seed 1 to where they leave the last wall behind, as they were before
-/// there were disturbances: then, episodes were equal bit for bit. Here positions are held to a
-/// millimetre and sums to a part in 10,000, because mathematical functions may differ in the last
-/// bit from one system's library to another's.
+/// Compares the oracle's episode from seed 1, up to its last wall, with one recorded before
+/// disturbances existed. Positions may differ by a millimetre and sums by a part in 10,000, because
+/// mathematical functions of different system libraries may differ in the last bit.
 #[test]
-fn undisturbed_episodes_are_those_from_before_there_were_disturbances() {
+fn undisturbed_episodes_equal_those_recorded_before_disturbances_existed() {
     let course = concat!(
         env!("CARGO_MANIFEST_DIR"),
         "/../../configs/courses/training.toml"
@@ -145,7 +144,7 @@ fn undisturbed_episodes_are_those_from_before_there_were_disturbances() {
     }
 }
 
-/// Steps, position at the end in metres, sum of all pixels.
+/// Steps, final position in metres, sum of all pixels.
 const RECORDED: [(Preset, u32, [f32; 3], f64); 3] = [
     (
         Preset::Airsim,
@@ -168,7 +167,7 @@ const RECORDED: [(Preset, u32, [f32; 3], f64); 3] = [
 ];
 
 #[test]
-fn latency_shifts_the_answer_by_exactly_its_periods() {
+fn latency_shifts_the_response_by_exactly_its_periods() {
     let actions = [
         [0.8, -0.4],
         [-0.3, 0.6],
@@ -185,7 +184,7 @@ fn latency_shifts_the_answer_by_exactly_its_periods() {
         flown(&mut simulator(Preset::Airsim, disturbances), 1, actions)
     };
     for periods in [1, 2] {
-        // The same episode as of a prompt drone that waits as long.
+        // The same episode as without latency, after waiting as long.
         let waiting = [vec![[0.0, 0.0]; periods as usize], actions.to_vec()].concat();
         assert!(late(periods, &actions) == late(0, &waiting)[..=actions.len()]);
         assert!(late(periods, &actions) != late(0, &actions));
@@ -193,7 +192,7 @@ fn latency_shifts_the_answer_by_exactly_its_periods() {
 }
 
 #[test]
-fn what_was_on_its_way_does_not_reach_the_next_episode() {
+fn a_pending_command_does_not_reach_the_next_episode() {
     let disturbances = DisturbanceSettings {
         latency_periods: 2,
         ..Default::default()
@@ -204,8 +203,8 @@ fn what_was_on_its_way_does_not_reach_the_next_episode() {
     assert!(first == flown(&mut used, 1, &[[0.0, 0.0]; 2]));
 }
 
-/// A drone `factor` times as heavy as nominal, hovering: how far it has risen after each period,
-/// metres, and how fast it rises at last, m/s.
+/// Lets a drone of `factor` times the nominal mass hover. Returns its rise after each period,
+/// metres, and its final climb rate, m/s.
 fn hover(preset: Preset, factor: f32) -> (Vec<f32>, f32) {
     let mut simulator = simulator(
         preset,
@@ -216,7 +215,7 @@ fn hover(preset: Preset, factor: f32) -> (Vec<f32>, f32) {
     );
     let seed = (0..)
         .find(|&seed| {
-            let drawn = Drawn::draw(
+            let drawn = DrawnDisturbances::draw(
                 &DisturbanceSettings {
                     mass_spread: 0.5,
                     ..Default::default()
@@ -236,7 +235,7 @@ fn hover(preset: Preset, factor: f32) -> (Vec<f32>, f32) {
 }
 
 #[test]
-fn heavier_drone_sinks_first_lighter_one_rises_and_both_come_to_hover() {
+fn a_heavier_drone_sinks_first_a_lighter_one_rises_and_both_reach_hover() {
     for preset in [Preset::Airsim, Preset::Hummingbird] {
         let (heavy, heavy_mps) = hover(preset, 1.2);
         let (light, light_mps) = hover(preset, 0.8);
@@ -257,7 +256,9 @@ fn masses_are_spread_evenly_over_the_range_and_do_not_depend_on_gusts() {
         ..Default::default()
     };
     let factors: Vec<f32> = (0..4000)
-        .map(|seed| Drawn::draw(&settings, &mut Pcg64Mcg::seed_from_u64(seed)).mass_factor)
+        .map(|seed| {
+            DrawnDisturbances::draw(&settings, &mut Pcg64Mcg::seed_from_u64(seed)).mass_factor
+        })
         .collect();
     assert!(factors.iter().all(|factor| (0.8..=1.2).contains(factor)));
     for quarter in 0..4 {
@@ -268,12 +269,12 @@ fn masses_are_spread_evenly_over_the_range_and_do_not_depend_on_gusts() {
             .count();
         assert!((900..1100).contains(&share), "{share} of 4000 from {from}");
     }
-    let first = Drawn::draw(&calm, &mut Pcg64Mcg::seed_from_u64(0)).mass_factor;
+    let first = DrawnDisturbances::draw(&calm, &mut Pcg64Mcg::seed_from_u64(0)).mass_factor;
     assert_eq!(first, factors[0]);
 }
 
 #[test]
-fn gust_moves_a_hovering_drone_aside() {
+fn a_gust_moves_a_hovering_drone_aside() {
     let aside = |force_rms_n| {
         let disturbances = DisturbanceSettings {
             gust: GustSettings {
@@ -291,7 +292,7 @@ fn gust_moves_a_hovering_drone_aside() {
         (sum / 20.0).sqrt()
     };
     assert!(aside(0.0) < 1e-3);
-    // Twice the force, twice as far.
+    // Twice the force moves the drone twice as far.
     let ratio = aside(0.3) / aside(0.15);
     assert!(
         aside(0.3) > 0.1 && (1.8..2.2).contains(&ratio),
@@ -301,7 +302,7 @@ fn gust_moves_a_hovering_drone_aside() {
 }
 
 #[test]
-fn oracle_still_arrives_in_a_storm() {
+fn the_oracle_still_arrives_under_strong_disturbances() {
     let mut simulator = simulator(Preset::Airsim, stormy());
     let arrived = (0..20)
         .filter(|&seed| {
@@ -309,7 +310,7 @@ fn oracle_still_arrives_in_a_storm() {
             loop {
                 let action = Oracle::act(simulator.course(), &simulator.state());
                 if let Some(outcome) = simulator.step(action).unwrap().outcome {
-                    return outcome == Outcome::ReachedEnd;
+                    return outcome == EpisodeOutcome::ReachedEnd;
                 }
             }
         })
@@ -318,13 +319,13 @@ fn oracle_still_arrives_in_a_storm() {
 }
 
 #[test]
-fn what_is_out_of_bounds_or_would_do_nothing_is_refused_by_key() {
+fn a_setting_out_of_bounds_or_without_effect_is_refused_by_key() {
     let refusal = |text: &str, preset| {
         let settings: DisturbanceSettings = toml::from_str(text).unwrap();
-        let refused = settings.check(&of(preset), &CameraSettings::default());
+        let refused = settings.validate(&of(preset), CameraSettings::default().range_m);
         refused.map_err(|fault| fault.to_string())
     };
-    for (text, told) in [
+    for (text, expected) in [
         ("mass_spread = 0.6", "mass_spread = 0.6 is outside 0 to 0.5"),
         ("mass_spread = nan", "mass_spread = NaN"),
         (
@@ -346,14 +347,14 @@ fn what_is_out_of_bounds_or_would_do_nothing_is_refused_by_key() {
             "makes the noise at 20 m 400",
         ),
     ] {
-        let told_is = refusal(text, Preset::Airsim).unwrap_err();
-        assert!(told_is.contains(told), "{told_is}");
-        assert!(told_is.starts_with("disturbances: key "), "{told_is}");
+        let message = refusal(text, Preset::Airsim).unwrap_err();
+        assert!(message.contains(expected), "{message}");
+        assert!(message.starts_with("disturbances: key "), "{message}");
     }
     for text in ["mass_spread = 0.2", "gust.force_rms_n = 0.2"] {
         assert_eq!(refusal(text, Preset::Airsim), Ok(()));
-        let told = refusal(text, Preset::Point).unwrap_err();
-        assert!(told.contains("vehicle.preset = \"point\""), "{told}");
+        let message = refusal(text, Preset::Point).unwrap_err();
+        assert!(message.contains("vehicle.preset = \"point\""), "{message}");
     }
     assert_eq!(
         refusal(

@@ -26,19 +26,19 @@ fn rng(seed: u64) -> Pcg64Mcg {
     Pcg64Mcg::seed_from_u64(seed)
 }
 
-/// Flies under `policy` to the end and returns each step's state and report.
+/// Flies `choose_action` to the end and returns each step's state and report.
 fn fly(
     simulator: &mut Simulator,
     level: u8,
     seed: u64,
-    policy: impl Fn(&Course, &VehicleState) -> [f32; 2],
+    choose_action: impl Fn(&Course, &VehicleState) -> [f32; 2],
 ) -> Vec<(VehicleState, StepReport)> {
     simulator
         .reset(level, &mut rng(seed), &mut rng(!seed))
         .unwrap();
     let mut steps = Vec::new();
     loop {
-        let action = policy(simulator.course(), &simulator.state());
+        let action = choose_action(simulator.course(), &simulator.state());
         let report = simulator.step(action).unwrap();
         steps.push((simulator.state(), report));
         if report.outcome.is_some() {
@@ -67,7 +67,7 @@ fn bits(steps: &[(VehicleState, StepReport)]) -> Vec<u32> {
 fn episode_after_another_episode_is_bit_equal_to_one_in_a_fresh_simulator() {
     for preset in PRESETS {
         let mut used = simulator(preset);
-        // One episode that collides in a wild attitude, one that arrives.
+        // One episode collides in a wild attitude, the other reaches the end.
         fly(&mut used, 3, 7, |_, _| [1.0, -1.0]);
         fly(&mut used, 1, 8, Oracle::act);
         let again = fly(&mut used, 2, 9, Oracle::act);
@@ -84,7 +84,7 @@ fn whole_course_passes_every_wall_once_and_reaches_the_end() {
         let (state, last) = steps.last().unwrap();
         assert_eq!(
             last.outcome,
-            Some(Outcome::ReachedEnd),
+            Some(EpisodeOutcome::ReachedEnd),
             "{preset:?} at {}",
             state.position_m
         );
@@ -128,12 +128,12 @@ fn wall_counts_when_the_centre_leaves_its_back_face() {
 
 #[test]
 fn straight_episode_ends_at_the_first_wall_with_the_nose_on_it() {
-    // The test course's first opening is off the middle.
+    // The test course's first opening does not cover the middle.
     let steps = fly(&mut simulator(Preset::Point), 1, 1, |_, _| [0.0, 0.0]);
     let (state, last) = steps.last().unwrap();
     assert_eq!(
         (last.outcome, last.walls_passed),
-        (Some(Outcome::Collided), 0)
+        (Some(EpisodeOutcome::Collided), 0)
     );
     assert_eq!(last.hit, Some(Obstacle::Wall(1)));
     let nose_m = state.position_m.x + 0.49;
@@ -147,7 +147,7 @@ fn floor_ceiling_and_sides_are_solid() {
         let (state, last) = steps.last().unwrap();
         assert_eq!(
             (last.outcome, last.hit),
-            (Some(Outcome::Collided), Some(Obstacle::Corridor))
+            (Some(EpisodeOutcome::Collided), Some(Obstacle::Corridor))
         );
         assert!(
             state.position_m.x < 9.0,
@@ -158,7 +158,7 @@ fn floor_ceiling_and_sides_are_solid() {
 }
 
 #[test]
-fn step_limit_breaks_the_episode_off_as_timed_out() {
+fn step_limit_ends_the_episode_as_timed_out() {
     let settings = SimulatorSettings {
         max_steps: 3,
         ..Default::default()
@@ -168,7 +168,7 @@ fn step_limit_breaks_the_episode_off_as_timed_out() {
     assert_eq!(steps.len(), 3);
     assert_eq!(
         (steps[2].1.outcome, steps[2].1.hit),
-        (Some(Outcome::TimedOut), None)
+        (Some(EpisodeOutcome::TimedOut), None)
     );
     assert_eq!(simulator.step([0.0, 0.0]), Err(SimulationError::NotFlying));
 }
@@ -263,9 +263,9 @@ fn level_beyond_the_course_is_refused() {
 }
 
 #[test]
-fn the_ground_truth_tells_what_disturbs_an_episode_and_nothing_of_the_kind_in_a_calm_one() {
+fn the_ground_truth_holds_the_disturbances_of_an_episode_and_none_in_a_calm_one() {
     let mut settings = SimulatorSettings::default();
-    let mut told = |share: f32| {
+    let mut ground_truth = |share: f32| {
         settings.disturbances.share = share;
         settings.disturbances.mass_spread = 0.2;
         settings.disturbances.latency_periods = 2;
@@ -275,7 +275,7 @@ fn the_ground_truth_tells_what_disturbs_an_episode_and_nothing_of_the_kind_in_a_
         simulator.step([0.0, 0.0]).unwrap();
         simulator.ground_truth()
     };
-    let (calm, disturbed) = (told(0.0), told(1.0));
+    let (calm, disturbed) = (ground_truth(0.0), ground_truth(1.0));
     assert_eq!(
         (calm.mass_factor, calm.latency_periods, calm.gust_n),
         (1.0, 0.0, [0.0; 3])

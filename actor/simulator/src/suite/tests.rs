@@ -1,4 +1,4 @@
-//! Suites: what they fly, and what is refused.
+//! Suites: which courses they fly, and which files are refused.
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
@@ -27,7 +27,7 @@ fn labels(course: &Course) -> Vec<u32> {
 }
 
 #[test]
-fn generalist_suite_is_six_thousand_episodes() {
+fn the_generalist_suite_has_six_thousand_episodes() {
     let suite = generalist();
     assert_eq!(suite.entries.len(), 6);
     assert!(suite.entries.iter().all(|entry| entry.episodes == 1000));
@@ -51,7 +51,7 @@ fn generalist_suite_is_six_thousand_episodes() {
 }
 
 #[test]
-fn all_orders_are_flown_alike_often_and_the_first_is_the_files_own() {
+fn all_orders_are_flown_equally_often_and_the_first_is_the_files_own() {
     let suite = generalist();
     let orders = entry(&suite, "all 120 orders");
     let flown: Vec<_> = (0..240)
@@ -60,12 +60,12 @@ fn all_orders_are_flown_alike_often_and_the_first_is_the_files_own() {
     assert_eq!(flown[0], [1, 2, 3, 4, 5]);
     assert_eq!(flown[..120].iter().collect::<HashSet<_>>().len(), 120);
     assert_eq!(flown[..120], flown[120..]);
-    // Few episodes are spread over all orders, too.
+    // A few episodes are spread over all orders as well.
     for first in 1..=5 {
-        let begun = flown[..20].iter().filter(|order| order[0] == first).count();
+        let starts = flown[..20].iter().filter(|order| order[0] == first).count();
         assert!(
-            (3..=5).contains(&begun),
-            "{begun} of 20 begin with wall {first}"
+            (3..=5).contains(&starts),
+            "{starts} of 20 start with wall {first}"
         );
     }
     // A wall keeps its opening wherever it stands.
@@ -112,12 +112,12 @@ fn held_out_courses_hold_only_held_out_shapes_with_the_disc_they_name() {
             }
             outlines.insert(format!("{:?}", course.walls()[0].outline()));
         }
-        assert_eq!(outlines.len(), 100, "every episode has a course of its own");
+        assert_eq!(outlines.len(), 100, "every episode has its own course");
     }
 }
 
 #[test]
-fn non_rectangular_gates_are_of_the_held_out_families() {
+fn the_non_rectangular_gates_are_the_held_out_families() {
     let gates = Course::load(configs().join("courses/non_rectangular.toml")).unwrap();
     let names: HashSet<_> = gates
         .walls()
@@ -134,7 +134,7 @@ fn non_rectangular_gates_are_of_the_held_out_families() {
 }
 
 #[test]
-fn what_cannot_be_flown_is_refused_by_file_entry_and_key() {
+fn a_suite_that_cannot_be_flown_is_refused_by_file_entry_and_key() {
     let path = configs().join("evaluations/x.toml");
     let refusal = |text: &str| Suite::parse(text, &path).unwrap_err().to_string();
     let of_entry = |keys: &str| {
@@ -142,12 +142,12 @@ fn what_cannot_be_flown_is_refused_by_file_entry_and_key() {
             "name = \"x\"\nepisodes = 2\n[[entry]]\nname = \"one\"\n{keys}"
         ))
     };
-    for (told, expected) in [
+    for (message, expected) in [
         (refusal("name = \"x\""), "has 0 [[entry]] tables"),
         (refusal("name = 3"), "line 1: invalid type"),
         (
-            refusal("name = \"x\"\nflihgts = 2\n"),
-            "line 2: unknown field `flihgts`",
+            refusal("name = \"x\"\nepisods = 2\n"),
+            "line 2: unknown field `episods`",
         ),
         (
             of_entry(""),
@@ -182,7 +182,8 @@ fn what_cannot_be_flown_is_refused_by_file_entry_and_key() {
         ),
         (
             of_entry(
-                "course = \"../courses/training.toml\"\n[[entry]]\nname = \"one\"\ncourse = \"../courses/training.toml\"",
+                "course = \"../courses/training.toml\"\n[[entry]]\nname = \"one\"\n\
+                 course = \"../courses/training.toml\"",
             ),
             "another entry has this name",
         ),
@@ -193,7 +194,7 @@ fn what_cannot_be_flown_is_refused_by_file_entry_and_key() {
             "has no episodes",
         ),
     ] {
-        assert!(told.contains(expected), "{told}");
-        assert!(told.contains("evaluations/x.toml: "), "{told}");
+        assert!(message.contains(expected), "{message}");
+        assert!(message.contains("evaluations/x.toml: "), "{message}");
     }
 }

@@ -54,7 +54,7 @@ fn every_shipped_experiment_can_be_run() {
 #[test]
 fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
     let text = format!(
-        "{}[settings]\nrun.episodes = 90\nreplay = {{ success_share = 0.5, success = \"approach\" }}\n{ARM}settings.\"replay.success_share\" = 0.25\nsettings.simulator.reward.action_scale = 2.0\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n",
+        "{}[settings]\nrun.episodes = 90\nreplay = {{ success_share = 0.5, success = \"approach\" }}\n{ARM}settings.\"replay.success_share\" = 0.25\nsettings.simulator.reward.open_view = 2.0\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n",
         head().replace("\"return\"", "\"walls_passed\"")
     );
     let experiment = load(&text, None).unwrap();
@@ -70,11 +70,11 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
         (90, 1)
     );
     assert_eq!(
-        a.config.simulator["reward"]["action_scale"].as_float(),
+        a.config.simulator["reward"]["open_view"].as_float(),
         Some(2.0)
     );
     assert_eq!(
-        b.config.simulator["reward"]["action_scale"].as_float(),
+        b.config.simulator["reward"]["open_view"].as_float(),
         Some(1.0),
         "written out"
     );
@@ -423,7 +423,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         ),
         (
             with_arm(
-                "[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.reward.action_scale = 2.0",
+                "[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.reward.open_view = 2.0",
             ),
             None,
             vec![

@@ -75,7 +75,7 @@ pub(super) const EXPERIMENT: Target = Target {
 /// The shipped ones, with the configuration they are based on where this process finds it.
 fn experiment_samples() -> Vec<Vec<u8>> {
     let configs = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/");
-    ["paper", "success-share", "vae-freeze", "action-reward"]
+    ["paper", "success-share", "vae-freeze", "open-view"]
         .map(|name| shipped(&format!("configs/experiments/{name}.toml")))
         .map(|bytes| {
             String::from_utf8(bytes)

@@ -11,7 +11,7 @@ use skein_simulator::course::{
     WallLabel, WallLayout,
 };
 use skein_simulator::reward::RewardTerms;
-use skein_simulator::simulator::{Outcome, Simulator, SimulatorSettings};
+use skein_simulator::simulator::{EpisodeOutcome, Simulator, SimulatorSettings};
 use skein_simulator::suite::Suite;
 
 use super::{Target, USUAL, Verdict, shipped, text};
@@ -191,7 +191,11 @@ pub(super) fn fly(simulator: &mut Simulator, settings: &SimulatorSettings, level
         if report.outcome.is_some() {
             // At the slow default speed, half a second from the start there is nothing to touch.
             let defaults = settings.vehicle == SimulatorSettings::default().vehicle;
-            assert!(!defaults || action != [0.0, 0.0] || report.outcome != Some(Outcome::Collided));
+            assert!(
+                !defaults
+                    || action != [0.0, 0.0]
+                    || report.outcome != Some(EpisodeOutcome::Collided)
+            );
             break;
         }
     }

@@ -1,3 +1,5 @@
+//! Course files: what they accept, and the errors that name wall, key and line.
+
 use super::*;
 
 const GOOD: &str = r#"
@@ -100,12 +102,13 @@ fn a_value_of_the_wrong_kind_is_named_with_its_wall_line_and_key() {
     says(
         "\"rectangle\"",
         "\"oblong\"",
-        "wall 4: line 16: key shape: unknown variant `oblong`, expected one of `rectangle`, `circle`, `triangle`, `diamond`, `cross`, `l`, `polygon`",
+        "wall 4: line 16: key shape: unknown variant `oblong`, expected one of `rectangle`, \
+         `circle`, `triangle`, `diamond`, `cross`, `l`, `polygon`",
     );
 }
 
 #[test]
-fn a_file_that_is_no_toml_is_refused_by_wall_line_and_key() {
+fn a_file_that_is_not_toml_is_refused_by_wall_line_and_key() {
     assert_says(
         &refusal("diameter_m = 2.2", "diameter_m = = 2.2"),
         &["wall 7: line 24: key diameter_m: "],
@@ -117,7 +120,7 @@ fn a_file_that_is_no_toml_is_refused_by_wall_line_and_key() {
 }
 
 #[test]
-fn keys_are_those_of_the_shape() {
+fn a_shape_takes_exactly_its_keys() {
     assert_says(
         &refusal("diameter_m = 2.2", ""),
         &["wall 7", "diameter_m is missing"],
@@ -142,7 +145,7 @@ fn an_opening_smaller_than_the_drone_is_refused() {
 }
 
 #[test]
-fn an_opening_over_the_rim_is_refused() {
+fn an_opening_beyond_the_frame_is_refused() {
     assert_says(
         &refusal("[1.0, 3.0]", "[2.0, 3.0]"),
         &["wall 4", "y = 3.00 m", "centre_m"],
@@ -196,7 +199,7 @@ fn order_must_match_walls_and_places() {
 }
 
 #[test]
-fn numbers_that_are_none_are_refused() {
+fn numbers_that_are_not_finite_or_negative_are_refused() {
     for key in ["length_m", "offset_m", "wall_thickness_m", "rotation_deg"] {
         let text = match key {
             "length_m" => GOOD.replace("length_m = 30.0", "length_m = nan"),

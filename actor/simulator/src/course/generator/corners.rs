@@ -1,4 +1,6 @@
-//! Families of openings that are polygons: corners `[y, z]`, counter-clockwise, of any size.
+//! Families of openings that are polygons.
+//!
+//! Each function draws corners `[y, z]`, counter-clockwise and of arbitrary scale.
 
 use std::f32::consts::TAU;
 
@@ -50,7 +52,7 @@ pub(super) fn star(rng: &mut impl Rng) -> Shape {
     Shape::Polygon { points_m }
 }
 
-/// Corners around a centre, bays and points wherever they come to lie.
+/// Corners around a centre, with bays and points at random.
 pub(super) fn blob(rng: &mut impl Rng) -> Shape {
     let corners = rng.random_range(9..=14);
     let points_m = (0..corners)
@@ -60,7 +62,7 @@ pub(super) fn blob(rng: &mut impl Rng) -> Shape {
 }
 
 pub(super) fn keyhole(rng: &mut impl Rng) -> Shape {
-    // The slot leaves the head between its last corner and its first, both on the unit circle.
+    // The slot starts between the head's last corner and its first, both on the unit circle.
     let (sides, half_slot) = (rng.random_range(5..=8), rng.random_range(0.065..=0.11));
     let (length, taper) = (rng.random_range(0.8..=1.8), rng.random_range(0.7..=1.1));
     let [neck, edge] = polar(half_slot, 1.0);
@@ -81,12 +83,12 @@ pub(super) fn keyhole(rng: &mut impl Rng) -> Shape {
     Shape::Polygon { points_m }
 }
 
-/// The unit disc without another one beside it: around on its own edge, back on that of the other.
+/// The unit disc without a second one: around on its own edge, back on the edge of the second.
 pub(super) fn crescent(rng: &mut impl Rng) -> Shape {
     const OUTER: usize = 12;
     const INNER: usize = 6;
     let beside: f32 = rng.random_range(0.9..=1.3);
-    // Half of the angle under which either centre sees where the two edges cross.
+    // Half of the angle, seen from either centre, between the points where the two edges cross.
     let crossing = (beside / 2.0).acos() / TAU;
     let outer = (0..=OUTER).map(|corner| {
         polar(
@@ -116,7 +118,7 @@ pub(super) fn u(rng: &mut impl Rng) -> Shape {
     ])
 }
 
-/// The right half of a shape, from the bottom upwards or back to the middle, and its mirror image.
+/// Completes the right half of a shape, from bottom to top, with its mirror image.
 fn mirrored(right: &[[f32; 2]]) -> Shape {
     let left = right.iter().rev().map(|[y, z]| [-y, *z]);
     Shape::Polygon {
@@ -124,7 +126,7 @@ fn mirrored(right: &[[f32; 2]]) -> Shape {
     }
 }
 
-/// The point at `share` of a full turn, `radius` from the centre.
+/// Returns the point at `share` of a full turn, `radius` from the centre.
 fn polar(share: f32, radius: f32) -> [f32; 2] {
     let (sin, cos) = (share * TAU).sin_cos();
     [radius * cos, radius * sin]

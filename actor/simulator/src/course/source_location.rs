@@ -1,27 +1,27 @@
-//! Says where in a course file the parser stumbled: line, wall and key.
+//! Location of a parser error in a course file: line, wall and key.
 //!
-//! The parser knows a byte, its user thinks in walls. Lines are looked at, not tables: a file that
-//! is no TOML still has walls and keys.
+//! The parser reports a byte, but a user thinks in walls. The search goes by lines instead of
+//! parsed tables, because a file that is not TOML still has walls and keys.
 
 use std::ops::Range;
 
-use super::{Place, WallLabel};
+use super::{FaultLocation, WallLabel};
 
-/// Where in a course file something is wrong.
+/// Location of an error in a course file.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Whereabouts {
+pub(super) struct SourceLocation {
     /// The line, from 1.
     pub(super) line: usize,
-    /// The wall in whose table the line stands, if its label can be read.
-    pub(super) place: Place,
-    /// The key whose value the line is part of, or the name of the table that begins there.
+    /// The wall whose table holds the line, if its label can be read.
+    pub(super) location: FaultLocation,
+    /// The key whose value holds the line, or the name of the table that begins there.
     pub(super) key: Option<String>,
 }
 
-impl Whereabouts {
-    /// Those of the bytes `span` of `text`.
+impl SourceLocation {
+    /// Returns the location of the bytes `span` of `text`.
     pub(super) fn of(span: Range<usize>, text: &str) -> Self {
-        // What the whole file lacks is reported at its first byte, whatever stands there.
+        // The parser reports a key that the whole file lacks at the first byte.
         let whole_file = span == (0..0);
         let line = 1 + text
             .bytes()
@@ -37,7 +37,7 @@ impl Whereabouts {
                 (table, label, key) = (header, None, (header != "wall").then_some(header));
                 continue;
             }
-            // Any other line is a comment or goes on with the value of the key before it.
+            // Any other line is a comment or continues the value of the previous key.
             let Some(name) = bare_key(text) else { continue };
             if number <= line {
                 key = Some(name);
@@ -48,19 +48,21 @@ impl Whereabouts {
         }
         Self {
             line,
-            place: label.map_or(Place::Course, |label| Place::Wall(WallLabel(label))),
+            location: label.map_or(FaultLocation::Course, |label| {
+                FaultLocation::Wall(WallLabel(label))
+            }),
             key: key.filter(|_| !whole_file).map(str::to_owned),
         }
     }
 }
 
-/// The name in `[name]` or `[[name]]`, closed or not; the rows of an array are none.
+/// Returns the name in `[name]` or `[[name]]`, closed or not; `None` for the rows of an array.
 fn header(line: &str) -> Option<&str> {
     line.starts_with('[')
         .then(|| bare_key(line.trim_start_matches(['[', ' '])))?
 }
 
-/// The word that a line begins with; numbers are none.
+/// Returns the key that a line begins with; `None` if it begins with a number.
 fn bare_key(line: &str) -> Option<&str> {
     let is_key = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
     let key = line.split(|c| !is_key(c)).next()?;
@@ -98,17 +100,27 @@ length_m = "long"
 "#;
 
     #[track_caller]
-    fn assert_found(fault: &str, line: usize, place: Place, key: Option<&str>) {
+    fn assert_found(fault: &str, line: usize, location: FaultLocation, key: Option<&str>) {
         let start = TEXT.find(fault).unwrap();
-        let found = Whereabouts::of(start..start + fault.len(), TEXT);
+        let found = SourceLocation::of(start..start + fault.len(), TEXT);
         let key = key.map(str::to_owned);
-        assert_eq!(found, Whereabouts { line, place, key }, "{fault}");
+        let expected = SourceLocation {
+            line,
+            location,
+            key,
+        };
+        assert_eq!(found, expected, "{fault}");
     }
 
     #[test]
     fn a_value_over_several_lines_belongs_to_its_key() {
-        assert_found("2O.0", 4, Place::Course, Some("wall_x_m"));
-        assert_found("\"x\"", 10, Place::Wall(WallLabel(4)), Some("points_m"));
+        assert_found("2O.0", 4, FaultLocation::Course, Some("wall_x_m"));
+        assert_found(
+            "\"x\"",
+            10,
+            FaultLocation::Wall(WallLabel(4)),
+            Some("points_m"),
+        );
     }
 
     #[test]
@@ -116,29 +128,29 @@ length_m = "long"
         assert_found(
             "0.0\npoints",
             7,
-            Place::Wall(WallLabel(4)),
+            FaultLocation::Wall(WallLabel(4)),
             Some("centre_m"),
         );
-        assert_found("seven", 14, Place::Course, Some("label"));
-        assert_found("[[wall\n", 15, Place::Wall(WallLabel(8)), None);
+        assert_found("seven", 14, FaultLocation::Course, Some("label"));
+        assert_found("[[wall\n", 15, FaultLocation::Wall(WallLabel(8)), None);
     }
 
     #[test]
-    fn what_follows_a_wall_is_not_part_of_it() {
-        assert_found("\"long\"", 18, Place::Course, Some("length_m"));
-        assert_found("[corridor]", 17, Place::Course, Some("corridor"));
+    fn a_table_after_a_wall_is_not_part_of_it() {
+        assert_found("\"long\"", 18, FaultLocation::Course, Some("length_m"));
+        assert_found("[corridor]", 17, FaultLocation::Course, Some("corridor"));
     }
 
     #[test]
-    fn what_the_whole_file_lacks_has_no_key() {
-        let found = Whereabouts::of(0..0, TEXT);
-        assert_eq!((found.place, found.key), (Place::Course, None));
+    fn a_key_missing_from_the_whole_file_has_no_line_key() {
+        let found = SourceLocation::of(0..0, TEXT);
+        assert_eq!((found.location, found.key), (FaultLocation::Course, None));
     }
 
     #[test]
-    fn the_end_of_the_file_is_somewhere() {
-        let found = Whereabouts::of(TEXT.len()..TEXT.len(), TEXT);
-        assert_eq!((found.line, found.place), (19, Place::Course));
-        assert_eq!(Whereabouts::of(0..0, "").line, 1);
+    fn the_end_of_the_file_has_a_line() {
+        let found = SourceLocation::of(TEXT.len()..TEXT.len(), TEXT);
+        assert_eq!((found.line, found.location), (19, FaultLocation::Course));
+        assert_eq!(SourceLocation::of(0..0, "").line, 1);
     }
 }

@@ -1,8 +1,8 @@
-//! The drones' answers to steps of the command, against values derived by hand.
+//! Step responses of the drones, against values derived by hand.
 //!
-//! Lateral: velocity error e asks for tilt k·e, the tilt follows with rate a, and tilt θ
-//! accelerates by g·θ. So the closed loop is s² + a·s + a·g·k = 0; for its poles p < q the step
-//! response is 1 − (q·exp(−p·t) − p·exp(−q·t)) / (q − p).
+//! Lateral motion: a velocity error e gives the target tilt k·e, the tilt follows with rate a, and
+//! a tilt θ accelerates by g·θ. So the closed loop is s² + a·s + a·g·k = 0. For its poles p < q the
+//! step response is 1 − (q·exp(−p·t) − p·exp(−q·t)) / (q − p).
 
 use nalgebra::{Point3, Vector3};
 
@@ -10,8 +10,8 @@ use super::{Preset, Vehicle, VehicleSettings, VehicleState};
 use crate::course::test_course;
 use crate::world::World;
 
-/// States after every physics step of an episode under constant `velocity_mps` from hover at
-/// mid-height. Walls do not act.
+/// Returns the step length, s, and the state after every physics step under a constant
+/// `velocity_mps`, from hover at mid-height. Walls are ignored.
 fn fly(preset: Preset, velocity_mps: Vector3<f32>, secs: f32) -> (f32, Vec<VehicleState>) {
     let settings = VehicleSettings {
         preset,
@@ -31,7 +31,7 @@ fn fly(preset: Preset, velocity_mps: Vector3<f32>, secs: f32) -> (f32, Vec<Vehic
     (dt_secs, states)
 }
 
-/// Time at which the lateral velocity first passes 63.2 % of a step to 1 m/s, s.
+/// Returns the time at which the lateral velocity first reaches 63.2 % of a step to 1 m/s, s.
 fn lateral_rise_secs(preset: Preset) -> f32 {
     let (dt_secs, states) = fly(preset, Vector3::new(1.0, 1.0, 0.0), 4.0);
     let risen = states
@@ -42,7 +42,7 @@ fn lateral_rise_secs(preset: Preset) -> f32 {
 }
 
 #[test]
-fn airsim_answers_sideways_in_0_92_s() {
+fn airsim_responds_sideways_in_0_92_s() {
     // k = 0.2 · π/5.5, a = 6.25: poles 1.46 and 4.79 per s, mean lag 1/(g·k) = 0.89 s, 63.2 % after
     // 0.92 s.
     let rise_secs = lateral_rise_secs(Preset::Airsim);
@@ -50,7 +50,7 @@ fn airsim_answers_sideways_in_0_92_s() {
 }
 
 #[test]
-fn hummingbird_answers_sideways_in_0_42_s() {
+fn hummingbird_responds_sideways_in_0_42_s() {
     // k = 0.255, a = 12: poles 3.55 and 8.45 per s, mean lag 0.40 s, 63.2 % after 0.42 s.
     let rise_secs = lateral_rise_secs(Preset::Hummingbird);
     assert!((rise_secs - 0.42).abs() < 0.03, "{rise_secs}");
@@ -81,7 +81,7 @@ fn commanded_velocity_is_reached_on_every_axis() {
         ] {
             let (_, states) = fly(preset, command, 8.0);
             let reached = states.last().unwrap().velocity_mps;
-            // Horizontally nothing integrates, so drag keeps the drones a little short of it.
+            // No horizontal loop integrates, so drag keeps the drone a little slower.
             assert!(
                 (reached - command).norm() < 0.02,
                 "{preset:?}: {reached} instead of {command}"
@@ -112,9 +112,9 @@ fn hovering_forward_holds_altitude() {
 
 #[test]
 fn airsim_climb_is_limited_by_its_rotors_then_overshoots_by_its_integral() {
-    // Full thrust lifts 16.72 N − 9.81 N on 1 kg: 6.9 m/s². The error of some 0.09 m accumulated
-    // while rising is worth 9 % of throttle, which at P = 1 per m/s is as many per cent of
-    // overshoot, decaying with P / I = 1 s.
+    // Full thrust gives 16.72 N − 9.81 N on 1 kg: 6.9 m/s². The error accumulated while rising,
+    // some 0.09 m, adds 9 % of throttle. At P = 1 per m/s that is 9 % of overshoot, which decays
+    // with P / I = 1 s.
     let (dt_secs, states) = fly(Preset::Airsim, Vector3::new(0.0, 0.0, 1.0), 4.0);
     let climb = |secs: f32| states[(secs / dt_secs) as usize].velocity_mps.z;
     assert!((climb(0.08) - 6.9 * 0.08).abs() < 0.06, "{}", climb(0.08));
@@ -125,7 +125,7 @@ fn airsim_climb_is_limited_by_its_rotors_then_overshoots_by_its_integral() {
 
 #[test]
 fn tilt_limit_is_respected_and_used() {
-    // Ten m/s of error ask for far more than the limit.
+    // An error of 10 m/s gives a target far above the limit.
     let (_, states) = fly(Preset::Airsim, Vector3::new(10.0, 0.0, 0.0), 3.0);
     let steepest = states
         .iter()
@@ -135,9 +135,9 @@ fn tilt_limit_is_respected_and_used() {
 }
 
 #[test]
-fn yaw_stays_zero_whatever_the_policy_does() {
-    // Rolling and pitching at once turns the nose by at most half the product of the two tilts; the
-    // controller takes it back.
+fn yaw_stays_near_zero_under_every_command() {
+    // Rolling and pitching at once turns the nose by at most half the product of the two tilts. The
+    // controller corrects it.
     for (preset, tilt_rad) in [(Preset::Airsim, 0.114_f32), (Preset::Hummingbird, 0.255)] {
         for command in [
             Vector3::new(1.0, 1.0, 1.0),
@@ -157,7 +157,7 @@ fn yaw_stays_zero_whatever_the_policy_does() {
 }
 
 #[test]
-fn yaw_knocked_off_by_tilting_both_ways_to_the_limit_comes_back() {
+fn yaw_returns_to_zero_after_tilting_both_ways_to_the_limit() {
     let (_, states) = fly(Preset::Airsim, Vector3::new(8.0, 8.0, 1.0), 20.0);
     let yaw_deg = states
         .last()

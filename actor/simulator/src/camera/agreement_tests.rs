@@ -1,4 +1,4 @@
-//! The drawn image against the traced one, over random poses in random courses.
+//! The drawn image compared with the traced one, for random poses in random courses.
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 use proptest::prelude::*;
@@ -6,26 +6,27 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::{
-    CameraSettings, DepthCamera, Errors, IMAGE_PIXELS, IMAGE_WIDTH, Instructions, ReferenceCamera,
+    CameraSettings, DepthCamera, IMAGE_PIXELS, IMAGE_WIDTH, ImageErrors, InstructionSet,
+    ReferenceCamera,
 };
 use crate::course::{Course, GeneratorRanges, test_course};
 
-/// Grey levels by which a pixel may differ: one rounding.
+/// Grey levels by which a pixel may differ, due to rounding.
 const ROUNDING: u8 = 1;
 
-/// Pixels about which a silhouette is looked for when the middles disagree: how exactly an edge
-/// must lie.
+/// Distance in pixels within which a silhouette excuses a difference: the tolerance of an edge's
+/// position.
 const SILHOUETTE_PX: f32 = 0.02;
 
-/// Share of the pixels that a silhouette may excuse. An image holds some 500 silhouette pixels, one
-/// in 25 of which has its middle within [`SILHOUETTE_PX`] of the edge; of these, few disagree.
+/// Most pixels that a silhouette may excuse. An image holds some 500 silhouette pixels. One in 25
+/// of them has its middle within [`SILHOUETTE_PX`] of the edge, and few of these differ.
 const MOST_EXCUSED: usize = IMAGE_PIXELS / 500;
 
-/// How two images of the same pose compare.
-struct Comparison {
-    /// Pixels that differ and lie on a silhouette.
+/// Differences between two images of the same pose.
+struct ImageComparison {
+    /// Number of pixels that differ but lie on a silhouette.
     excused: usize,
-    /// Pixels that differ without excuse: column, row, drawn, traced.
+    /// All other pixels that differ: column, row, drawn, traced.
     wrong: Vec<(usize, usize, u8, u8)>,
 }
 
@@ -33,7 +34,7 @@ fn compare(
     course: &Course,
     settings: &CameraSettings,
     world_from_body: &Isometry3<f32>,
-) -> Comparison {
+) -> ImageComparison {
     let reference = ReferenceCamera::new(settings, course).unwrap();
     let mut drawn = [0; IMAGE_PIXELS];
     let mut traced = [0; IMAGE_PIXELS];
@@ -43,7 +44,7 @@ fn compare(
     reference.render(world_from_body, &mut traced);
 
     let view = settings.view(world_from_body);
-    let mut comparison = Comparison {
+    let mut comparison = ImageComparison {
         excused: 0,
         wrong: Vec::new(),
     };
@@ -72,18 +73,19 @@ fn compare(
     comparison
 }
 
-/// Where in the corridor a lens is put.
+/// Region of the corridor for a lens.
 #[derive(Debug, Clone, Copy)]
 enum Spot {
-    /// Before a wall, behind the one before.
+    /// Between a wall and the previous one.
     BetweenWalls,
-    /// In an opening, or just before or behind it.
+    /// In an opening, just before it or just behind it.
     Opening,
-    /// In a wall itself, where a body that has hit it may be: the backs of its faces are not seen.
+    /// Inside a wall, where a body that hit it may be: the backs of its faces are invisible.
     InsideWall,
 }
 
-/// A lens at a spot of the wall with this number. `share`: where in the spot, each from 0 to 1.
+/// Returns a lens position at a spot of wall `number`. `share`: position within the spot, each
+/// from 0 to 1.
 fn lens(course: &Course, number: usize, spot: Spot, share: [f32; 3]) -> [f32; 3] {
     const MARGIN_M: f32 = 0.05;
     let between = |least: f32, most: f32, share: f32| least + (most - least) * share;
@@ -115,7 +117,7 @@ fn lens(course: &Course, number: usize, spot: Spot, share: [f32; 3]) -> [f32; 3]
     }
 }
 
-/// Settings whose lens sits at the body's origin, so that the pose decides where it is.
+/// Returns settings with the lens at the body's origin, so that the pose is the lens's pose.
 fn lens_in_the_middle() -> CameraSettings {
     CameraSettings {
         mount_m: [0.0; 3],
@@ -133,7 +135,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
 
     #[test]
-    fn drawn_image_equals_the_traced_one(
+    fn the_drawn_image_equals_the_traced_one(
         seed in any::<u64>(),
         wall in 0usize..5,
         share in prop::array::uniform3(0.0f32..1.0),
@@ -153,8 +155,8 @@ proptest! {
 }
 
 #[test]
-fn episode_poses_agree_too() {
-    // As flown: level or tilted by up to the vehicle's limit, with little yaw.
+fn images_agree_for_poses_of_an_episode() {
+    // As in an episode: tilted by up to the vehicle's limit, with little yaw.
     let course = test_course();
     for step in 0..40 {
         let phase = step as f32;
@@ -191,8 +193,7 @@ fn episode_poses_agree_too() {
 
 #[test]
 fn depth_is_planar_and_in_steps_of_the_range() {
-    // 12 m before the end wall, looking straight at it: the same depth at every pixel that shows
-    // it.
+    // The lens is 8 m before the end wall and faces it: every pixel of it has the same depth.
     let course = test_course();
     let pose = Isometry3::translation(52.0, 0.0, 3.5);
     let settings = CameraSettings {
@@ -204,21 +205,21 @@ fn depth_is_planar_and_in_steps_of_the_range() {
         .unwrap()
         .render(&pose, &mut image);
     let at = |column: usize, row: usize| image[row * IMAGE_WIDTH + column];
-    // 255 * 8 m / 10 m = 204; the end wall is 3 / 8 * 64 = 24 pixels wide to each side.
+    // 255 * 8 m / 10 m = 204; the end wall reaches 3 / 8 * 64 = 24 pixels to each side.
     assert!(
         (41..87).all(|column| at(column, 36) == 204),
         "{:?}",
         &image[36 * IMAGE_WIDTH..37 * IMAGE_WIDTH]
     );
-    // The left border looks along 45 degrees: the side, 3 m away, at a depth of 3 m but for half a
+    // The left border is at 45 degrees, so the side, 3 m away, has a depth of 3 m up to half a
     // pixel.
     assert_eq!(at(0, 36), (25.5f32 * 3.0 * 64.0 / 63.5).round() as u8);
-    // Up is up: the ceiling, 3.5 m above, and the floor, 3.5 m below, mirror each other.
+    // The ceiling, 3.5 m above, and the floor, 3.5 m below, are symmetric.
     assert_eq!(at(64, 0), at(64, 71));
 }
 
 #[test]
-fn roll_turns_the_image_and_pitch_lifts_it() {
+fn roll_turns_the_image_and_nose_down_brings_the_floor_nearer() {
     let course = test_course();
     let mut camera = DepthCamera::new(&lens_in_the_middle(), &course).unwrap();
     let mut render = |turn: UnitQuaternion<f32>| {
@@ -243,16 +244,16 @@ fn roll_turns_the_image_and_pitch_lifts_it() {
         .count();
     assert!(off < 20, "{off} pixels differ");
 
-    // Nose down (about the leftward axis) brings the floor nearer in the image's middle.
+    // Nose down is a turn about the leftward axis.
     let nose_down = render(UnitQuaternion::from_euler_angles(0.0, 0.5, 0.0));
     let middle = 36 * IMAGE_WIDTH + 64;
     assert!(nose_down[middle] < level[middle]);
 }
 
 #[test]
-fn nothing_is_near_in_the_middle_of_an_opening() {
-    // With the lens in the plane of a face, the near plane cuts the face all along its hole. Turned
-    // in many ways, no pixel of the line of that cut may show.
+fn no_pixel_is_near_in_the_middle_of_an_opening() {
+    // With the lens in the plane of a face, the near plane cuts the face all along its hole. In no
+    // attitude may a pixel of that cut line be visible.
     let course = test_course();
     let mut camera = DepthCamera::new(&lens_in_the_middle(), &course).unwrap();
     let mut image = [0; IMAGE_PIXELS];
@@ -275,7 +276,7 @@ fn nothing_is_near_in_the_middle_of_an_opening() {
 }
 
 #[test]
-fn wider_registers_change_no_bit_of_the_image() {
+fn instruction_sets_change_no_bit_of_the_image() {
     let course = test_course();
     let settings = lens_in_the_middle();
     let mut camera = DepthCamera::new(&settings, &course).unwrap();
@@ -286,19 +287,19 @@ fn wider_registers_change_no_bit_of_the_image() {
         let quaternion = std::array::from_fn(|_| rng.random_range(-1.0..1.0));
         let spot = [Spot::BetweenWalls, Spot::Opening][number % 2];
         let view = settings.view(&pose(lens(&course, number % 5, spot, share), quaternion));
-        super::draw(&mut camera, &view, Errors::None, &mut portable);
-        for set in Instructions::ALL
+        super::draw(&mut camera, &view, ImageErrors::None, &mut portable);
+        for set in InstructionSet::ALL
             .into_iter()
             .filter(|set| set.is_available())
         {
-            set.draw()(&mut camera, &view, Errors::None, &mut wider);
+            set.draw()(&mut camera, &view, ImageErrors::None, &mut wider);
             assert!(portable == wider, "{set}, {view:?}");
         }
     }
 }
 
 #[test]
-fn a_pose_that_is_not_a_number_sees_nothing() {
+fn a_nan_pose_gives_an_empty_image() {
     let mut camera = DepthCamera::new(&CameraSettings::default(), &test_course()).unwrap();
     let mut image = [0; IMAGE_PIXELS];
     camera.render(&Isometry3::translation(f32::NAN, 0.0, 3.5), &mut image);
@@ -306,7 +307,7 @@ fn a_pose_that_is_not_a_number_sees_nothing() {
 }
 
 #[test]
-fn settings_without_sense_are_refused_by_key() {
+fn settings_out_of_bounds_are_refused_by_key() {
     let settings = CameraSettings {
         range_m: f32::NAN,
         ..Default::default()
