@@ -1,13 +1,13 @@
-//! The three kinds of layer, each a description of its two tensors.
+//! The three kinds of layer, each described by its two tensors.
 //!
-//! Initial values follow PyTorch's defaults: weights and biases even in ±1/√fan_in (Kaiming uniform
-//! with a = √5, He et al. 2015).
+//! Initial values follow PyTorch's defaults: weights and biases uniform in ±1/√fan_in (Kaiming
+//! uniform with a = √5, He et al. 2015).
 
 use tch::Tensor;
 
 use super::{Layout, Parameters};
 
-/// Places of a layer's two tensors in its network's [`Parameters`].
+/// Indices of a layer's two tensors in its network's [`Parameters`].
 #[derive(Debug, Clone, Copy)]
 struct Affine {
     weight: usize,
@@ -16,8 +16,8 @@ struct Affine {
 
 impl Affine {
     fn describe(layout: &mut Layout, name: &str, weight_shape: &[i64], outputs: i64) -> Self {
-        // PyTorch takes the second dimension for the inputs, also where the weight of a transposed
-        // convolution has its outputs there.
+        // PyTorch takes dimension 1 for the inputs, even where a transposed convolution's weight
+        // has its outputs there.
         let fan_in: i64 = weight_shape[1..].iter().product();
         let bound = 1.0 / (fan_in as f32).sqrt();
         Self {
@@ -37,7 +37,7 @@ impl Linear {
         Self(Affine::describe(layout, name, &[outputs, inputs], outputs))
     }
 
-    /// `[n, inputs]` to `[n, outputs]`.
+    /// Maps `[n, inputs]` to `[n, outputs]`.
     pub fn forward(&self, parameters: &Parameters, input: &Tensor) -> Tensor {
         input.linear(
             parameters.tensor(self.0.weight),
@@ -67,7 +67,7 @@ impl Convolution {
         ))
     }
 
-    /// `[n, inputs, h, w]` to `[n, outputs, (h - height) / 2 + 1, (w - width) / 2 + 1]`.
+    /// Maps `[n, inputs, h, w]` to `[n, outputs, (h - height) / 2 + 1, (w - width) / 2 + 1]`.
     pub fn forward(&self, parameters: &Parameters, input: &Tensor) -> Tensor {
         let (weight, bias) = (
             parameters.tensor(self.0.weight),
@@ -98,7 +98,7 @@ impl TransposedConvolution {
         ))
     }
 
-    /// `[n, inputs, h, w]` to `[n, outputs, 2 (h - 1) + height, 2 (w - 1) + width]`.
+    /// Maps `[n, inputs, h, w]` to `[n, outputs, 2 (h - 1) + height, 2 (w - 1) + width]`.
     pub fn forward(&self, parameters: &Parameters, input: &Tensor) -> Tensor {
         let (weight, bias) = (
             parameters.tensor(self.0.weight),

@@ -1,9 +1,13 @@
-//! One SAC update on the kernels, forward and backward written out, in reading order.
+//! One SAC update on the native kernels, forward and backward written out, in reading order.
 //!
-//! The same update as that of [`super::TorchSac`], which stays beside it as the reference: same
-//! parameters in the same order, same noise, same metrics. Every sum has one order, so the bits
-//! depend neither on the processor nor on how many threads there are. Memory is set aside once for
-//! a batch size and used again.
+//! It computes the same update as [`super::TorchSac`], which stays as the reference: same
+//! parameters in the same order, same noise, same metrics. Every sum has a fixed order, so the bits
+//! depend neither on the processor nor on the number of threads. Buffers are allocated once per
+//! batch size and reused.
+//!
+//! Equation numbers are those of arXiv:1812.05905. Its symbols: s and s' are the states before and
+//! after the replayed action, a' and a are actions drawn from the policy in s' and s, Q is the
+//! critic, Q̄ the target critic, α the temperature, H̄ the target entropy.
 
 mod sample;
 
@@ -25,7 +29,7 @@ use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
 use crate::state::{Part, Stateful};
 
-/// Policy, critic, target critic and temperature, each with its optimizer.
+/// Policy, critic, target critic and temperature, each with its optimizer state.
 #[derive(Debug)]
 pub struct NativeSac {
     isa: Isa,
@@ -35,7 +39,8 @@ pub struct NativeSac {
     policy_parameters: Learned,
     critic: NativeCritic,
     critic_parameters: Learned,
-    /// Of a critic that follows the learned one slowly, and steadies the targets.
+    /// Parameters of the target critic Q̄: a slowly following average of the critic's, which
+    /// steadies the targets.
     target_parameters: Vec<f32>,
     /// log α, `[1]`.
     log_temperature: Learned,
@@ -45,35 +50,38 @@ pub struct NativeSac {
     work: Work,
 }
 
-/// Everything computed on the way, kept from update to update.
+/// Buffers of one update, kept from update to update.
 #[derive(Debug, Default)]
 struct Work {
     rows: usize,
-    /// The policy's, of states after the actions, then of states: `[2 rows, 4]`.
+    /// Policy network outputs, `[2 rows, 4]`: first for the next observations s', then for s.
     outputs: Vec<f32>,
+    /// Actions drawn from those outputs, and their log-probabilities: rows of s' first, then of s.
     sample: Sample,
-    /// The critic's states and actions side by side, `[rows, state + 2]`.
+    /// Critic input, `[rows, critic input + 2]`: states and actions side by side.
     joined: Vec<f32>,
-    /// The target's, `[rows, 2]`.
+    /// Target critic's two estimates of Q̄(s', a'), `[rows, 2]`.
     target_values: Vec<f32>,
-    /// Of the actions replayed, then of those drawn.
+    /// Critic activations: for the replayed actions, then overwritten by those for the drawn
+    /// actions.
     critic: CriticLayers,
-    /// Of the actions replayed.
+    /// Gradient of the critic loss in the critic's activations, for the replayed actions.
     critic_grad: CriticLayers,
-    /// Of the values of the actions drawn, `[rows, 2]`.
+    /// Gradient of the policy loss in the two estimates of Q(s, a), `[rows, 2]`.
     drawn_grad: Vec<f32>,
-    /// `[rows, 2]`.
+    /// Gradient of the policy loss in the drawn actions, through Q, `[rows, 2]`.
     action_gradient: Vec<f32>,
-    /// Of the states alone.
+    /// Policy activations for the current states s, `[rows, width]` per layer.
     policy: Layers,
+    /// Gradient of the policy loss in those activations.
     policy_grad: Layers,
 }
 
 impl NativeSac {
-    /// Untrained networks whose parameters depend on the run's seed alone.
+    /// Returns untrained networks; their parameters depend on the run's seed alone.
     ///
     /// # Panics
-    /// At the first update, when this machine lacks the instructions.
+    /// The first update panics when this machine lacks the instructions of `isa`.
     pub fn new(section: &SacSection, inputs: Inputs, run_seed: u64, isa: Isa) -> Self {
         let width = section.hidden_width as i64;
         let mut policy_layout = Layout::default();
@@ -107,8 +115,7 @@ impl NativeSac {
         }
     }
 
-    /// Actions drawn from the present policy: in the states after the replayed actions, and in the
-    /// states themselves.
+    /// Draws actions from the current policy: a' for the next observations, a for the observations.
     fn draw(&mut self, team: &mut Team, columns: Columns<'_>, noise: &mut Noise) {
         let policy = &self.policy_parameters.values;
         let Work {
@@ -128,9 +135,9 @@ impl NativeSac {
         sample.draw(self.isa, outputs);
     }
 
-    /// The critic's gradient: what the state after the action is worth says the slow critic (eq.
-    /// 3), and both estimates are drawn towards r + γ (1 - terminated) (min Q̄(s', a') - α log π(a'
-    /// | s')) (eq. 5). Returns the loss and the mean of the smaller estimate.
+    /// Computes the critic's gradient. Both estimates are regressed (eq. 5) on the soft Bellman
+    /// target r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')) (eq. 3). Returns the loss
+    /// and the mean of the smaller estimate.
     fn critic_gradient(
         &mut self,
         team: &mut Team,
@@ -176,8 +183,8 @@ impl NativeSac {
         [loss, value].map(|sum| (sum / *rows as f64) as f32)
     }
 
-    /// The policy's gradient: it moves towards actions of higher value, as far as its entropy is
-    /// worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7). Returns the mean of that, and
+    /// Computes the policy's gradient: minimises α log π(a | s) - min Q(s, a) (eq. 7), so actions
+    /// of higher value become likelier, at a price for lost entropy. Returns the means of that and
     /// of log π.
     fn policy_gradient(
         &mut self,
@@ -215,7 +222,7 @@ impl NativeSac {
         let action = self.inputs.critic..self.inputs.critic + ACTION;
         self.critic
             .backward_through(team, critic, given, drawn_grad, action, action_gradient);
-        // Back through the drawing and the policy.
+        // Back through the drawn actions, then through the policy.
         sample.backward(
             *rows,
             temperature * share,
@@ -230,7 +237,7 @@ impl NativeSac {
         [loss, log_prob_sum].map(|sum| (sum / *rows as f64) as f32)
     }
 
-    /// Places for everything that an update of so many rows computes.
+    /// Allocates the buffers for an update of `rows` transitions.
     fn places(&self, rows: usize) -> Work {
         let numbers = |rows: usize, width: usize| vec![0.0; rows * width];
         Work {
@@ -248,8 +255,8 @@ impl NativeSac {
         }
     }
 
-    /// Looks whether what an update reports and the gradients it took are numbers. Of a gradient,
-    /// the square of its length has to be.
+    /// Checks that the reported values and the gradients are finite; for a gradient, that its
+    /// squared norm is.
     fn check(&self, reported: [f32; 5]) -> Result<(), UpdateError> {
         let [critic_loss, policy_loss, temperature, entropy, mean_value] = reported;
         let norm = |learned: &Learned| squared_norm(self.isa, &learned.gradient);
@@ -266,7 +273,7 @@ impl NativeSac {
         must_be_finite(self.updates() + 1, numbers)
     }
 
-    /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
+    /// Returns the policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
     pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
         let mut outputs = vec![0.0; observations.len() / self.inputs.policy * 2 * ACTION];
         let policy = &self.policy_parameters.values;
@@ -280,9 +287,10 @@ impl NativeSac {
 }
 
 impl Algorithm for NativeSac {
-    /// One step of critic, policy and temperature, and of the target behind them. All three
-    /// gradients are taken at the same parameters before any of them moves: an update is done whole
-    /// or not at all.
+    /// Makes one step of critic, policy and temperature, then moves the target critic.
+    ///
+    /// All three gradients are taken at the same parameters before any of them moves, so an update
+    /// happens whole or not at all.
     ///
     /// Source: arXiv:1812.05905, algorithm 1.
     fn update(
@@ -299,8 +307,8 @@ impl Algorithm for NativeSac {
         self.draw(team, columns, noise);
         let [critic_loss, mean_value] = self.critic_gradient(team, columns, temperature);
         let [policy_loss, log_prob] = self.policy_gradient(team, columns, temperature);
-        // The temperature rises while the policy is more certain than asked for, and falls
-        // otherwise: the gradient of -α (log π + H̄) by log α is itself (eq. 18).
+        // The derivative of -α (log π + H̄) by log α is the expression itself (eq. 18). The
+        // temperature rises while the entropy is below its target, and falls otherwise.
         self.log_temperature.gradient[0] = -temperature * (log_prob + self.target_entropy);
 
         let metrics = [critic_loss, policy_loss, temperature, -log_prob, mean_value];
@@ -348,7 +356,7 @@ impl Stateful for NativeSac {
     }
 }
 
-/// Derivative of the smaller estimate by both: equal ones share it.
+/// Derivative of the smaller estimate by both estimates. Equal ones share it, as in libtorch.
 fn share_of_smaller([one, other]: [f32; ESTIMATES]) -> [f32; ESTIMATES] {
     if one < other {
         [1.0, 0.0]

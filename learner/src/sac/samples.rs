@@ -12,16 +12,16 @@ pub(crate) struct Transitions {
     pub(crate) actions: Vec<f32>,
     pub(crate) rewards: Vec<f32>,
     pub(crate) next_observations: Vec<f32>,
-    /// What the critic is told instead of the observations, and after the actions.
+    /// Critic inputs before and after the actions, where they differ from the observations.
     pub(crate) told: Option<[Vec<f32>; 2]>,
     pub(crate) terminated: Vec<f32>,
-    /// Of the observations and the next ones.
+    /// Images before and after the actions.
     pub(crate) images: Option<[Vec<u8>; 2]>,
 }
 
 impl Transitions {
-    /// Numbers without a meaning, observations of `width`; every third transition is the last of
-    /// its task.
+    /// Random numbers without meaning, observations `width` wide. Every third transition ends its
+    /// task.
     pub(crate) fn random(width: usize, rows: usize, noise: &mut Noise) -> Self {
         let mut draw =
             |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(1.0)).collect() };
@@ -36,7 +36,7 @@ impl Transitions {
         }
     }
 
-    /// The same, and the critic is told `width` numbers of each state.
+    /// Gives the critic inputs of its own, `width` random numbers per state.
     pub(crate) fn telling(mut self, width: usize, noise: &mut Noise) -> Self {
         let mut draw = || {
             (0..self.rewards.len() * width)
@@ -47,8 +47,7 @@ impl Transitions {
         self
     }
 
-    /// A one-step task: the observation's first two numbers are the action that would have been
-    /// right.
+    /// A one-step task: the first two numbers of the observation are the best action.
     pub(crate) fn guessing(width: usize, rows: usize, noise: &mut Noise) -> Self {
         let mut draw =
             |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(0.8)).collect() };
@@ -68,8 +67,8 @@ impl Transitions {
         }
     }
 
-    /// A one-step task that only the image tells: a bright one is worth 1, a dark one -1, whatever
-    /// is done.
+    /// A one-step task whose reward only the image shows: 1 for a bright one, -1 for a dark one,
+    /// whatever the action.
     pub(crate) fn looking(width: usize, rows: usize, noise: &mut Noise) -> Self {
         let mut asked = Self::guessing(width, rows, noise);
         let ways: Vec<f32> = (0..rows)
@@ -108,7 +107,7 @@ impl Transitions {
     }
 }
 
-/// How bright a number in [-1, 1] is drawn.
+/// Brightness that encodes a number in [-1, 1].
 pub(crate) fn shade(number: f32) -> u8 {
     (127.5 + 127.5 * number).round() as u8
 }

@@ -1,4 +1,4 @@
-//! The whole update, on both engines: exactness, determinism, and that it learns.
+//! The whole update on both engines: exactness, determinism, and that it learns.
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::config::{Engine, Observation, SacSection, View};
@@ -14,7 +14,7 @@ use crate::networks::{Layout, Parameters, Policy};
 use crate::noise::Noise;
 use crate::state::{NamedTensor, TensorValues};
 
-/// Numbers in an observation.
+/// Width of an observation.
 const OBSERVATION: usize = 32;
 pub(super) const ENGINES: [Engine; 2] = [Engine::Native, Engine::Libtorch];
 
@@ -69,7 +69,7 @@ fn published(sac: &dyn Algorithm) -> Vec<f32> {
     published
 }
 
-/// What the published policy does without noise, `[n, 2]`.
+/// The published policy's action without noise, `[n, 2]`.
 fn mode(sac: &dyn Algorithm, section: &SacSection, observations: &[f32]) -> Vec<f32> {
     let mut layout = Layout::default();
     let policy = Policy::describe(&mut layout, OBSERVATION as i64, section.hidden_width as i64);
@@ -146,7 +146,7 @@ fn an_update_that_is_not_finite_changes_nothing() {
             refused(|batch| batch.observations[7] = f32::NAN),
             of("critic loss")
         );
-        // Squared, they are still numbers; the square of a gradient's length no longer is.
+        // Their squares are still finite; the gradient's squared norm is not.
         let UpdateError::NonFinite { tensor, .. } = refused(|batch| batch.rewards.fill(1.5e19));
         assert!(tensor.starts_with("critic"), "{engine}: {tensor}");
     }
@@ -155,8 +155,8 @@ fn an_update_that_is_not_finite_changes_nothing() {
 #[test]
 fn truncated_episode_still_bootstraps() {
     for engine in ENGINES {
-        // What the critic learns of one transition, the last of its episode, when the state after
-        // it is another.
+        // Metrics after learning from one transition, the last of its episode, for a given next
+        // state.
         let learned = |terminated: f32, next: f32| {
             let mut sac = sac(engine, &small(), 1);
             let mut last = Transitions::guessing(OBSERVATION, 1, &mut Noise::new(1));

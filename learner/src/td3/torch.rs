@@ -1,5 +1,6 @@
-//! One TD3 update with libtorch's automatic gradients, in reading order: the reference, the way to
-//! a CUDA device, and to policies that learn from images.
+//! One TD3 update with libtorch's automatic gradients, in reading order.
+//!
+//! Equation numbers are those of arXiv:1802.09477.
 
 use skein_kernels::Team;
 use skein_protocol::ACTION;
@@ -18,7 +19,7 @@ use crate::perception::{LooksAhead, Perception};
 use crate::sac::losses::critic_loss;
 use crate::state::{Part, Stateful};
 
-/// Policy and critic, the targets that follow them slowly, and their optimizers.
+/// Policy and critic, their target networks, and their optimizers.
 #[derive(Debug)]
 pub struct TorchTd3 {
     inputs: Inputs,
@@ -28,7 +29,7 @@ pub struct TorchTd3 {
     pub(super) policy_parameters: Parameters,
     policy_optimizer: Adam,
     pub(super) target_policy: Parameters,
-    /// Where the encoder is trained end to end: its parameters lie before the critic's.
+    /// Encoder trained end to end, if there is one: its parameters lie before the critic's.
     perception: Option<Perception>,
     critic: Critic,
     pub(super) critic_parameters: Parameters,
@@ -37,7 +38,7 @@ pub struct TorchTd3 {
 }
 
 impl TorchTd3 {
-    /// Untrained networks whose parameters depend on the run's seed alone.
+    /// Returns untrained networks; their parameters depend on the run's seed alone.
     pub fn new(section: &Td3Section, inputs: Inputs, run_seed: u64, device: Device) -> Self {
         let width = section.hidden_width as i64;
         let mut layout = Layout::default();
@@ -78,8 +79,8 @@ impl TorchTd3 {
         }
     }
 
-    /// r + γ (1 - terminated) min Q̄(s', a'), where a' is what the target policy would do, give or
-    /// take some noise (eq. 14 and 15), `[n]`.
+    /// Bellman targets, `[n]`: r + γ (1 - terminated) min Q̄(s', a'), where a' is the target
+    /// policy's action plus clipped noise (eq. 14 and 15).
     fn targets(&self, batch: &Batch, noise: &mut Noise) -> Tensor {
         let Td3Section {
             discount,
@@ -101,7 +102,7 @@ impl TorchTd3 {
         &batch.rewards + continues * values * discount
     }
 
-    /// -Q₁ of what the policy would do (eq. 1), a scalar.
+    /// Policy loss, a scalar: the mean of -Q₁ of the policy's actions (eq. 1).
     fn policy_loss(&self, batch: &Batch) -> Tensor {
         let actions = self
             .policy

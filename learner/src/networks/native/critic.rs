@@ -1,5 +1,5 @@
-//! A critic's two estimates of Q on the kernels, from one network with two outputs or from two
-//! networks with one.
+//! The critic's two estimates of Q on the native kernels, from one network with two outputs or from
+//! two networks with one output each.
 
 use std::ops::Range;
 
@@ -9,25 +9,25 @@ use super::dense::{Dense, Layers, output, output_mut};
 use super::rows::ESTIMATES;
 use crate::networks::Layout;
 
-/// The networks, which are alike; their parameters lie one behind the other.
+/// One or two networks of equal shape; their parameters lie one after the other.
 #[derive(Debug)]
 pub struct NativeCritic {
     network: Dense,
     networks: usize,
-    /// Parameters of one.
+    /// Number of parameters of one network.
     len: usize,
 }
 
-/// What the networks gave for some rows, or what flows back.
+/// Activations of the critic's networks for some rows, or gradients in them.
 #[derive(Debug, Default)]
 pub struct CriticLayers {
     networks: Vec<Layers>,
-    /// Both estimates, `[rows, 2]`.
+    /// Both estimates, `[rows, 2]`, or the gradient in them.
     pub values: Vec<f32>,
 }
 
 impl NativeCritic {
-    /// The critic that `layout` describes, of one network or of two.
+    /// Returns the critic that `layout` describes, made of `networks` networks.
     pub fn new(isa: Isa, layout: &Layout, networks: usize) -> Self {
         let tensors = &layout.tensors()[..layout.tensors().len() / networks];
         Self {
@@ -37,7 +37,7 @@ impl NativeCritic {
         }
     }
 
-    /// Places for what is computed of so many rows.
+    /// Allocates buffers for the activations of `rows` rows.
     pub fn places(&self, rows: usize) -> CriticLayers {
         CriticLayers {
             networks: (0..self.networks)
@@ -47,7 +47,8 @@ impl NativeCritic {
         }
     }
 
-    /// Both estimates for `joined`, `[rows, observation + 2]`, and what the layers gave on the way.
+    /// Computes both estimates for `joined`, `[rows, critic input + 2]`; keeps all activations in
+    /// `given`.
     pub fn forward(
         &self,
         team: &mut Team,
@@ -62,7 +63,7 @@ impl NativeCritic {
         }
     }
 
-    /// Both estimates alone, `[rows, 2]`.
+    /// Computes only both estimates, `[rows, 2]`.
     pub fn forward_through(
         &self,
         team: &mut Team,
@@ -79,7 +80,7 @@ impl NativeCritic {
         }
     }
 
-    /// The gradient of all parameters, from what flows back to the estimates, `grad.values`.
+    /// Computes the gradient in all parameters, from the gradient in the estimates, `grad.values`.
     pub fn gradient(
         &self,
         team: &mut Team,
@@ -98,8 +99,8 @@ impl NativeCritic {
         }
     }
 
-    /// What flows back to some columns of the input, `[rows, columns]`, from what flows to the
-    /// estimates, `[rows, 2]`.
+    /// Computes the gradient in some columns of the input, `[rows, columns]`, from the gradient in
+    /// the estimates, `[rows, 2]`.
     pub fn backward_through(
         &self,
         team: &mut Team,
@@ -122,13 +123,14 @@ impl NativeCritic {
         }
     }
 
-    /// The parameters of one network.
+    /// Slice of the parameters that belongs to network `number`.
     fn of<'a>(&self, number: usize, parameters: &'a [f32]) -> &'a [f32] {
         &parameters[number * self.len..][..self.len]
     }
 }
 
-/// Writes what network `number` gave, `[rows, estimates of it]`, to its place among the estimates.
+/// Copies the output of network `number`, `[rows, outputs]`, to its columns of `values`, `[rows,
+/// 2]`.
 fn scatter(own: &[f32], number: usize, values: &mut [f32]) {
     let each = ESTIMATES * own.len() / values.len();
     for (own, values) in own
@@ -139,7 +141,7 @@ fn scatter(own: &[f32], number: usize, values: &mut [f32]) {
     }
 }
 
-/// Reads what network `number` gave from among the estimates: the other way round.
+/// Copies the columns of network `number` out of `values`; the inverse of [`scatter`].
 fn gather(values: &[f32], number: usize, own: &mut [f32]) {
     let each = ESTIMATES * own.len() / values.len();
     for (own, values) in own
