@@ -1,5 +1,5 @@
-//! What is written of the final evaluation: the report, where the episodes flew, and what the VAE
-//! makes of what they saw.
+//! Output files of the final evaluation: the report, the trajectories, and images with their
+//! reconstructions.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -16,23 +16,23 @@ use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, durable};
 use crate::episode::CommittedEpisode;
 use crate::trainer::Trainer;
 
-/// Episodes a course of which the path is written.
+/// Episodes per course whose trajectory is written.
 const PATHS: usize = 25;
-/// Images that are shown beside their reconstructions.
+/// Number of images shown beside their reconstructions.
 const PICTURES: usize = 8;
 
-/// Why an evaluation cannot be written.
+/// Reason why an evaluation cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write {}: {source}", path.display())]
 pub struct EvaluationError {
-    /// The file.
+    /// Path of the file.
     pub path: PathBuf,
-    /// Why.
+    /// Cause.
     #[source]
     pub source: io::Error,
 }
 
-/// Puts `content` in the place of the file at `path`, at once or not at all.
+/// Replaces the file at `path` by `content`, completely or not at all.
 fn replace<E>(path: &Path, content: Result<Vec<u8>, E>) -> Result<(), EvaluationError>
 where
     E: Into<Box<dyn std::error::Error + Send + Sync>>,
@@ -137,7 +137,7 @@ fn write_path(
     Ok(())
 }
 
-/// Writes depth images of an episode beside their reconstructions, `reconstructions.safetensors`;
+/// Writes some depth images beside their reconstructions, `reconstructions.safetensors`. Writes
 /// nothing where there is no VAE.
 ///
 /// # Errors
