@@ -30,7 +30,7 @@ pub struct Reporter {
 
 /// Shows `line` to the user. The program that reads the progress lines shows every line that is not
 /// JSON as it is.
-pub fn tell(line: &str) {
+pub fn notify_user(line: &str) {
     tracing::warn!("{line}");
     // Standard output may be closed; the line is in the log.
     let _ = writeln!(std::io::stdout().lock(), "{line}");

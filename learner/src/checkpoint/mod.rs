@@ -72,7 +72,7 @@ pub struct Progress {
     /// Policy updates done.
     pub policy_updates: u64,
     /// Epochs whose episodes were ordered and not learned from, in order.
-    pub in_the_air: Vec<EpochOrder>,
+    pub in_flight: Vec<EpochOrder>,
     /// Evaluations flown to confirm a candidate for the best snapshot; numbers their episodes.
     pub evaluations: u64,
     /// Evaluation episodes flown.
@@ -100,7 +100,7 @@ impl Progress {
             environment_steps: 0,
             vae_steps: 0,
             policy_updates: 0,
-            in_the_air: Vec::new(),
+            in_flight: Vec::new(),
             evaluations: 0,
             evaluation_episodes: 0,
             latest_candidate: None,

@@ -49,7 +49,7 @@ fn state(episodes: u64) -> CheckpointState {
             environment_steps: 12,
             vae_steps: 3,
             policy_updates: u64::MAX,
-            in_the_air: vec![EpochOrder {
+            in_flight: vec![EpochOrder {
                 epoch: 7,
                 policy_version: 6,
                 exploration: Exploration::Sample,

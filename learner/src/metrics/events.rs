@@ -16,7 +16,7 @@ use prost::Message;
 use serde::{Deserialize, Serialize};
 
 use crate::disk::{Disk, Patient};
-use crate::report::tell;
+use crate::report::notify_user;
 
 /// How the names of our files begin, before the second of their start. TensorBoard takes files
 /// whose name has `tfevents` in it.
@@ -222,7 +222,7 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, Even
         let found = fs::metadata(&path).map_or(0, |metadata| metadata.len());
         if found < *bytes {
             let path = path.display();
-            tell(&format!(
+            notify_user(&format!(
                 "{path} ends after {found} of {bytes} bytes: TensorBoard's curves have a hole"
             ));
         } else if found > *bytes {

@@ -253,7 +253,7 @@ impl Replay {
     ///
     /// # Errors
     /// The first that `encode` returns; the buffer is as before.
-    pub fn renew_latents<E>(
+    pub fn recode_latents<E>(
         &mut self,
         chunk: usize,
         encode: impl FnMut(&[u8]) -> Result<Vec<LatentCode>, E>,

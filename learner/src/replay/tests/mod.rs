@@ -115,8 +115,8 @@ fn an_episode_stored_in_segments_is_the_episode_stored_whole() {
             whole.insert(flown).unwrap();
         }
         assert_eq!(segments.state(), whole.state());
-        segments.renew_latents(4, encode).unwrap();
-        whole.renew_latents(4, encode).unwrap();
+        segments.recode_latents(4, encode).unwrap();
+        whole.recode_latents(4, encode).unwrap();
         assert_eq!(segments.state(), whole.state());
     }
 }
@@ -381,7 +381,7 @@ fn the_encoder_sees_pieces_of_one_size_whatever_the_episodes_lengths() {
     }
     let mut pieces = Vec::new();
     replay
-        .renew_latents(5, |images| {
+        .recode_latents(5, |images| {
             pieces.push(images.len() / IMAGE_PIXELS);
             encode(images)
         })
@@ -397,7 +397,7 @@ fn a_failed_encoder_leaves_everything_as_it_was() {
         .unwrap();
     let before = replay.state();
     let mut calls = 0;
-    let result = replay.renew_latents(4, |images| {
+    let result = replay.recode_latents(4, |images| {
         calls += 1;
         if calls == 2 {
             Err("out of memory")

@@ -179,7 +179,7 @@ proptest! {
         let (mut replay, mut model) = (Replay::new(&config), Model::new(&config));
         for (number, episode) in episodes.iter().enumerate() {
             if number == freeze_after {
-                replay.renew_latents(chunk, encode).unwrap();
+                replay.recode_latents(chunk, encode).unwrap();
                 replay.freeze();
                 model.set_latents(|vector| final_code(vector[0] as u8));
             }

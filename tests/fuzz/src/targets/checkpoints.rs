@@ -86,7 +86,7 @@ fn state() -> CheckpointState {
             episodes: EPISODES,
             epochs: 2,
             version: 2,
-            in_the_air: vec![EpochOrder {
+            in_flight: vec![EpochOrder {
                 epoch: 2,
                 policy_version: 1,
                 exploration: Exploration::Sample,
