@@ -1,9 +1,10 @@
-//! The engine of our own: forward, backward and Adam over [`skein_kernels`].
+//! The native engine: forward, backward and Adam on [`skein_kernels`].
 //!
-//! Images lie channels-last from the first byte to the last gradient, so that what a kernel sees
-//! are runs of memory, read where they lie. The gradients are written out by hand, layer by layer;
-//! what autograd computes is what they are tested against. All results are the same bits for any
-//! number of threads and on every processor.
+//! One step computes the loss of arXiv:1312.6114 with a squared reconstruction error, and its
+//! gradient, in the order of `step.rs`. Images are stored channels-last throughout, so that kernels
+//! read contiguous runs of memory in place. Gradients are written out by hand, layer by layer, and
+//! tested against autograd. All results are the same bits for any number of threads and on every
+//! processor.
 
 mod batch;
 mod buffer;
@@ -38,24 +39,25 @@ use crate::state::{Part, Stateful};
 
 pub use stopwatch::{LAYERS, Pass, Spent};
 
-/// Images reconstructed at once: bounds memory, and the weights are read once for all of them.
+/// Images reconstructed at once: bounds memory, and reads the weights once for all of them.
 const CHUNK: usize = 32;
 
-/// Encoder, decoder and Adam's state, in the order of [`Order`].
+/// Encoder, decoder and Adam's state, arranged by [`ParameterOrder`].
 #[derive(Debug)]
 pub struct NativeVae {
     isa: Isa,
     team: Team,
     members: Vec<Member>,
     order: Order,
-    /// Length of the part of PyTorch's order that actors need.
+    /// Length of the prefix of PyTorch's order that actors need.
     published_len: usize,
     network: Network,
-    /// Whether `network` has packed these parameters.
+    /// `true` if `network` has packed the present parameters.
     packed: bool,
     parameters: Buffer,
     moments: [Buffer; 2],
-    /// All but that of the weights of the decoder's first convolution, which exists in blocks only.
+    /// Gradient, except for the weights of the decoder's first convolution, which exists only block
+    /// by block.
     gradient: Buffer,
     batch: Batch,
     noise: Vec<f32>,
@@ -65,7 +67,7 @@ pub struct NativeVae {
 }
 
 impl NativeVae {
-    /// An untrained VAE whose parameters depend on the run's seed alone; the same as
+    /// Returns an untrained VAE; its parameters depend on the run's seed alone and equal
     /// [`super::TorchVae`]'s.
     pub fn new(section: &VaeSection, run_seed: u64, threads: usize) -> Self {
         Self::with_isa(section, run_seed, threads, Isa::best())
@@ -101,11 +103,11 @@ impl NativeVae {
         vae
     }
 
-    /// One step of Adam on a minibatch of depth images, `[n, 72, 128]`.
+    /// Makes one step of Adam on a minibatch of depth images, `[n, 72, 128]`.
     ///
     /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was
-    /// changed then.
+    /// [`UpdateError::NonFinite`] names the value that was not finite and the step's number;
+    /// nothing has changed then.
     pub fn update(&mut self, images: &[u8], noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
         let count = images.len() / IMAGE_PIXELS;
         self.noise.resize(count * self.network.latent(), 0.0);
@@ -121,7 +123,7 @@ impl NativeVae {
         })
     }
 
-    /// Loss and gradient for these images and `self.noise`.
+    /// Computes loss and gradient for these images and `self.noise`.
     fn objective(&mut self, images: &[u8]) -> Objective {
         self.pack();
         let mut step = Step {
@@ -136,8 +138,8 @@ impl NativeVae {
         step.objective(images, &self.noise, &mut self.gradient)
     }
 
-    /// Whether all that a step would use is finite. A gradient counts as not finite when its
-    /// squared norm, or for the decoder's first convolution a bound of it, overflows.
+    /// Checks that everything a step would use is finite. For the gradient, its squared norm must
+    /// not overflow; for the decoder's first convolution, a bound of it.
     fn check(&mut self, objective: &Objective) -> Result<(), UpdateError> {
         let watch = &mut self.members[0].watch;
         watch.start();
@@ -163,7 +165,7 @@ impl NativeVae {
         Ok(())
     }
 
-    /// Adam, and what the next step needs of the weights.
+    /// Applies Adam, and packs the weights for the next step.
     fn step(&mut self) {
         self.steps += 1;
         let (isa, learning_rate, number) = (self.isa, self.learning_rate, self.steps);
@@ -201,7 +203,7 @@ impl NativeVae {
         watch.adam_and_packing();
     }
 
-    /// Packs the weights if they changed otherwise than by a step.
+    /// Packs the weights if they changed other than by a step.
     fn pack(&mut self) {
         if !self.packed {
             self.network.pack(&mut self.team, &self.parameters);
@@ -210,7 +212,8 @@ impl NativeVae {
         }
     }
 
-    /// The code's mean for each image, `[n, latent]`. `images`: `[n, 72, 128]`, any number of them.
+    /// Returns the latent mean of each image, `[n, latent]`. `images`: `[n, 72, 128]`, any number
+    /// of them.
     pub fn encode(&mut self, images: &[u8]) -> Vec<f32> {
         self.pack();
         let (network, parameters) = (&self.network, &*self.parameters);
@@ -233,8 +236,8 @@ impl NativeVae {
         codes
     }
 
-    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1].
-    /// `images`: `[n, 72, 128]`.
+    /// Reconstructs each image from its code's mean: `[n, 72, 128]` u8 to `[n, 72, 128]`, depth in
+    /// [0, 1].
     pub fn reconstruct(&mut self, images: &[u8]) -> Vec<f32> {
         let mut seen = Vec::with_capacity(images.len());
         for images in images.chunks(CHUNK * IMAGE_PIXELS) {
@@ -287,16 +290,20 @@ impl NativeVae {
     /// # Panics
     /// When `into` is not [`NativeVae::published_len`] long.
     pub fn publish(&self, into: &mut [f32]) {
-        assert_eq!(into.len(), self.published_len, "one place for each number");
+        assert_eq!(
+            into.len(),
+            self.published_len,
+            "as many places as parameters"
+        );
         self.order.to_pytorch(&self.parameters, into);
     }
 
-    /// VAE steps done so far.
+    /// Number of VAE steps done so far.
     pub fn updates(&self) -> u64 {
         self.steps
     }
 
-    /// Where the time went since this was last asked.
+    /// Returns the time per layer and pass since the last call.
     pub fn take_spent(&mut self) -> Spent {
         let mut spent = Spent::default();
         for member in &mut self.members {
@@ -305,8 +312,8 @@ impl NativeVae {
         spent
     }
 
-    /// Floating-point operations of the passes of each layer for an image, in the order of
-    /// [`LAYERS`] and [`Pass::ALL`]. Pixels have no gradient.
+    /// Floating-point operations per image of each layer's passes, in the order of [`LAYERS`] and
+    /// [`Pass::ALL`]. The first layer has no backward pass: pixels need no gradient.
     pub fn operations(&self) -> [[f64; 3]; 10] {
         let mut operations = self.network.operations().map(|pass| [pass; 3]);
         operations[0][Pass::Backward as usize] = 0.0;
@@ -316,15 +323,15 @@ impl NativeVae {
 
 #[cfg(test)]
 impl NativeVae {
-    /// Makes a tensor's first number something else.
+    /// Sets the first number of a tensor to `value`.
     pub(super) fn spoil(&mut self, tensor: &str, value: f32) {
         let place = self.order.tensor(tensor).start;
         self.parameters[place] = value;
         self.packed = false;
     }
 
-    /// Loss, squared error and divergence, and the whole gradient in PyTorch's order. `noise`:
-    /// standard normal, `[n, latent]`.
+    /// Returns [loss, squared error, divergence], and the whole gradient in PyTorch's order.
+    /// `noise`: standard normal, `[n, latent]`.
     pub(super) fn loss_and_gradient(
         &mut self,
         images: &[u8],
@@ -358,10 +365,10 @@ impl NativeVae {
 
 impl Stateful for NativeVae {
     fn parts(&mut self) -> Vec<(String, Part<'_>)> {
-        // Whoever asks may change them.
+        // The caller may change the parameters.
         self.packed = false;
         let [first, second] = &mut self.moments;
-        // Names of its own: another engine's numbers lie in another order.
+        // Names differ from the other engine's, because the numbers are in another order.
         let parts = [
             ("parameters", Part::Numbers(&mut self.parameters)),
             ("adam.first_moment", Part::Numbers(first)),

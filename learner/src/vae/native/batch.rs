@@ -1,41 +1,46 @@
-//! What is remembered of a minibatch between its passes.
+//! Buffers of a minibatch, kept between its passes.
 
 use super::buffer::Buffer;
 use super::network::Network;
 use super::order::Affine;
 use super::unfold;
 
-/// Activations, and the loss's gradients with respect to them, image by image, channels last. Kept
-/// from step to step.
+/// Activations, and the gradients of the loss in them, image by image, channels last. Reused from
+/// step to step. All shapes are per batch of n images.
 #[derive(Debug, Default)]
 pub(super) struct Batch {
-    /// Pixels and the encoder's images, after ReLU.
+    /// Pixels, then the outputs of the encoder's four convolutions after ReLU, `[n, pixels,
+    /// channels]` each.
     pub(super) seen: [Buffer; 5],
-    /// Mean and log-variance, `[n, 2 latent]`.
+    /// Mean and log-variance of the latent code, `[n, 2 latent]`.
     pub(super) heads: Buffer,
-    /// `[n, latent]`.
+    /// Sampled latent codes, `[n, latent]`.
     pub(super) codes: Buffer,
-    /// The decoder's first image, `[n, 3, 1024]`, after ReLU.
+    /// The decoder's first feature map, `[n, 3, 1024]`, after ReLU.
     pub(super) unfolded: Buffer,
-    /// The decoder's other images, after ReLU; of the last one, the gradient before its sigmoid.
+    /// Outputs of the decoder's four transposed convolutions, `[n, pixels, channels]` each, after
+    /// ReLU. The last one holds the gradient before its sigmoid after the backward pass.
     pub(super) drawn: [Buffer; 4],
-    /// Gradients before the ReLU of the encoder's images, as `seen`; of pixels none is needed.
+    /// Gradients before ReLU of the encoder's outputs, shaped like them; pixels need none.
     pub(super) seen_flow: [Buffer; 4],
+    /// Gradient in `heads`, `[n, 2 latent]`.
     pub(super) heads_flow: Buffer,
+    /// Gradient in `codes`, `[n, latent]`.
     pub(super) codes_flow: Buffer,
+    /// Gradient before ReLU of `unfolded`, `[n, 3, 1024]`.
     pub(super) unfolded_flow: Buffer,
-    /// Gradients before the ReLU of the decoder's images but the last.
+    /// Gradients before ReLU of the decoder's outputs, except the last one's.
     pub(super) drawn_flow: [Buffer; 3],
-    /// Of each image, what flows back to each bias of the encoder's layers,
+    /// Gradient in each bias of the encoder's convolutions, image by image, `[n, biases]`.
     pub(super) seen_sums: Buffer,
-    /// and of the decoder's.
+    /// Gradient in each bias of the decoder's convolutions, image by image, `[n, biases]`.
     pub(super) drawn_sums: Buffer,
-    /// Of each image, the squared error.
+    /// Squared error of each image, `[n]`.
     pub(super) errors: Vec<f64>,
 }
 
 impl Batch {
-    /// Makes room for so many images.
+    /// Makes room for `images` images.
     pub(super) fn resize(&mut self, network: &Network, images: usize) {
         let latent = network.latent();
         let (seen, drawn) = (network.seen_lens(), network.drawn_lens());
@@ -64,7 +69,7 @@ impl Batch {
     }
 }
 
-/// Numbers of an image's sums for these layers' biases, in whole cache lines.
+/// Length of an image's bias sums for these layers, in whole cache lines.
 fn sums_len(places: [&Affine; 4]) -> usize {
     places
         .iter()

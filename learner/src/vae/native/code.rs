@@ -1,5 +1,5 @@
-//! The code between encoder and decoder: how it is drawn, what it costs, and what flows back
-//! through it.
+//! The latent code between encoder and decoder: sampling, divergence, and the gradient through
+//! both.
 
 use skein_kernels::{Isa, exp};
 use skein_protocol::LONGEST_LATENT;
@@ -8,9 +8,9 @@ use crate::networks::LOG_VARIANCE_BOUND;
 
 const BOUND: f32 = LOG_VARIANCE_BOUND as f32;
 
-/// Draws codes as mean + std · noise (arXiv:1312.6114, section 2.4): `[n, latent]` from heads, `[n,
-/// 2 latent]`, mean and log-variance, unbounded, side by side, and standard normal `[n, latent]`.
-/// Returns the sum of the divergences from the standard normal, in nats (appendix B).
+/// Samples codes as mean + std · noise (arXiv:1312.6114, section 2.4), `[n, latent]`. `heads`:
+/// means and unbounded log-variances side by side, `[n, 2 latent]`; `noise`: standard normal, `[n,
+/// latent]`. Returns the sum of the divergences from the standard normal, in nats (appendix B).
 pub(super) fn draw(
     isa: Isa,
     latent: usize,
@@ -41,8 +41,8 @@ pub(super) fn draw(
     0.5 * total
 }
 
-/// The gradient with respect to the heads, `[n, 2 latent]`, from that with respect to the codes,
-/// `[n, latent]`, and from the divergence, which counts `divergence_weight`.
+/// Computes the gradient in the heads, `[n, 2 latent]`, from the gradient in the codes, `[n,
+/// latent]`, and from the divergence, weighted by `divergence_weight`.
 pub(super) fn flow_back(
     isa: Isa,
     latent: usize,
@@ -70,7 +70,7 @@ pub(super) fn flow_back(
                     mean_flow[place] = divergence_weight.mul_add(mean, grad[place]);
                     let drawn = 0.5 * grad[place] * noise[place] * exp(0.5 * log_variance);
                     let flow = (0.5 * divergence_weight).mul_add(exp(log_variance) - 1.0, drawn);
-                    // Outside of the bounds nothing changes with it.
+                    // The log-variance has no effect outside its bounds.
                     log_variance_flow[place] = if (-BOUND..=BOUND).contains(&unbounded) {
                         flow
                     } else {
@@ -102,10 +102,10 @@ mod tests {
     }
 
     #[test]
-    fn what_flows_back_is_the_slope_of_what_is_drawn() {
+    fn the_gradient_is_the_slope_of_the_sampled_loss() {
         let mut heads: [f32; 2 * LATENT] =
             std::array::from_fn(|place| (place as f32 * 0.7).sin() * 2.0);
-        // Two that are out of bounds.
+        // Two log-variances out of bounds.
         (heads[LATENT + 3], heads[LATENT + 4]) = (11.0, -12.0);
         let noise: [f32; LATENT] = std::array::from_fn(|place| (place as f32 * 1.3).cos());
         let grad: [f32; LATENT] = std::array::from_fn(|place| (place as f32 * 0.4).cos());

@@ -1,4 +1,4 @@
-//! Encoder and decoder, an image at a time.
+//! Encoder and decoder, applied to one image at a time.
 
 use skein_kernels::{Finish, Isa, Matrix, Panels, Rows, Start, Team, Windows, product};
 use skein_protocol::snapshot::{ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL};
@@ -10,33 +10,34 @@ use super::order::{Affine, Order};
 use super::stopwatch::{Pass, Stopwatch};
 use super::unfold::{self, Unfold};
 
-/// Channels of the decoder's images: of the one it begins with, `[1, 3]` pixels, to depth.
+/// Channels of the decoder's feature maps, from the first one with `[1, 3]` pixels to the depth
+/// image.
 const DECODER_CHANNELS: [usize; 5] = [1024, 128, 64, 32, 1];
 const DECODER_KERNELS: [[usize; 2]; 4] = [[5, 7], [6, 8], [7, 8], [8, 6]];
 
-/// Places of the layers in [`super::stopwatch::LAYERS`].
+/// Indices of the layers in [`super::stopwatch::LAYERS`].
 pub(super) const HEADS: usize = 4;
 pub(super) const LINEAR: usize = 5;
 pub(super) const UNFOLD: usize = 6;
 pub(super) const DECODER: usize = 7;
 
-/// All layers.
+/// All layers of the VAE.
 #[derive(Debug)]
 pub(super) struct Network {
     isa: Isa,
     pub(super) encoder: [Layer; 4],
-    /// Mean, then log-variance.
+    /// Both heads as one layer: mean, then log-variance.
     pub(super) heads: Linear,
-    /// The mean's weights once more, for encoding alone: `[3072, latent]`.
+    /// Weights of the mean head alone, `[3072, latent]`, for encoding.
     mean: Panels,
     pub(super) linear: Linear,
     pub(super) unfold: Unfold,
-    /// The transposed convolutions behind the first one.
+    /// Transposed convolutions after the first one.
     pub(super) decoder: [Layer; 3],
 }
 
 impl Network {
-    /// With codes of `latent` numbers.
+    /// Describes the network for codes of `latent` numbers.
     pub(super) fn new(isa: Isa, latent: usize, order: &Order) -> Self {
         let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
         let encoder = std::array::from_fn(|index| {
@@ -47,7 +48,7 @@ impl Network {
         });
         assert!(
             (2 * latent).is_multiple_of(LANES),
-            "what flows back to the heads' biases is added up in whole lanes"
+            "bias gradients of the heads are summed in whole lanes"
         );
         let mut heads = order.layer("encoder.mean");
         let log_variance = order.layer("encoder.log_variance");
@@ -68,7 +69,7 @@ impl Network {
         assert_eq!(
             size,
             [IMAGE_HEIGHT, IMAGE_WIDTH],
-            "the decoder gives what the encoder takes"
+            "the decoder's output has the size of the encoder's input"
         );
         Self {
             isa,
@@ -86,7 +87,7 @@ impl Network {
         }
     }
 
-    /// Takes over all weights but those of the decoder's first convolution.
+    /// Packs all weights except those of the decoder's first convolution.
     pub(super) fn pack(&mut self, team: &mut Team, parameters: &[f32]) {
         let mean = &parameters[self.heads.place.weight.clone()][..self.latent() * ENCODER_FEATURES];
         self.mean
@@ -100,8 +101,8 @@ impl Network {
         });
     }
 
-    /// Depth, `[72, 128]`, to pixels in [0, 1] and the encoder's four images, the last of which are
-    /// the features.
+    /// Runs the encoder's convolutions: depth, `[72, 128]`, to pixels in [0, 1] and four feature
+    /// maps, the last of which are the features.
     pub(super) fn see(
         &self,
         parameters: &[f32],
@@ -121,20 +122,20 @@ impl Network {
         }
     }
 
-    /// The code's mean from the features, into `code`, `[latent]`.
+    /// Computes the latent mean from the features, into `code`, `[latent]`.
     pub(super) fn mean(&self, parameters: &[f32], features: &[f32], code: &mut [f32]) {
         let bias = &parameters[self.heads.place.bias.clone()][..self.latent()];
         let (rows, start) = (Rows::Matrix(features), Start::Bias(bias));
         product(rows, &self.mean, start, Finish::Plain, code);
     }
 
-    /// Numbers of a code.
+    /// Length of a latent code.
     pub(super) fn latent(&self) -> usize {
         self.linear.inputs
     }
 
-    /// Image number `index` of a batch whose codes have gone through [`Unfold::multiply`]: the
-    /// decoder's four images, the last one before its sigmoid.
+    /// Runs the decoder's convolutions for image `index` of a batch whose codes have gone through
+    /// [`Unfold::multiply`]. Fills four feature maps, the last one before its sigmoid.
     pub(super) fn draw(
         &self,
         parameters: &[f32],
@@ -161,30 +162,31 @@ impl Network {
         }
     }
 
-    /// Numbers in pixels and in each of the encoder's images.
+    /// Lengths of the pixels and of each of the encoder's feature maps.
     pub(super) fn seen_lens(&self) -> [usize; 5] {
         let [a, b, c, d] = [0, 1, 2, 3].map(|layer| self.encoder[layer].rows_len());
         [IMAGE_PIXELS, a, b, c, d]
     }
 
-    /// Numbers in each of the decoder's images.
+    /// Lengths of the decoder's feature maps.
     pub(super) fn drawn_lens(&self) -> [usize; 4] {
         let [a, b, c] = [0, 1, 2].map(|layer| self.decoder[layer].windows.image_len());
         [unfold::IMAGE_LEN, a, b, c]
     }
 
-    /// Layers with biases of which each image has its sums, in order: the encoder's convolutions,
-    /// and the decoder's.
+    /// Parameter ranges of the encoder's convolutions, in order. Each image has its own sums for
+    /// their biases.
     pub(super) fn encoder_places(&self) -> [&Affine; 4] {
         [0, 1, 2, 3].map(|layer| &self.encoder[layer].place)
     }
 
+    /// Parameter ranges of the decoder's convolutions, in order.
     pub(super) fn decoder_places(&self) -> [&Affine; 4] {
         let [a, b, c] = [0, 1, 2].map(|layer| &self.decoder[layer].place);
         [&self.unfold.place, a, b, c]
     }
 
-    /// Floating-point operations of a pass of each layer for an image, in the order of
+    /// Floating-point operations per image of one pass of each layer, in the order of
     /// [`super::stopwatch::LAYERS`].
     pub(super) fn operations(&self) -> [f64; 10] {
         let encoder = [0, 1, 2, 3].map(|layer| self.encoder[layer].operations());

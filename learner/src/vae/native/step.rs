@@ -1,9 +1,9 @@
 //! Loss and gradient of a minibatch, pass by pass.
 //!
-//! Whatever concerns one image alone is done image by image, so that what one layer leaves is in
-//! the caches when the next one comes, and images are shared among the members of the team. What
-//! concerns the whole batch (the linear layers, the decoder's first convolution, the gradients of
-//! weights) is shared by rows or columns. No sum is ever split between members.
+//! Work that concerns a single image is done image by image, so that one layer's output is still
+//! cached when the next layer reads it. The members of the team share the images. Work on the whole
+//! batch (linear layers, the decoder's first convolution, weight gradients) is shared by rows or
+//! columns. No sum is ever split between members.
 
 use skein_kernels::{Finish, Isa, Start, Team};
 use skein_protocol::IMAGE_PIXELS;
@@ -26,7 +26,7 @@ pub(super) struct Objective {
     pub(super) divergence: f32,
 }
 
-/// What the passes work with.
+/// Everything that the passes of one step read and write.
 pub(super) struct Step<'a> {
     pub(super) isa: Isa,
     pub(super) team: &'a mut Team,
@@ -38,9 +38,9 @@ pub(super) struct Step<'a> {
 }
 
 impl Step<'_> {
-    /// The loss of depth images, `[n, 72, 128]`, and its gradient but for the weights of the
-    /// decoder's first convolution, for which what flows back is left in [`super::unfold::Unfold`].
-    /// `noise`: standard normal, `[n, latent]`.
+    /// Computes the loss of depth images, `[n, 72, 128]`, and its gradient. For the weights of the
+    /// decoder's first convolution, only the gradient in its output is left in
+    /// [`super::unfold::Unfold`]. `noise`: standard normal, `[n, latent]`.
     pub(super) fn objective(
         &mut self,
         depth: &[u8],
@@ -65,7 +65,7 @@ impl Step<'_> {
         }
     }
 
-    /// Encoder.
+    /// Forward: the encoder's convolutions.
     fn see(&mut self, depth: &[u8]) {
         let count = depth.len() / IMAGE_PIXELS;
         let (network, parameters) = (&*self.network, self.parameters);
@@ -85,8 +85,8 @@ impl Step<'_> {
         );
     }
 
-    /// Heads, codes, the decoder's linear layer, and what it makes of the first image. Returns the
-    /// sum of divergences.
+    /// Forward: heads, sampled codes, and the decoder's linear layer and first convolution. Returns
+    /// the sum of the divergences.
     fn draw_codes(&mut self, noise: &[f32]) -> f64 {
         let (network, parameters, batch) = (&mut *self.network, self.parameters, &mut *self.batch);
         let watch = &mut self.members[0].watch;
@@ -120,7 +120,8 @@ impl Step<'_> {
         divergence
     }
 
-    /// The rest of the decoder, the squared error, and the way back to its first image.
+    /// Forward through the rest of the decoder, squared error, and backward to its first feature
+    /// map.
     fn draw_and_flow_back(&mut self, count: usize) {
         let (isa, network, parameters) = (self.isa, &*self.network, self.parameters);
         let Batch {
@@ -162,7 +163,7 @@ impl Step<'_> {
         );
     }
 
-    /// Through the decoder's first convolution, back to its input.
+    /// Backward through the decoder's first convolution.
     fn unfold_flow_back(&mut self) {
         let (parameters, batch) = (self.parameters, &mut *self.batch);
         let watch = &mut self.members[0].watch;
@@ -188,7 +189,7 @@ impl Step<'_> {
         );
     }
 
-    /// Through the code, back to the features.
+    /// Backward through linear layer, codes and heads, to the features.
     fn code_flow_back(&mut self, noise: &[f32], divergence_weight: f64) {
         let (network, batch) = (&*self.network, &mut *self.batch);
         let watch = &mut self.members[0].watch;
@@ -218,7 +219,7 @@ impl Step<'_> {
         watch.layer(HEADS, Pass::Backward);
     }
 
-    /// Through the encoder, back to its first image.
+    /// Backward through the encoder, to its first feature map.
     fn see_flow_back(&mut self, count: usize) {
         let (isa, network) = (self.isa, &*self.network);
         let Batch {
@@ -253,7 +254,8 @@ impl Step<'_> {
         );
     }
 
-    /// Of all weights but the decoder's first convolution's, and of all biases.
+    /// Computes the gradients of all biases and of all weights except the decoder's first
+    /// convolution's.
     fn gradients(&mut self, gradient: &mut [f32]) {
         let (isa, network, batch) = (self.isa, &*self.network, &*self.batch);
         let watch = &mut self.members[0].watch;
@@ -290,7 +292,7 @@ impl Step<'_> {
     }
 }
 
-/// What flows back to the biases of four layers from one image, a layer behind the other.
+/// Bias gradients of four layers from one image, one layer after the other.
 struct Sums<'a> {
     parts: [&'a mut [f32]; 4],
 }
@@ -306,13 +308,13 @@ impl<'a> Sums<'a> {
         Self { parts }
     }
 
-    /// `grad`: the gradient with respect to the output of the layer at this place, before its ReLU.
+    /// Adds for `layer`. `grad`: the gradient in the layer's output, before its ReLU.
     fn add(&mut self, isa: Isa, layer: usize, grad: &[f32]) {
         column_sums(isa, grad, self.parts[layer]);
     }
 }
 
-/// The biases' gradients, from the sums of each image.
+/// Computes the biases' gradients from the sums of all images.
 fn total(isa: Isa, places: [&Affine; 4], sums: &[f32], gradient: &mut [f32]) {
     let mut total = [0.0; 512];
     let biases: usize = places.iter().map(|place| place.bias.len()).sum();
