@@ -1,4 +1,4 @@
-//! The files of a checkpoint: from state to bytes and back.
+//! Conversion of a checkpoint's state to files and back.
 
 use std::borrow::Cow;
 use std::collections::HashSet;
@@ -21,29 +21,29 @@ const TENSORS: &str = "tensors.safetensors";
 const REPLAY: &str = "replay.safetensors";
 const SNAPSHOTS: &str = "snapshots.safetensors";
 const PROGRESS: &str = "progress.bin";
-/// The configuration.
+/// File of the configuration.
 pub(super) const CONFIG: &str = "config.toml";
-/// All files but the manifest.
+/// All files except the manifest.
 pub(super) const NAMES: [&str; 5] = [TENSORS, REPLAY, SNAPSHOTS, PROGRESS, CONFIG];
 
-/// Bytes that reading `progress.bin` may set aside: two windows of a million episodes, and room for
-/// the rest. A length that makes no sense ends there.
+/// Bytes that decoding `progress.bin` may allocate: two windows of a million episodes, and the rest.
+/// It stops a damaged length.
 const PROGRESS_LIMIT: usize = 64 << 20;
 
 // Safetensors are little-endian, and values are written as they lie in memory.
 const _: () = assert!(cfg!(target_endian = "little"));
 
-/// `progress.bin`: counters, and what of the replay buffer is no tensor.
+/// Content of `progress.bin`: counters, and the numbers of the replay buffer that are not tensors.
 #[derive(serde::Serialize, serde::Deserialize)]
 struct ProgressFile {
     progress: Progress,
     success_inserted: u64,
     regular_inserted: u64,
-    /// Blocks of images in the replay buffer; `None` once the VAE is frozen.
+    /// Number of image blocks in the replay buffer; `None` once the VAE is frozen.
     image_blocks: Option<u64>,
 }
 
-/// Writes all files but the manifest into `directory`; `config` is the portable configuration.
+/// Writes all files except the manifest into `directory`. `config`: the portable configuration.
 pub(super) fn write(
     directory: &Path,
     state: &CheckpointState,
@@ -94,7 +94,7 @@ pub(super) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), CheckpointErr
         .map_err(CheckpointError::io("write", path))
 }
 
-/// Reads what [`write`] wrote, each file checked against `manifest`.
+/// Reads the files that [`write`] wrote, each checked against `manifest`.
 pub(super) fn read(
     directory: &Path,
     manifest: &Manifest,
@@ -118,7 +118,7 @@ fn parse_progress(bytes: &[u8]) -> Result<ProgressFile, String> {
         bincode::serde::decode_from_slice(bytes, limited).map_err(|error| error.to_string())?;
     match bytes.len() - read {
         0 => Ok(file),
-        more => Err(format!("{more} bytes follow what it should hold")),
+        more => Err(format!("{more} bytes follow its expected end")),
     }
 }
 
@@ -128,7 +128,7 @@ fn read_snapshots(stored: &Stored) -> Result<Vec<Snapshot>, CheckpointError> {
     for name in tensors.names() {
         let version = name
             .parse()
-            .map_err(|_| stored.unusable(format!("{name} is no snapshot's version")))?;
+            .map_err(|_| stored.unusable(format!("{name} is not a snapshot's version")))?;
         let values = stored.tensor(&tensors, name, Dtype::F32)?;
         snapshots.push(Snapshot {
             version: PolicyVersion(version),
@@ -234,7 +234,7 @@ fn read_tensors(stored: &Stored) -> Result<Vec<NamedTensor>, CheckpointError> {
             values,
         });
     }
-    // The file orders tensors by their type; the order given to it means nothing, so one is chosen.
+    // The file orders tensors by type and does not keep the given order, so one is chosen here.
     named.sort_by(|left, right| left.name.cmp(&right.name));
     Ok(named)
 }
@@ -283,7 +283,7 @@ impl Stored {
     }
 }
 
-/// Values as they lie in memory: nothing is copied on the way to the file.
+/// Values as they lie in memory, written to the file without a copy.
 struct Borrowed<'a> {
     dtype: Dtype,
     shape: Vec<usize>,

@@ -11,7 +11,7 @@ use super::super::*;
 use super::{config, encode, final_code};
 use crate::episode::samples::{episode, with_images};
 
-/// A transition, owned.
+/// A transition that owns its values.
 #[derive(Debug, Clone, PartialEq)]
 struct Transition {
     observation: Vec<f32>,
@@ -154,8 +154,8 @@ prop_compose! {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Overwriting, classification, freezing at any point, saving and restoring at any point:
-    /// always what the model holds.
+    /// Overwriting, classification, freezing, saving and restoring at any point: the content is
+    /// always the model's.
     #[test]
     fn holds_what_a_naive_model_holds(
         episodes in episodes(),
