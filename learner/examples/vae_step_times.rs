@@ -1,5 +1,5 @@
-//! Prints how long a VAE step takes on this machine, on both engines, where in the network the time
-//! goes, and how near that is to what its cores can do.
+//! Prints the time of a VAE step on this machine, on both engines, by layer, and relative to the
+//! peak of its cores.
 //!
 //! `cargo run --release -p skein-learner --example vae_step_times -- [THREADS]`
 
@@ -92,7 +92,7 @@ fn vae(batch: usize, threads: usize, peak: f64) {
     });
 }
 
-/// Runs `work` a few times to warm up, then `repetitions` times; prints and returns the median,
+/// Runs `work` a few times to warm up, then `repetitions` times. Prints and returns the median,
 /// which a busy machine disturbs least.
 fn report(what: &str, batch: usize, repetitions: usize, mut work: impl FnMut()) -> f64 {
     let warm_up = repetitions / 5 + 1;

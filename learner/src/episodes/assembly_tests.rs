@@ -1,5 +1,4 @@
-//! An episode is whole, in order and makes sense, and so is a segment, or it is refused by what is
-//! wrong with it.
+//! An episode or a segment is whole, in order and consistent, or it is refused with the reason.
 
 use bytemuck::Zeroable;
 use skein_protocol::ids::{Attempt, Epoch, PolicyVersion, RunId};
@@ -13,7 +12,7 @@ const ACTOR: ActorId = ActorId(2);
 const INCARNATION: ActorIncarnation = ActorIncarnation(11);
 /// Length of the latent codes.
 const LATENT: usize = 16;
-/// Steps of the episode here.
+/// Steps of the test episode.
 const STEPS: u32 = 3;
 
 fn ticket() -> Ticket {
@@ -50,7 +49,7 @@ fn assembly(keep: Keep) -> Assembly {
     )
 }
 
-/// Record `step`, its image filled with its number.
+/// Record `step`, its image filled with the step number.
 fn record(step: u32) -> TransitionRecord {
     let mut record = TransitionRecord::zeroed();
     record.begin(&ticket(), ACTOR, INCARNATION, step);
@@ -131,7 +130,7 @@ fn an_episode_that_never_ends_is_refused_at_its_limit() {
     );
 }
 
-/// The assembly of two steps that follow one that led to `seen`.
+/// The assembly of a segment of two steps, after one step of its episode.
 fn segment(begins: Option<SegmentEnd>) -> Assembly {
     let segment = Segment {
         steps: 2,
@@ -165,7 +164,7 @@ fn segment_end(step: u32) -> TransitionRecord {
     })
 }
 
-/// A step after which the episode goes on.
+/// A step after which the episode continues.
 fn onward(step: u32) -> TransitionRecord {
     changed(record(step), |record| {
         (record.kind, record.truncated, record.outcome) = (RecordKind::Step.code(), 0, 0);
@@ -173,7 +172,7 @@ fn onward(step: u32) -> TransitionRecord {
 }
 
 #[test]
-fn a_segment_is_its_steps_and_what_they_led_to_and_knows_what_came_before() {
+fn a_segment_holds_its_steps_and_the_action_before_them() {
     let mut assembly = segment(None);
     assert!(matches!(assembly.push(&onward(1)), Ok(Assembled::Step)));
     assert!(matches!(assembly.push(&onward(2)), Ok(Assembled::Step)));
@@ -191,7 +190,7 @@ fn a_segment_is_its_steps_and_what_they_led_to_and_knows_what_came_before() {
     assert!(!segment.terminated());
     let end = SegmentEnd::of(&segment).unwrap();
     assert_eq!((end.episode, end.steps), (EpisodeId(5), 3));
-    // The episode may end in a segment, of which no other begins then.
+    // An episode may end in a segment; then no other segment follows.
     let mut last = self::segment(None);
     last.push(&changed(onward(1), |record| record.terminated = 1))
         .unwrap();
@@ -213,7 +212,7 @@ fn a_segment_that_is_too_short_or_too_long_or_of_a_whole_episode_is_refused() {
         let fault = records
             .iter()
             .find_map(|record| assembly.push(record).err());
-        fault.expect("it makes no sense").to_string()
+        fault.expect("one record is invalid").to_string()
     };
     assert!(refusal(&[onward(1), segment_end(2)], segment(None)).contains("before its last step"));
     assert!(
@@ -253,7 +252,7 @@ fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passe
         (record.position_m, record.velocity_mps) = (seen.position_m, seen.velocity_mps);
         (record.orientation, record.walls_passed) = (seen.orientation, 2);
     });
-    // An encoder that has learned since sees it otherwise.
+    // A newer encoder encodes the same image differently.
     assert_ne!(there.latent, seen.latent);
     assert!(matches!(
         segment(Some(begins)).push(&there),
@@ -277,7 +276,7 @@ fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passe
 }
 
 #[test]
-fn depth_images_are_copied_only_for_who_wants_them() {
+fn depth_images_are_copied_only_if_ordered() {
     assert_eq!(assemble(Keep::Latents).depth, None);
     let kept = assemble(Keep::Depth).depth.unwrap();
     let images: Vec<_> = kept
@@ -294,8 +293,8 @@ fn depth_images_are_copied_only_for_who_wants_them() {
 
 #[test]
 fn an_episode_that_contradicts_itself_is_refused() {
-    // A change of one record, by its step, and what is said of it or of the first one that shows
-    // it.
+    // A change to one record, by its step, and the resulting error, here or at the first record
+    // that reveals it.
     type Case = (u32, fn(&mut TransitionRecord), &'static str);
     let cases: [Case; 9] = [
         (0, |r| r.truncated = 1, "a step after the episode's end"),
@@ -351,7 +350,7 @@ fn an_episode_that_contradicts_itself_is_refused() {
 }
 
 #[test]
-fn what_was_hit_is_known_of_the_committed_episode() {
+fn a_committed_episode_names_the_wall_that_was_hit() {
     for (hit_wall, expected) in [(0, None), (1, Some(1))] {
         let mut assembly = assembly(Keep::Latents);
         let mut last = record(0);

@@ -70,7 +70,7 @@ fn status(actor: u32, incarnation: ActorIncarnation) -> ActorStatus {
     }
 }
 
-/// A heartbeat of an actor that has flown for so many seconds in this incarnation.
+/// Sends a heartbeat of an actor that has flown for `secs` seconds in this incarnation.
 fn flown(
     dispatcher: &mut Dispatcher,
     actor: u32,
@@ -89,7 +89,7 @@ fn flown(
     dispatcher.on_status(&status, now);
 }
 
-/// Tickets handed out to `actor`.
+/// Tickets issued to `actor`.
 pub(super) fn tickets_for(
     messages: &[Message],
     actor: u32,
@@ -139,7 +139,7 @@ pub(super) fn feed(
         .collect()
 }
 
-/// A dispatcher with one actor that holds tickets 0 and 1 of three orders.
+/// Returns a dispatcher with one actor that holds tickets 0 and 1 of three orders.
 pub(super) fn dispatcher(now: Instant) -> (Dispatcher, Vec<Ticket>) {
     let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
     (0..3).for_each(|episode| dispatcher.order(order(episode)));
@@ -156,7 +156,7 @@ pub(super) fn dispatcher(now: Instant) -> (Dispatcher, Vec<Ticket>) {
 }
 
 #[test]
-fn credit_bounds_what_is_in_the_air_and_returns_with_each_episode() {
+fn credit_bounds_outstanding_tickets_and_returns_with_each_episode() {
     let now = Instant::now();
     let (mut dispatcher, tickets) = dispatcher(now);
     assert!(dispatcher.issue(now).is_empty());
@@ -195,7 +195,7 @@ fn an_episode_with_a_hole_is_discarded_whole_and_flown_again() {
     assert_eq!(dispatcher.faults().reissued(), 1);
     let again = tickets_for(&dispatcher.issue(now), 0, INCARNATION).remove(0);
     assert_eq!((again.episode, again.attempt), (EpisodeId(0), Attempt(1)));
-    // The actor flies on with what it holds: episode 1, then episode 0 again.
+    // The actor continues with what it holds: episode 1, then episode 0 again.
     assert_eq!(
         feed(&mut dispatcher, &records(&tickets[1], 0, INCARNATION), now)[0]
             .1
@@ -240,7 +240,7 @@ fn a_restarted_actor_owes_nothing_of_its_former_incarnation() {
     let (mut dispatcher, tickets) = dispatcher(now);
     let next = ActorIncarnation(101);
     attach(&mut dispatcher, 0, next, now);
-    attach(&mut dispatcher, 0, INCARNATION, now); // a late word of the former incarnation
+    attach(&mut dispatcher, 0, INCARNATION, now); // a late heartbeat of the former incarnation
     let again = tickets_for(&dispatcher.issue(now), 0, next);
     assert_eq!(
         again
@@ -257,7 +257,7 @@ fn a_restarted_actor_owes_nothing_of_its_former_incarnation() {
 }
 
 #[test]
-fn a_ticket_that_got_lost_is_issued_again_when_the_next_one_is_flown() {
+fn a_lost_ticket_is_issued_again_when_the_next_one_is_flown() {
     let now = Instant::now();
     let (mut dispatcher, tickets) = dispatcher(now);
     assert_eq!(
@@ -282,20 +282,20 @@ fn a_ticket_that_takes_too_long_is_issued_again_though_its_actor_lives() {
         attach(&mut dispatcher, 0, INCARNATION, now);
         dispatcher.on_time(now);
     }
-    let letters = dispatcher.issue(now);
+    let messages = dispatcher.issue(now);
     assert!(
-        letters
+        messages
             .iter()
-            .any(|letter| letter.is_for(ActorId(0), INCARNATION)
-                && letter.read(RUN) == Ok(Control::Rejoin)),
-        "nothing at all came of it: its line is broken"
+            .any(|message| message.is_for(ActorId(0), INCARNATION)
+                && message.read(RUN) == Ok(Control::Rejoin)),
+        "no record arrived: its connection is broken"
     );
     assert_eq!(dispatcher.faults().reissued(), 1);
     assert!(feed(&mut dispatcher, &records(&tickets[0], 0, INCARNATION), now).is_empty());
 }
 
-/// Has an actor fail what is its first episode, again and again, by `damage` to its first record,
-/// until the dispatcher gives up; at most `most` times.
+/// Lets an actor fail its first episode again and again, with `damage` to its first record, until
+/// the dispatcher gives up; at most `most` times.
 fn fail_for_ever(
     dispatcher: &mut Dispatcher,
     actor: u32,
@@ -409,7 +409,7 @@ fn actors_beyond_the_limit_get_no_tickets_until_there_is_room() {
     );
 }
 
-/// What may happen next to one of three actors.
+/// Possible next events of one of three actors.
 #[derive(Debug, Clone, Copy)]
 enum Event {
     FlyNext,
@@ -437,7 +437,7 @@ fn event() -> impl Strategy<Value = (u32, Event)> {
 }
 
 proptest! {
-    /// The whole promise, under arbitrary mishaps followed by quiet.
+    /// Arbitrary mishaps followed by quiet: the promise still holds.
     #[test]
     fn every_order_is_committed_exactly_once_and_whole(events in prop::collection::vec(event(), 0..60)) {
         const ORDERS: u64 = 12;
@@ -447,7 +447,7 @@ proptest! {
         let mut incarnations = [INCARNATION; 3];
         let mut held: [VecDeque<Ticket>; 3] = Default::default();
         let mut committed: BTreeMap<u64, CommittedEpisode> = BTreeMap::new();
-        // More than that, and the episode is given up: another test.
+        // At `MOST_FAILURES` the episode would be given up, which another test covers.
         let mut poisonings: BTreeMap<EpisodeId, usize> = BTreeMap::new();
         let calm = (0..3 * ORDERS as usize).map(|turn| ((turn % 3) as u32, Event::FlyNext));
         let quiet = calm.clone().chain([(0, Event::Silence)]).chain(calm);
@@ -513,7 +513,7 @@ proptest! {
 }
 
 #[test]
-fn the_times_of_all_incarnations_of_all_actors_are_summed_up_and_none_twice() {
+fn the_times_of_all_incarnations_of_all_actors_are_summed_without_counting_twice() {
     let now = Instant::now();
     let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
     let flies = |dispatcher: &mut Dispatcher, actor, incarnation, secs| {
@@ -534,12 +534,12 @@ fn the_times_of_all_incarnations_of_all_actors_are_summed_up_and_none_twice() {
     flies(&mut dispatcher, 0, INCARNATION, 5);
     flies(&mut dispatcher, 1, INCARNATION, 20);
     assert_eq!(physics(&dispatcher).count, 25);
-    // The next incarnation counts from nothing; an older one's late word is not believed.
+    // The next incarnation counts from zero; a late heartbeat of an older one is ignored.
     attach(&mut dispatcher, 0, next_incarnation, now);
     flies(&mut dispatcher, 0, next_incarnation, 100);
     flies(&mut dispatcher, 0, INCARNATION, 7000);
     assert_eq!(physics(&dispatcher).count, 125);
-    // What it says as it leaves is in.
+    // The last heartbeat before leaving is included.
     flown(
         &mut dispatcher,
         0,
