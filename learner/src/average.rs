@@ -5,7 +5,7 @@
 //! than any one of them.
 
 use crate::algorithm::Algorithm;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
 /// Number of first updates over which the average forgets faster, because an untrained policy is
 /// not worth remembering.
@@ -13,14 +13,14 @@ const BEGINNING: f32 = 10.0;
 
 /// A moving average of a policy's parameters.
 #[derive(Debug)]
-pub struct Average {
+pub struct PolicyAverage {
     /// Weight of the latest policy.
     weight: f32,
     values: Vec<f32>,
     latest: Vec<f32>,
 }
 
-impl Average {
+impl PolicyAverage {
     /// Starts as the policy of `algorithm`; averages exponentially over about `updates` updates.
     pub fn new(updates: usize, algorithm: &dyn Algorithm) -> Self {
         let mut values = vec![0.0; algorithm.policy_layout().len()];
@@ -52,8 +52,11 @@ impl Average {
     }
 }
 
-impl Stateful for Average {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
-        vec![("policy_average".to_owned(), Part::Numbers(&mut self.values))]
+impl Stateful for PolicyAverage {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
+        vec![(
+            "policy_average".to_owned(),
+            StatePart::Numbers(&mut self.values),
+        )]
     }
 }

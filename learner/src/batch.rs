@@ -9,7 +9,7 @@ use crate::vae::images_from_bytes;
 
 /// A minibatch on the learner's device. [`Columns`] documents the columns and their shapes.
 #[derive(Debug)]
-pub(crate) struct Batch {
+pub(crate) struct TensorBatch {
     pub(crate) observations: Tensor,
     pub(crate) actions: Tensor,
     pub(crate) rewards: Tensor,
@@ -22,7 +22,7 @@ pub(crate) struct Batch {
     pub(crate) images: Option<[Tensor; 2]>,
 }
 
-impl Batch {
+impl TensorBatch {
     /// Copies each column to the device.
     ///
     /// # Panics

@@ -1,8 +1,8 @@
 //! A full disk pauses the learner and loses nothing.
 //!
 //! A writer that finds no room warns, waits, and tries again until there is room or the run must
-//! stop. What was learned stays in memory meanwhile. [`Disk::with_room`] repeats the write of a
-//! whole file; [`Patient`] continues a file that is appended to, so that nothing is written twice.
+//! stop. What was learned stays in memory meanwhile. [`Disk::with_room`] repeats the write of a whole
+//! file; [`PatientWriter`] continues a file that is appended to, so that nothing is written twice.
 //! Every other failure is returned to the caller.
 
 use std::error::Error;
@@ -67,8 +67,8 @@ impl Disk {
     }
 
     /// Returns a writer to the file at `path` that waits for room.
-    pub fn patient<W: Write>(&self, path: &Path, inner: W) -> Patient<W> {
-        Patient {
+    pub fn patient<W: Write>(&self, path: &Path, inner: W) -> PatientWriter<W> {
+        PatientWriter {
             disk: self.clone(),
             path: path.to_owned(),
             inner,
@@ -130,13 +130,13 @@ impl Drop for Wait<'_> {
 
 /// A writer that waits for room instead of failing: see [`Disk::patient`].
 #[derive(Debug)]
-pub struct Patient<W> {
+pub struct PatientWriter<W> {
     disk: Disk,
     path: PathBuf,
     inner: W,
 }
 
-impl<W: Write> Write for Patient<W> {
+impl<W: Write> Write for PatientWriter<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let Self { disk, path, inner } = self;
         // The system reports a full disk only if it took none of these bytes.
@@ -154,12 +154,12 @@ mod tests {
     use super::*;
 
     /// A disk that has room again after `refusals` attempts.
-    struct Small {
+    struct SmallDisk {
         written: Vec<u8>,
         refusals: usize,
     }
 
-    impl Write for Small {
+    impl Write for SmallDisk {
         fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
             if self.written.len() >= 5 && self.refusals > 0 {
                 self.refusals -= 1;
@@ -186,7 +186,7 @@ mod tests {
     #[test]
     fn what_waited_for_room_is_written_once() {
         let disk = disk();
-        let small = Small {
+        let small = SmallDisk {
             written: Vec::new(),
             refusals: 4,
         };

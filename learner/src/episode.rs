@@ -81,7 +81,7 @@ pub struct CommittedEpisode {
 /// Reason why an episode's parts do not fit together.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("episode {episode} of {steps} steps has {found} {what} where {expected} are expected")]
-pub struct EpisodeFault {
+pub struct MalformedEpisode {
     /// Number of the episode.
     pub episode: EpisodeId,
     /// Its steps, counted by its actions.
@@ -198,8 +198,8 @@ impl CommittedEpisode {
     /// requires.
     ///
     /// # Errors
-    /// [`EpisodeFault`] names the first part that is not.
-    pub fn check(&self) -> Result<(), EpisodeFault> {
+    /// [`MalformedEpisode`] names the first part that is not.
+    pub fn check(&self) -> Result<(), MalformedEpisode> {
         let steps = self.steps();
         let images = self
             .depth
@@ -214,7 +214,7 @@ impl CommittedEpisode {
             ("bytes of depth images", images, (steps + 1) * IMAGE_PIXELS),
         ] {
             if found != expected {
-                return Err(EpisodeFault {
+                return Err(MalformedEpisode {
                     episode: self.episode,
                     steps,
                     what,

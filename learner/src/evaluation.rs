@@ -17,14 +17,14 @@ use crate::episode::CommittedEpisode;
 use crate::trainer::Trainer;
 
 /// Episodes per course whose trajectory is written.
-const PATHS: usize = 25;
+const TRAJECTORIES: usize = 25;
 /// Number of images shown beside their reconstructions.
 const PICTURES: usize = 8;
 
 /// Reason why an evaluation cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write {}: {source}", path.display())]
-pub struct EvaluationError {
+pub struct EvaluationWriteError {
     /// Path of the file.
     pub path: PathBuf,
     /// Cause.
@@ -33,14 +33,14 @@ pub struct EvaluationError {
 }
 
 /// Replaces the file at `path` by `content`, completely or not at all.
-fn replace<E>(path: &Path, content: Result<Vec<u8>, E>) -> Result<(), EvaluationError>
+fn replace<E>(path: &Path, content: Result<Vec<u8>, E>) -> Result<(), EvaluationWriteError>
 where
     E: Into<Box<dyn std::error::Error + Send + Sync>>,
 {
     content
         .map_err(io::Error::other)
         .and_then(|bytes| durable::replace(path, &bytes))
-        .map_err(|source| EvaluationError {
+        .map_err(|source| EvaluationWriteError {
             path: path.to_owned(),
             source,
         })
@@ -48,7 +48,7 @@ where
 
 /// A row of `evaluation_trajectories.csv`.
 #[derive(Debug, Serialize)]
-struct PathRow<'a> {
+struct TrajectoryRow<'a> {
     course: &'a str,
     episode: usize,
     step: usize,
@@ -62,15 +62,15 @@ struct PathRow<'a> {
 /// courses, course by course.
 ///
 /// # Errors
-/// [`EvaluationError`] names the file.
+/// [`EvaluationWriteError`] names the file.
 pub fn write_report(
     directory: &RunDirectory,
     config: &Config,
     policy_version: PolicyVersion,
     policy_sha256: &str,
     flown: &[CommittedEpisode],
-) -> Result<EvaluationReport, EvaluationError> {
-    let mut paths = csv::Writer::from_writer(Vec::new());
+) -> Result<EvaluationReport, EvaluationWriteError> {
+    let mut trajectories = csv::Writer::from_writer(Vec::new());
     let mut rows = Ok(());
     let mut courses = Vec::new();
     for (course, episodes) in config
@@ -85,16 +85,16 @@ pub fn write_report(
             .first()
             .map_or(0, |episode| episode.course_walls.into());
         courses.push(CourseEvaluation::of(&name, walls, &scores));
-        for (number, episode) in episodes.iter().take(PATHS).enumerate() {
-            rows = rows.and_then(|()| write_path(&mut paths, &name, number, episode));
+        for (number, episode) in episodes.iter().take(TRAJECTORIES).enumerate() {
+            rows = rows.and_then(|()| write_trajectory(&mut trajectories, &name, number, episode));
         }
     }
-    let paths = rows.map_err(io::Error::from).and_then(|()| {
-        paths
+    let trajectories = rows.map_err(io::Error::from).and_then(|()| {
+        trajectories
             .into_inner()
             .map_err(|error| io::Error::other(error.to_string()))
     });
-    replace(&directory.evaluation_trajectories_csv(), paths)?;
+    replace(&directory.evaluation_trajectories_csv(), trajectories)?;
     let report = EvaluationReport {
         policy_version,
         policy_sha256: policy_sha256.to_owned(),
@@ -116,15 +116,15 @@ fn score(episode: &CommittedEpisode) -> EpisodeScore {
     }
 }
 
-fn write_path(
-    paths: &mut csv::Writer<Vec<u8>>,
+fn write_trajectory(
+    trajectories: &mut csv::Writer<Vec<u8>>,
     course: &str,
     number: usize,
     episode: &CommittedEpisode,
 ) -> Result<(), csv::Error> {
     for (step, observation) in episode.observations.iter().enumerate() {
         let [x_m, y_m, z_m] = observation.position_m;
-        paths.serialize(PathRow {
+        trajectories.serialize(TrajectoryRow {
             course,
             episode: number,
             step,
@@ -141,12 +141,12 @@ fn write_path(
 /// nothing where there is no VAE.
 ///
 /// # Errors
-/// [`EvaluationError`] names the file.
+/// [`EvaluationWriteError`] names the file.
 pub fn write_reconstructions(
     directory: &RunDirectory,
     trainer: &mut Trainer,
     episodes: &[CommittedEpisode],
-) -> Result<(), EvaluationError> {
+) -> Result<(), EvaluationWriteError> {
     let depth = episodes
         .iter()
         .filter_map(|episode| episode.depth.as_deref())

@@ -46,7 +46,7 @@ fn main() -> ExitCode {
 /// Exit status after `error`: says whether starting again may help.
 fn status_of(error: &anyhow::Error) -> ExitCode {
     match error.downcast_ref::<TrainingError>() {
-        Some(error) if error.is_of_the_transport() => ExitCode::from(EXIT_START_AGAIN),
+        Some(error) if error.is_transport_failure() => ExitCode::from(EXIT_START_AGAIN),
         _ => ExitCode::FAILURE,
     }
 }

@@ -5,7 +5,7 @@
 
 use tch::{Device, Kind, Tensor, no_grad_guard};
 
-use crate::state::Part;
+use crate::state::StatePart;
 
 const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
@@ -62,7 +62,7 @@ impl Adam {
     }
 
     /// The state, under names that begin with `prefix`.
-    pub fn parts(&mut self, prefix: &str) -> Vec<(String, Part<'_>)> {
+    pub fn parts(&mut self, prefix: &str) -> Vec<(String, StatePart<'_>)> {
         [
             ("first_moment", &self.first_moment),
             ("second_moment", &self.second_moment),
@@ -71,7 +71,7 @@ impl Adam {
         .map(|(name, tensor)| {
             (
                 format!("{prefix}.{name}"),
-                Part::Tensor(tensor.shallow_clone()),
+                StatePart::Tensor(tensor.shallow_clone()),
             )
         })
         .into()
@@ -87,7 +87,7 @@ mod tests {
     use crate::state::Stateful;
 
     impl Stateful for Adam {
-        fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
             Adam::parts(self, "adam")
         }
     }

@@ -12,7 +12,7 @@
 
 use tch::{Tensor, no_grad_guard};
 
-use crate::batch::Batch;
+use crate::batch::TensorBatch;
 use crate::networks::{ImageEncoder, Layout, Parameters};
 
 /// Factor by which initial weights exceed PyTorch's defaults. It keeps the variance of activations
@@ -34,7 +34,7 @@ pub(crate) struct Perception {
 /// Choice of the encoder that shows the policy the state after the action, where targets need the
 /// policy's next action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum LooksAhead {
+pub(crate) enum NextStateEncoder {
     /// The learned encoder: SAC asks the learned policy.
     Learned,
     /// The target encoder: TD3 asks the target policy.
@@ -61,27 +61,32 @@ impl Perception {
     ///
     /// # Panics
     /// When the batch has no images.
-    pub(crate) fn look(
+    pub(crate) fn encode(
         &self,
-        batch: &mut Batch,
+        batch: &mut TensorBatch,
         critic: &Parameters,
         target: &Parameters,
-        ahead: LooksAhead,
+        ahead: NextStateEncoder,
     ) {
         let images = batch.images.as_ref();
         let [now, next] = images.expect("end-to-end training receives images");
-        batch.states = self.see(critic, now, &batch.observations);
+        batch.states = self.with_features(critic, now, &batch.observations);
         batch.observations = batch.states.detach();
         let _guard = no_grad_guard();
-        batch.next_states = self.see(target, next, &batch.next_observations);
+        batch.next_states = self.with_features(target, next, &batch.next_observations);
         batch.next_observations = match ahead {
-            LooksAhead::Learned => self.see(critic, next, &batch.next_observations),
-            LooksAhead::Target => batch.next_states.shallow_clone(),
+            NextStateEncoder::Learned => self.with_features(critic, next, &batch.next_observations),
+            NextStateEncoder::Target => batch.next_states.shallow_clone(),
         };
     }
 
     /// Observations with their codes replaced by the features of `images`, `[n, observation]`.
-    fn see(&self, parameters: &Parameters, images: &Tensor, observations: &Tensor) -> Tensor {
+    fn with_features(
+        &self,
+        parameters: &Parameters,
+        images: &Tensor,
+        observations: &Tensor,
+    ) -> Tensor {
         let beside = observations.narrow(1, self.latent, observations.size()[1] - self.latent);
         Tensor::cat(&[self.encoder.forward(parameters, images), beside], 1)
     }

@@ -11,7 +11,7 @@ use crate::episodes::receiver::Shared;
 /// Time and losses over all incarnations of the learner, as stored in checkpoints: work lost with a
 /// killed learner is not counted.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct Spent {
+pub struct RunCosts {
     /// Seconds from the learner's start to its end.
     pub wall_secs: f64,
     /// Time of the learner's threads and of the actors, by stage.
@@ -22,7 +22,7 @@ pub struct Spent {
     pub records_refused: BTreeMap<String, u64>,
 }
 
-impl Spent {
+impl RunCosts {
     /// Adds the costs of the present incarnation, started at `started`. `training` is the time of
     /// its training thread; `shared` has the time of all other threads.
     pub fn with_this_incarnation(

@@ -50,7 +50,7 @@ impl TensorValues {
 
 /// Access to one part of a state.
 #[derive(Debug)]
-pub enum Part<'a> {
+pub enum StatePart<'a> {
     /// A libtorch tensor on any device: f32, f64 or i64. Shares its storage with the state.
     Tensor(Tensor),
     /// A flat vector, `[len]`.
@@ -59,7 +59,7 @@ pub enum Part<'a> {
     Count(&'a mut u64),
 }
 
-impl Part<'_> {
+impl StatePart<'_> {
     /// Copies the shape and the values.
     fn read(&self) -> (Vec<usize>, TensorValues) {
         match self {
@@ -136,7 +136,7 @@ fn values(tensor: &Tensor) -> TensorValues {
 pub trait Stateful {
     /// Lists every part of the state, under a name that is unique in the learner. The parts can be
     /// changed in place: one list serves storing and restoring.
-    fn parts(&mut self) -> Vec<(String, Part<'_>)>;
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)>;
 
     /// Copies the whole state.
     fn named_tensors(&mut self) -> Vec<NamedTensor> {
@@ -157,8 +157,9 @@ pub trait Stateful {
     /// bit for bit the one that would have followed.
     ///
     /// # Errors
-    /// [`RestoreError`] names the first tensor that does not fit; the state is unchanged then.
-    fn load_named(&mut self, stored: &[NamedTensor]) -> Result<(), RestoreError> {
+    /// [`TensorRestoreError`] names the first tensor that does not fit; the state is unchanged
+    /// then.
+    fn load_named(&mut self, stored: &[NamedTensor]) -> Result<(), TensorRestoreError> {
         let stored: HashMap<&str, &NamedTensor> = stored
             .iter()
             .map(|tensor| (tensor.name.as_str(), tensor))
@@ -167,11 +168,11 @@ pub trait Stateful {
         for (name, own) in self.parts() {
             let NamedTensor { shape, values, .. } = *stored
                 .get(name.as_str())
-                .ok_or_else(|| RestoreError::Missing { name: name.clone() })?;
+                .ok_or_else(|| TensorRestoreError::Missing { name: name.clone() })?;
             let expected = own.shape();
             let len: usize = expected.iter().product();
             if (shape, values.kind(), values.len()) != (&expected, own.kind(), len) {
-                return Err(RestoreError::Shape {
+                return Err(TensorRestoreError::Shape {
                     name,
                     expected: format!("{} {expected:?}", own.kind()),
                     found: format!("{} {shape:?} with {} values", values.kind(), values.len()),
@@ -189,7 +190,7 @@ pub trait Stateful {
 
 /// Reason why a stored state cannot be restored.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum RestoreError {
+pub enum TensorRestoreError {
     /// A tensor is missing.
     #[error(
         "the stored state lacks the tensor {name}: it comes from another version or is damaged"
@@ -221,11 +222,11 @@ mod tests {
     struct Three(Tensor, Vec<f32>, u64);
 
     impl Stateful for Three {
-        fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
             vec![
-                ("first".into(), Part::Tensor(self.0.shallow_clone())),
-                ("second".into(), Part::Numbers(&mut self.1)),
-                ("third".into(), Part::Count(&mut self.2)),
+                ("first".into(), StatePart::Tensor(self.0.shallow_clone())),
+                ("second".into(), StatePart::Numbers(&mut self.1)),
+                ("third".into(), StatePart::Count(&mut self.2)),
             ]
         }
     }
@@ -265,7 +266,7 @@ mod tests {
         let missing = state.load_named(&stored[..2]).unwrap_err();
         assert_eq!(
             missing,
-            RestoreError::Missing {
+            TensorRestoreError::Missing {
                 name: "third".into()
             }
         );

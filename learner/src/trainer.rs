@@ -17,11 +17,11 @@ use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::Exploration;
 
 use crate::algorithm::{self, Algorithm, Columns};
-use crate::average::Average;
-use crate::checkpoint::Progress;
+use crate::average::PolicyAverage;
+use crate::checkpoint::TrainingProgress;
 use crate::device::{self, DeviceError};
 use crate::episode::CommittedEpisode;
-use crate::episodes::assembly::Keep;
+use crate::episodes::assembly::KeptData;
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::noise::Noise;
@@ -37,10 +37,10 @@ const ENCODE_CHUNK: usize = 64;
 pub enum TrainerRestoreError {
     /// The networks' state does not fit.
     #[error(transparent)]
-    Networks(#[from] state::RestoreError),
+    Networks(#[from] state::TensorRestoreError),
     /// The replay buffer's state does not fit.
     #[error(transparent)]
-    Replay(#[from] replay::RestoreError),
+    Replay(#[from] replay::ReplayRestoreError),
     /// The tensors contain another count than the counters.
     #[error("the stored {what} are {found}, but its counters say {expected}")]
     Count {
@@ -66,7 +66,7 @@ pub struct Trainer {
     encoder: Option<(u64, Encoder)>,
     algorithm: Box<dyn Algorithm>,
     /// Average of the policy that flies in its place, if averaging is configured.
-    average: Option<Average>,
+    average: Option<PolicyAverage>,
     replay: Replay,
     steps: u64,
     /// Number of times that stored latent codes were due for re-encoding since the run began.
@@ -97,7 +97,7 @@ impl Trainer {
         let averaged = config.learning.average_updates;
         Ok(Self {
             layout: SnapshotLayout::of(config),
-            average: (averaged > 0).then(|| Average::new(averaged, algorithm.as_ref())),
+            average: (averaged > 0).then(|| PolicyAverage::new(averaged, algorithm.as_ref())),
             team: Team::new(match engine {
                 Engine::Native => threads,
                 Engine::Libtorch => 1,
@@ -118,7 +118,7 @@ impl Trainer {
     /// [`TrainerRestoreError`] names what does not fit; do not use the trainer then.
     pub fn restore(
         &mut self,
-        progress: &Progress,
+        progress: &TrainingProgress,
         tensors: &[NamedTensor],
         replay: ReplayState,
     ) -> Result<(), TrainerRestoreError> {
@@ -183,10 +183,10 @@ impl Trainer {
     }
 
     /// Data to keep of the next episodes to be ordered.
-    pub fn keep(&self) -> Keep {
+    pub fn keep(&self) -> KeptData {
         match self.has_images() || self.config.learning.mirror {
-            true => Keep::Depth,
-            false => Keep::Latents,
+            true => KeptData::Depth,
+            false => KeptData::Latents,
         }
     }
 
@@ -400,7 +400,7 @@ impl Trainer {
         all.extend(
             self.average
                 .as_mut()
-                .map(Average::named_tensors)
+                .map(PolicyAverage::named_tensors)
                 .unwrap_or_default(),
         );
         all

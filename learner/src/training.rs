@@ -28,18 +28,18 @@ use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{Ending, Summary};
 
-use crate::checkpoint::{CheckpointWriter, EpochOrder, Progress};
+use crate::checkpoint::{CheckpointWriter, EpochOrder, TrainingProgress};
 use crate::curriculum;
 use crate::disk::Disk;
 use crate::episode::CommittedEpisode;
-use crate::episodes::receiver::{Batch, EpisodeReceiver, ReceiverError};
+use crate::episodes::receiver::{EpisodeBatch, EpisodeReceiver, ReceiverError};
 use crate::metrics::{Metrics, Scalar};
 use crate::report::Reporter;
 use crate::trainer::Trainer;
 
 use curves::EpochCurves;
 pub use error::TrainingError;
-use stop::StopWatch;
+use stop::StopMonitor;
 
 /// A run in progress.
 struct Training<'a> {
@@ -47,7 +47,7 @@ struct Training<'a> {
     identity: &'a RunIdentity,
     directory: &'a RunDirectory,
     stop: &'a AtomicBool,
-    stop_watch: StopWatch<'a>,
+    stop_monitor: StopMonitor<'a>,
     disk: Disk,
     layout: SnapshotLayout,
     trainer: Trainer,
@@ -62,9 +62,9 @@ struct Training<'a> {
     timer: LapTimer,
     /// Counters of the run. Those that trainer and metrics keep themselves are filled in for a
     /// checkpoint.
-    progress: Progress,
+    progress: TrainingProgress,
     /// Progress in the newest checkpoint.
-    saved: Progress,
+    saved: TrainingProgress,
     /// Number of earlier incarnations of the learner.
     resumes: u64,
     /// Epochs or segments that are ordered but not learned from.
@@ -79,7 +79,7 @@ struct Training<'a> {
 /// One order in flight: the episodes of an epoch, or a segment of one.
 struct OrderInFlight {
     order: EpochOrder,
-    batch: Batch,
+    batch: EpisodeBatch,
     /// Episodes that have arrived.
     episodes: Vec<CommittedEpisode>,
 }
@@ -242,14 +242,14 @@ impl Training<'_> {
         self.timer.lap(Stage::OtherTraining, 0);
         self.reporter
             .update(|progress| progress.phase = Phase::Flying);
-        let (is_amid_episode, shared) = (self.open_episode.is_some(), self.receiver.shared());
+        let (is_mid_episode, shared) = (self.open_episode.is_some(), self.receiver.shared());
         if let Some(OrderInFlight {
             batch, episodes, ..
         }) = self.in_flight.front_mut()
         {
-            let watch = &mut self.stop_watch;
-            let mut next = || match is_amid_episode {
-                true => batch.next_unless(|| watch.amid_episode(&shared)),
+            let watch = &mut self.stop_monitor;
+            let mut next = || match is_mid_episode {
+                true => batch.next_unless(|| watch.during_episode(&shared)),
                 false => Ok(batch.next(self.stop)?),
             };
             while let Some(episode) = next()? {
@@ -319,7 +319,7 @@ impl Training<'_> {
 
     fn train_vae(&mut self) -> Result<(), TrainingError> {
         let version = self.progress.version();
-        let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
+        let (reporter, watch) = (&self.reporter, &mut self.stop_monitor);
         let trained = self
             .trainer
             .train_vae(version, &mut self.timer, |metrics| {
@@ -338,7 +338,7 @@ impl Training<'_> {
         self.timer.lap(Stage::OtherTraining, 0);
         let version = self.progress.version();
         let started = Instant::now();
-        let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
+        let (reporter, watch) = (&self.reporter, &mut self.stop_monitor);
         let updates_before = self.trainer.updates();
         let means = &mut self.curves.policy;
         self.trainer

@@ -16,7 +16,7 @@ const RECEIVER_PATIENCE: Duration = Duration::from_secs(20);
 /// Examines every progress report.
 #[derive(Debug)]
 pub struct Watchdog {
-    done: Option<Done>,
+    done: Option<WorkDone>,
     /// When this state was first seen.
     since: Instant,
     /// When a warning about the present stall was last logged.
@@ -25,7 +25,7 @@ pub struct Watchdog {
 
 /// All counters that a healthy run advances.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Done {
+struct WorkDone {
     phase: Phase,
     episodes: u64,
     steps: u64,
@@ -54,7 +54,7 @@ impl Watchdog {
         obstacle: Option<String>,
         receiver: Option<(Duration, Situation)>,
     ) -> Option<String> {
-        let done = Done {
+        let done = WorkDone {
             phase: progress.phase,
             episodes: progress.episodes,
             steps: progress.steps,
@@ -116,7 +116,7 @@ fn who_waits(phase: Phase, still: Duration, receiver: Option<(Duration, Situatio
 mod tests {
     use super::*;
 
-    fn nobody() -> Option<(Duration, Situation)> {
+    fn no_actor() -> Option<(Duration, Situation)> {
         let situation = Situation {
             waiting: 3,
             ..Situation::default()
@@ -130,19 +130,19 @@ mod tests {
         let at = |secs| start + Duration::from_secs(secs);
         let mut watchdog = Watchdog::new(start);
         let mut progress = Progress::start(40);
-        assert_eq!(watchdog.look(at(1), &progress, None, nobody()), None);
-        assert_eq!(watchdog.look(at(20), &progress, None, nobody()), None);
-        let stalled = watchdog.look(at(22), &progress, None, nobody()).unwrap();
+        assert_eq!(watchdog.look(at(1), &progress, None, no_actor()), None);
+        assert_eq!(watchdog.look(at(20), &progress, None, no_actor()), None);
+        let stalled = watchdog.look(at(22), &progress, None, no_actor()).unwrap();
         assert_eq!(
             stalled,
             "the training thread has waited for episodes for 21 s; no actor is attached; \
              episodes that wait for one: 3"
         );
         progress.steps += 1;
-        assert_eq!(watchdog.look(at(23), &progress, None, nobody()), None);
+        assert_eq!(watchdog.look(at(23), &progress, None, no_actor()), None);
         progress.phase = Phase::Learning;
-        watchdog.look(at(24), &progress, None, nobody());
-        let stalled = watchdog.look(at(50), &progress, None, nobody()).unwrap();
+        watchdog.look(at(24), &progress, None, no_actor());
+        let stalled = watchdog.look(at(50), &progress, None, no_actor()).unwrap();
         assert!(
             stalled.contains("at one step of its updates for 26 s"),
             "{stalled}"
@@ -155,7 +155,7 @@ mod tests {
         let mut watchdog = Watchdog::new(start);
         let progress = Progress::start(40);
         watchdog.look(start, &progress, None, None);
-        let stale = nobody().map(|(_, situation)| (Duration::from_secs(33), situation));
+        let stale = no_actor().map(|(_, situation)| (Duration::from_secs(33), situation));
         let stalled = watchdog
             .look(start + PATIENCE, &progress, None, stale)
             .unwrap();
@@ -170,7 +170,7 @@ mod tests {
         let start = Instant::now();
         let mut watchdog = Watchdog::new(start);
         let full = "no room for the checkpoint".to_owned();
-        let stalled = watchdog.look(start, &Progress::start(40), Some(full.clone()), nobody());
+        let stalled = watchdog.look(start, &Progress::start(40), Some(full.clone()), no_actor());
         assert_eq!(stalled, Some(full));
     }
 }

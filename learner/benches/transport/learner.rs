@@ -8,8 +8,8 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use skein_learner::episode::CommittedEpisode;
-use skein_learner::episodes::assembly::Keep;
-use skein_learner::episodes::receiver::{Batch, EpisodeReceiver};
+use skein_learner::episodes::assembly::KeptData;
+use skein_learner::episodes::receiver::{EpisodeBatch, EpisodeReceiver};
 use skein_learner::threads::cpu_secs;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{Attempt, EpisodeId, Epoch, PolicyVersion};
@@ -28,7 +28,7 @@ const BATCHES_AHEAD: usize = 3;
 
 /// Settings of one measurement.
 pub(crate) struct Load {
-    pub(crate) keep: Keep,
+    pub(crate) keep: KeptData,
     pub(crate) warm_up: Duration,
     pub(crate) measured: Duration,
 }
@@ -51,7 +51,7 @@ pub(crate) struct Learner {
     directory: RunDirectory,
     receiver: EpisodeReceiver,
     actors: Vec<Child>,
-    batches: VecDeque<Batch>,
+    batches: VecDeque<EpisodeBatch>,
     next_episode: u64,
     // Last, because the others use it.
     _lock: LearnerLock,
@@ -145,7 +145,7 @@ impl Learner {
     }
 
     /// Orders episodes and takes them out for `time`; returns the number of their records.
-    fn take_episodes(&mut self, keep: Keep, time: Duration) -> usize {
+    fn take_episodes(&mut self, keep: KeptData, time: Duration) -> usize {
         let end = Instant::now() + time;
         let mut records = 0;
         while Instant::now() < end {
@@ -167,7 +167,7 @@ impl Learner {
         }
     }
 
-    fn order(&mut self, keep: Keep) {
+    fn order(&mut self, keep: KeptData) {
         let episodes = (4 * self.actors.len() as u64).max(16);
         let numbers = self.next_episode..self.next_episode + episodes;
         let ticket = |episode| Ticket {
@@ -189,10 +189,10 @@ impl Learner {
 }
 
 /// Checks that an episode is complete; returns the number of its records.
-fn look_at(episode: &CommittedEpisode, keep: Keep) -> usize {
+fn look_at(episode: &CommittedEpisode, keep: KeptData) -> usize {
     episode.check().unwrap();
     assert_eq!(episode.steps(), STEPS as usize);
-    assert_eq!(episode.depth.is_some(), keep == Keep::Depth);
+    assert_eq!(episode.depth.is_some(), keep == KeptData::Depth);
     if let Some(depth) = &episode.depth {
         assert_eq!(
             (depth[0], depth[depth.len() - 1]),
@@ -217,7 +217,7 @@ fn await_ends(actors: &mut [Child]) {
     }
 }
 
-/// Time to copy a record from memory as large as an actor's into an episode, as [`Keep::Depth`]
+/// Time to copy a record from memory as large as an actor's into an episode, as [`KeptData::Depth`]
 /// does.
 fn copy_micros(time: Duration) -> f64 {
     let record = size_of::<TransitionRecord>();

@@ -24,7 +24,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
-use skein_learner::episodes::assembly::Keep;
+use skein_learner::episodes::assembly::KeptData;
 use skein_protocol::allocation::keep_freed_memory;
 
 use crate::learner::{Learner, Load, Throughput};
@@ -60,7 +60,7 @@ fn main() {
     let mut least = BTreeMap::new();
     for count in actors {
         learner.start_actors(count);
-        for (kept, keep) in [("_with_images", Keep::Depth), ("", Keep::Latents)] {
+        for (kept, keep) in [("_with_images", KeptData::Depth), ("", KeptData::Latents)] {
             let measured = learner.throughput(&Load {
                 keep,
                 warm_up: Duration::from_secs_f64(seconds / 4.0),

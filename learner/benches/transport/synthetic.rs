@@ -19,7 +19,7 @@ pub(crate) const STEPS: u32 = 120;
 /// Time without a message from the learner after which the actor gives up.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-struct Actor {
+struct SyntheticActor {
     ports: ActorPorts,
     id: ActorId,
     incarnation: ActorIncarnation,
@@ -39,7 +39,7 @@ struct Actor {
 pub(crate) fn serve(directory: &Path, id: u32) {
     let (identity, config) = RunDirectory::new(directory).open().unwrap();
     let _presence = Presence::enter(&identity).unwrap();
-    let mut actor = Actor::new(
+    let mut actor = SyntheticActor::new(
         ActorPorts::join(&identity, &config).unwrap(),
         ActorId(id),
         &config,
@@ -55,7 +55,7 @@ pub(crate) fn serve(directory: &Path, id: u32) {
     actor.report(ActorState::Leaving);
 }
 
-impl Actor {
+impl SyntheticActor {
     fn new(ports: ActorPorts, id: ActorId, config: &Config) -> Self {
         Self {
             ports,

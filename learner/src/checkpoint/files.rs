@@ -13,7 +13,7 @@ use skein_protocol::snapshot::Snapshot;
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, durable};
 
 use super::manifest::Manifest;
-use super::{CheckpointError, CheckpointState, Progress};
+use super::{CheckpointError, CheckpointState, TrainingProgress};
 use crate::replay::{ReplayState, RingState};
 use crate::state::{NamedTensor, TensorValues};
 
@@ -26,8 +26,8 @@ pub(super) const CONFIG: &str = "config.toml";
 /// All files except the manifest.
 pub(super) const NAMES: [&str; 5] = [TENSORS, REPLAY, SNAPSHOTS, PROGRESS, CONFIG];
 
-/// Bytes that decoding `progress.bin` may allocate: two windows of a million episodes, and the rest.
-/// It stops a damaged length.
+/// Bytes that decoding `progress.bin` may allocate: two windows of a million episodes, and the
+/// rest. It stops a damaged length.
 const PROGRESS_LIMIT: usize = 64 << 20;
 
 // Safetensors are little-endian, and values are written as they lie in memory.
@@ -36,7 +36,7 @@ const _: () = assert!(cfg!(target_endian = "little"));
 /// Content of `progress.bin`: counters, and the numbers of the replay buffer that are not tensors.
 #[derive(serde::Serialize, serde::Deserialize)]
 struct ProgressFile {
-    progress: Progress,
+    progress: TrainingProgress,
     success_inserted: u64,
     regular_inserted: u64,
     /// Number of image blocks in the replay buffer; `None` once the VAE is frozen.
@@ -52,7 +52,7 @@ pub(super) fn write(
     let tensors = state
         .tensors
         .iter()
-        .map(|tensor| (tensor.name.clone(), Borrowed::of(tensor)))
+        .map(|tensor| (tensor.name.clone(), BorrowedTensor::of(tensor)))
         .collect();
     write_tensors(&directory.join(TENSORS), tensors)?;
     pass(FaultPoint::CheckpointTensors);
@@ -64,7 +64,7 @@ pub(super) fn write(
         .map(|snapshot| {
             (
                 snapshot.version.to_string(),
-                Borrowed::flat(Dtype::F32, &snapshot.values),
+                BorrowedTensor::flat(Dtype::F32, &snapshot.values),
             )
         })
         .collect();
@@ -103,12 +103,12 @@ pub(super) fn read(
     let bytes = manifest.read_file(directory, PROGRESS)?;
     let file =
         parse_progress(&bytes).map_err(|problem| CheckpointError::Content { path, problem })?;
-    let replay = read_replay(&Stored::open(directory, REPLAY, manifest)?, &file)?;
+    let replay = read_replay(&TensorFile::open(directory, REPLAY, manifest)?, &file)?;
     Ok(CheckpointState {
         progress: file.progress,
-        tensors: read_tensors(&Stored::open(directory, TENSORS, manifest)?)?,
+        tensors: read_tensors(&TensorFile::open(directory, TENSORS, manifest)?)?,
         replay,
-        snapshots: read_snapshots(&Stored::open(directory, SNAPSHOTS, manifest)?)?,
+        snapshots: read_snapshots(&TensorFile::open(directory, SNAPSHOTS, manifest)?)?,
     })
 }
 
@@ -122,7 +122,7 @@ fn parse_progress(bytes: &[u8]) -> Result<ProgressFile, String> {
     }
 }
 
-fn read_snapshots(stored: &Stored) -> Result<Vec<Snapshot>, CheckpointError> {
+fn read_snapshots(stored: &TensorFile) -> Result<Vec<Snapshot>, CheckpointError> {
     let tensors = stored.tensors()?;
     let mut snapshots = Vec::new();
     for name in tensors.names() {
@@ -139,23 +139,23 @@ fn read_snapshots(stored: &Stored) -> Result<Vec<Snapshot>, CheckpointError> {
     Ok(snapshots)
 }
 
-fn replay_tensors(replay: &ReplayState) -> Vec<(String, Borrowed<'_>)> {
+fn replay_tensors(replay: &ReplayState) -> Vec<(String, BorrowedTensor<'_>)> {
     let mut tensors = Vec::new();
     for (part, ring) in [("success", &replay.success), ("regular", &replay.regular)] {
         tensors.push((
             format!("{part}.rows"),
-            Borrowed::flat(Dtype::F32, &ring.rows),
+            BorrowedTensor::flat(Dtype::F32, &ring.rows),
         ));
         tensors.push((
             format!("{part}.images"),
-            Borrowed::flat(Dtype::U32, &ring.images),
+            BorrowedTensor::flat(Dtype::U32, &ring.images),
         ));
     }
     for (number, block) in replay.images.iter().flatten().enumerate() {
         let shape = vec![block.len() / IMAGE_PIXELS, IMAGE_HEIGHT, IMAGE_WIDTH];
         tensors.push((
             block_name(number as u64),
-            Borrowed {
+            BorrowedTensor {
                 dtype: Dtype::U8,
                 shape,
                 bytes: block,
@@ -165,7 +165,7 @@ fn replay_tensors(replay: &ReplayState) -> Vec<(String, Borrowed<'_>)> {
     tensors
 }
 
-fn read_replay(stored: &Stored, file: &ProgressFile) -> Result<ReplayState, CheckpointError> {
+fn read_replay(stored: &TensorFile, file: &ProgressFile) -> Result<ReplayState, CheckpointError> {
     let tensors = stored.tensors()?;
     let ring = |part: &str, inserted| {
         let rows = stored.tensor(&tensors, &format!("{part}.rows"), Dtype::F32)?;
@@ -198,7 +198,10 @@ fn block_name(number: u64) -> String {
     format!("images.{number:06}")
 }
 
-fn write_tensors(path: &Path, tensors: Vec<(String, Borrowed<'_>)>) -> Result<(), CheckpointError> {
+fn write_tensors(
+    path: &Path,
+    tensors: Vec<(String, BorrowedTensor<'_>)>,
+) -> Result<(), CheckpointError> {
     let mut names = HashSet::new();
     if let Some((name, _)) = tensors.iter().find(|(name, _)| !names.insert(name)) {
         let problem = format!("two tensors are called {name}, and one would be lost");
@@ -216,7 +219,7 @@ fn write_tensors(path: &Path, tensors: Vec<(String, Borrowed<'_>)>) -> Result<()
     })
 }
 
-fn read_tensors(stored: &Stored) -> Result<Vec<NamedTensor>, CheckpointError> {
+fn read_tensors(stored: &TensorFile) -> Result<Vec<NamedTensor>, CheckpointError> {
     let mut named = Vec::new();
     for (name, view) in stored.tensors()?.iter() {
         let bytes = view.data();
@@ -240,12 +243,12 @@ fn read_tensors(stored: &Stored) -> Result<Vec<NamedTensor>, CheckpointError> {
 }
 
 /// A safetensors file in memory, its checksum verified.
-struct Stored {
+struct TensorFile {
     path: PathBuf,
     bytes: Vec<u8>,
 }
 
-impl Stored {
+impl TensorFile {
     fn open(directory: &Path, name: &str, manifest: &Manifest) -> Result<Self, CheckpointError> {
         Ok(Self {
             path: directory.join(name),
@@ -284,13 +287,13 @@ impl Stored {
 }
 
 /// Values as they lie in memory, written to the file without a copy.
-struct Borrowed<'a> {
+struct BorrowedTensor<'a> {
     dtype: Dtype,
     shape: Vec<usize>,
     bytes: &'a [u8],
 }
 
-impl<'a> Borrowed<'a> {
+impl<'a> BorrowedTensor<'a> {
     fn of(tensor: &'a NamedTensor) -> Self {
         let (dtype, bytes) = match &tensor.values {
             TensorValues::F32(values) => (Dtype::F32, bytemuck::cast_slice(values)),
@@ -313,7 +316,7 @@ impl<'a> Borrowed<'a> {
     }
 }
 
-impl View for Borrowed<'_> {
+impl View for BorrowedTensor<'_> {
     fn dtype(&self) -> Dtype {
         self.dtype
     }

@@ -32,13 +32,13 @@ pub(super) struct Manifest {
     /// `Config::digest`, hexadecimal: JSON's numbers do not hold 64 bits.
     config_digest: String,
     episodes: u64,
-    files: Vec<Entry>,
+    files: Vec<ManifestEntry>,
 }
 
 /// Name, size and checksum of one file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Entry {
+struct ManifestEntry {
     name: String,
     bytes: u64,
     /// Checksum, hexadecimal.
@@ -55,7 +55,7 @@ impl Manifest {
     ) -> Result<Self, CheckpointError> {
         let files = names
             .iter()
-            .map(|name| Entry::of(directory, name))
+            .map(|name| ManifestEntry::of(directory, name))
             .collect::<Result<_, _>>()?;
         Ok(Self {
             format: FORMAT,
@@ -118,7 +118,7 @@ impl Manifest {
     pub(super) fn verify(&self, directory: &Path) -> Result<(), CheckpointError> {
         for entry in &self.files {
             let path = directory.join(&entry.name);
-            let found = Entry::of(directory, &entry.name)?;
+            let found = ManifestEntry::of(directory, &entry.name)?;
             entry.check(&path, found.bytes, &found.xxh3)?;
         }
         Ok(())
@@ -155,7 +155,7 @@ impl Manifest {
     }
 }
 
-impl Entry {
+impl ManifestEntry {
     /// Describes the file `name` in `directory`, as it is now.
     fn of(directory: &Path, name: &str) -> Result<Self, CheckpointError> {
         let path = directory.join(name);

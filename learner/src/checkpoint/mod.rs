@@ -32,10 +32,10 @@ use skein_protocol::snapshot::Snapshot;
 use skein_protocol::summary::Trained;
 use skein_protocol::ticket::Exploration;
 
-use crate::episodes::assembly::Keep;
+use crate::episodes::assembly::KeptData;
 use crate::metrics::MetricsState;
 use crate::replay::ReplayState;
-use crate::spent::Spent;
+use crate::spent::RunCosts;
 use crate::state::NamedTensor;
 
 pub use error::CheckpointError;
@@ -46,7 +46,7 @@ pub use writer::CheckpointWriter;
 #[derive(Debug, Clone, PartialEq)]
 pub struct CheckpointState {
     /// Counters and results so far.
-    pub progress: Progress,
+    pub progress: TrainingProgress,
     /// All tensors that updates change, by name.
     pub tensors: Vec<NamedTensor>,
     /// Content of the replay buffer.
@@ -57,7 +57,7 @@ pub struct CheckpointState {
 
 /// Progress of a run: every counter that decides what happens next, and the results so far.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Progress {
+pub struct TrainingProgress {
     /// Training episodes committed; the checkpoint's name.
     pub episodes: u64,
     /// Epochs learned from.
@@ -88,10 +88,10 @@ pub struct Progress {
     /// Averages over the latest episodes, and the lengths of the metrics files.
     pub metrics: MetricsState,
     /// Time and losses so far.
-    pub spent: Spent,
+    pub spent: RunCosts,
 }
 
-impl Progress {
+impl TrainingProgress {
     /// Progress of a run that has not begun; its averages are over `window_episodes` episodes.
     pub fn start(window_episodes: usize) -> Self {
         Self {
@@ -109,7 +109,7 @@ impl Progress {
             best: None,
             trained: None,
             metrics: MetricsState::new(window_episodes),
-            spent: Spent::default(),
+            spent: RunCosts::default(),
         }
     }
 
@@ -129,7 +129,7 @@ pub struct EpochOrder {
     /// Exploration of the episodes.
     pub exploration: Exploration,
     /// Data to keep of the episodes.
-    pub keep: Keep,
+    pub keep: KeptData,
 }
 
 /// The best snapshot and its results.

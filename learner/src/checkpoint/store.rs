@@ -30,7 +30,7 @@ pub struct CheckpointStore {
 
 /// A checkpoint in the folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Place {
+struct StoredCheckpoint {
     episodes: u64,
     path: PathBuf,
 }
@@ -146,7 +146,7 @@ impl CheckpointStore {
 
     /// Lists all checkpoints, the newest first. Of two with one episode, the replacing one comes
     /// first.
-    fn places(&self) -> Result<Vec<Place>, CheckpointError> {
+    fn places(&self) -> Result<Vec<StoredCheckpoint>, CheckpointError> {
         if !self.directory.exists() {
             return Ok(Vec::new());
         }
@@ -167,7 +167,7 @@ impl CheckpointStore {
                     .parse::<u64>()
                     .ok()
             });
-            found.extend(episodes.map(|episodes| Place {
+            found.extend(episodes.map(|episodes| StoredCheckpoint {
                 episodes,
                 path: self.directory.join(&name),
             }));
@@ -188,13 +188,13 @@ impl CheckpointStore {
     /// [`CheckpointError`] names the file that is missing, damaged, or of another version or
     /// configuration.
     pub fn load(&self, episodes: u64) -> Result<CheckpointState, CheckpointError> {
-        self.load_from(&Place {
+        self.load_from(&StoredCheckpoint {
             episodes,
             path: checkpoint_directory(&self.directory, episodes),
         })
     }
 
-    fn load_from(&self, place: &Place) -> Result<CheckpointState, CheckpointError> {
+    fn load_from(&self, place: &StoredCheckpoint) -> Result<CheckpointState, CheckpointError> {
         let manifest = Manifest::read(&place.path)?;
         let config = manifest.read_file(&place.path, files::CONFIG)?;
         if !manifest.is_of(self.config.digest()) {

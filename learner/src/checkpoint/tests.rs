@@ -12,7 +12,7 @@ use skein_protocol::transition::Outcome;
 use super::*;
 use crate::disk::Disk;
 use crate::episode::samples::{episode, with_images};
-use crate::metrics::{EventFile, Windows};
+use crate::metrics::{EpisodeWindows, EventFile};
 use crate::replay::Replay;
 use crate::state::TensorValues;
 
@@ -25,7 +25,7 @@ fn state(episodes: u64) -> CheckpointState {
         episode.level_up[1] = true;
         replay.insert(episode).unwrap();
     }
-    let mut windows = Windows::new(50);
+    let mut windows = EpisodeWindows::new(50);
     windows.walls_passed.push(3.0);
     let odd = vec![
         -0.0,
@@ -41,7 +41,7 @@ fn state(episodes: u64) -> CheckpointState {
         values,
     };
     CheckpointState {
-        progress: Progress {
+        progress: TrainingProgress {
             episodes,
             epochs: 7,
             version: 9,
@@ -53,7 +53,7 @@ fn state(episodes: u64) -> CheckpointState {
                 epoch: 7,
                 policy_version: 6,
                 exploration: Exploration::Sample,
-                keep: Keep::Depth,
+                keep: KeptData::Depth,
             }],
             evaluations: 1,
             evaluation_episodes: 5,
@@ -80,7 +80,7 @@ fn state(episodes: u64) -> CheckpointState {
                 }],
                 windows,
             },
-            spent: Spent::default(),
+            spent: RunCosts::default(),
         },
         snapshots: vec![
             Snapshot {
@@ -290,7 +290,10 @@ fn another_format_is_refused_before_anything_else_is_believed() {
     let error = store.load_newest(|_| Ok(()), |_| {}).unwrap_err();
     let expected = manifest::FORMAT;
     assert!(
-        matches!(error, CheckpointError::Format { found: 9, expected: ours, .. } if ours == expected),
+        matches!(
+            error,
+            CheckpointError::Format { found: 9, expected: ours, .. } if ours == expected
+        ),
         "{error}"
     );
 }

@@ -16,14 +16,14 @@ use crate::disk::Disk;
 #[derive(Debug)]
 pub struct CheckpointWriter {
     store: CheckpointStore,
-    orders: SyncSender<Order>,
+    orders: SyncSender<WriteOrder>,
     /// Ends with the first error; taken when that error is returned.
     thread: Option<JoinHandle<Result<(), CheckpointError>>>,
 }
 
 /// A state to write, and the other files that it relies on.
 #[derive(Debug)]
-struct Order {
+struct WriteOrder {
     state: CheckpointState,
     relied_on: Vec<PathBuf>,
 }
@@ -60,7 +60,7 @@ impl CheckpointWriter {
         relied_on: Vec<PathBuf>,
     ) -> Result<(), CheckpointError> {
         self.orders
-            .send(Order { state, relied_on })
+            .send(WriteOrder { state, relied_on })
             .or_else(|_| self.join().and_then(|()| Err(self.gone())))
     }
 
@@ -89,9 +89,9 @@ impl CheckpointWriter {
 fn write_all(
     store: &CheckpointStore,
     disk: &Disk,
-    orders: &Receiver<Order>,
+    orders: &Receiver<WriteOrder>,
 ) -> Result<(), CheckpointError> {
-    for Order { state, relied_on } in orders {
+    for WriteOrder { state, relied_on } in orders {
         let started = std::time::Instant::now();
         let path = disk.with_room(store.directory(), || store.save(&state, &relied_on))?;
         info!(

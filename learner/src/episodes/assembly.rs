@@ -8,15 +8,15 @@ use skein_protocol::ids::{ActorId, ActorIncarnation, EpisodeId};
 use skein_protocol::transition::{Outcome, RecordFault, RecordKind, TransitionRecord};
 use skein_protocol::{ACTION, IMAGE_PIXELS};
 
-use super::order::Order;
+use super::order::EpisodeOrder;
 use crate::episode::{CommittedEpisode, StepObservation};
 
-pub use super::order::Keep;
+pub use super::order::KeptData;
 
 /// An episode or segment whose records are arriving.
 #[derive(Debug)]
 pub struct Assembly {
-    order: Order,
+    order: EpisodeOrder,
     actor: ActorId,
     incarnation: ActorIncarnation,
     episode: CommittedEpisode,
@@ -51,7 +51,7 @@ impl SegmentEnd {
     }
 
     /// `true` if `order` asks for the segment that comes next.
-    pub fn is_before(&self, order: &Order) -> bool {
+    pub fn is_before(&self, order: &EpisodeOrder) -> bool {
         (self.episode, self.steps) == (order.ticket.episode, order.ticket.first_step() as usize)
     }
 
@@ -90,7 +90,7 @@ impl Assembly {
     /// Starts empty, for `order`. An episode has at most `longest_records` records, with codes of
     /// `latent` numbers. A later segment `begins` at the end of the one before it.
     pub fn new(
-        order: Order,
+        order: EpisodeOrder,
         begins: Option<SegmentEnd>,
         longest_records: usize,
         latent: usize,
@@ -113,12 +113,12 @@ impl Assembly {
     }
 
     /// The order that is being flown.
-    pub fn order(&self) -> &Order {
+    pub fn order(&self) -> &EpisodeOrder {
         &self.order
     }
 
     /// Returns the order; drops what was assembled.
-    pub fn into_order(self) -> Order {
+    pub fn into_order(self) -> EpisodeOrder {
         self.order
     }
 
@@ -325,7 +325,7 @@ impl Assembly {
 }
 
 /// The episode or segment that `order` asks for, before its first record.
-fn nothing_of(order: &Order, actor: ActorId) -> CommittedEpisode {
+fn nothing_of(order: &EpisodeOrder, actor: ActorId) -> CommittedEpisode {
     let ticket = &order.ticket;
     let flown: &[[f32; ACTION]] = ticket
         .segment
@@ -348,7 +348,7 @@ fn nothing_of(order: &Order, actor: ActorId) -> CommittedEpisode {
         walls_passed: 0,
         course_walls: 0,
         hit_wall: None,
-        depth: (order.keep == Keep::Depth).then(Vec::new),
+        depth: (order.keep == KeptData::Depth).then(Vec::new),
     }
 }
 

@@ -5,7 +5,7 @@ use skein_protocol::ids::{Attempt, Epoch, PolicyVersion, RunId};
 use skein_protocol::segment::Segment;
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 
-use super::super::order::Place;
+use super::super::order::BatchPlace;
 use super::*;
 
 const ACTOR: ActorId = ActorId(2);
@@ -29,16 +29,16 @@ fn ticket() -> Ticket {
     }
 }
 
-fn order(ticket: Ticket, keep: Keep) -> Order {
-    Order {
+fn order(ticket: Ticket, keep: KeptData) -> EpisodeOrder {
+    EpisodeOrder {
         ticket,
         epoch: Epoch(0),
         keep,
-        place: Place { batch: 0, index: 0 },
+        place: BatchPlace { batch: 0, index: 0 },
     }
 }
 
-fn assembly(keep: Keep) -> Assembly {
+fn assembly(keep: KeptData) -> Assembly {
     Assembly::new(
         order(ticket(), keep),
         None,
@@ -62,7 +62,7 @@ fn record(step: u32) -> TransitionRecord {
     record
 }
 
-fn assemble(keep: Keep) -> CommittedEpisode {
+fn assemble(keep: KeptData) -> CommittedEpisode {
     let mut assembly = assembly(keep);
     for step in 0..STEPS {
         assert!(matches!(assembly.push(&record(step)), Ok(Assembled::Step)));
@@ -76,7 +76,7 @@ fn assemble(keep: Keep) -> CommittedEpisode {
 #[test]
 fn no_episode_mixes_policy_versions() {
     for strange in 1..=STEPS {
-        let mut assembly = assembly(Keep::Latents);
+        let mut assembly = assembly(KeptData::Latents);
         for step in 0..strange {
             assembly.push(&record(step)).unwrap();
         }
@@ -93,12 +93,12 @@ fn no_episode_mixes_policy_versions() {
             }
         );
     }
-    assert_eq!(assemble(Keep::Latents).policy_version, PolicyVersion(3));
+    assert_eq!(assemble(KeptData::Latents).policy_version, PolicyVersion(3));
 }
 
 #[test]
 fn a_code_that_is_longer_than_configured_is_refused() {
-    let mut assembly = assembly(Keep::Latents);
+    let mut assembly = assembly(KeptData::Latents);
     let mut longer = record(0);
     longer.latent[..LATENT].fill(0.5);
     assembly.push(&longer).unwrap();
@@ -110,7 +110,7 @@ fn a_code_that_is_longer_than_configured_is_refused() {
 
 #[test]
 fn an_episode_that_never_ends_is_refused_at_its_limit() {
-    let mut assembly = assembly(Keep::Depth);
+    let mut assembly = assembly(KeptData::Depth);
     let onward = |step| {
         let mut record = record(step);
         record.kind = RecordKind::Step.code();
@@ -141,7 +141,7 @@ fn segment(begins: Option<SegmentEnd>) -> Assembly {
         ..ticket()
     };
     Assembly::new(
-        order(ticket, Keep::Depth),
+        order(ticket, KeptData::Depth),
         begins,
         100,
         LATENT,
@@ -221,7 +221,9 @@ fn a_segment_that_is_too_short_or_too_long_or_of_a_whole_episode_is_refused() {
     );
     assert!(refusal(&[onward(0)], segment(None)).contains("step is 0 where 1"));
     assert!(refusal(&[segment_end(1)], segment(None)).contains("before its last step"));
-    assert!(refusal(&[onward(0), segment_end(1)], assembly(Keep::Latents)).contains("flown whole"));
+    assert!(
+        refusal(&[onward(0), segment_end(1)], assembly(KeptData::Latents)).contains("flown whole")
+    );
     let end = |change: fn(&mut TransitionRecord)| {
         refusal(
             &[onward(1), changed(onward(2), change), segment_end(3)],
@@ -277,8 +279,8 @@ fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passe
 
 #[test]
 fn depth_images_are_copied_only_if_ordered() {
-    assert_eq!(assemble(Keep::Latents).depth, None);
-    let kept = assemble(Keep::Depth).depth.unwrap();
+    assert_eq!(assemble(KeptData::Latents).depth, None);
+    let kept = assemble(KeptData::Depth).depth.unwrap();
     let images: Vec<_> = kept
         .chunks_exact(IMAGE_PIXELS)
         .map(|image| image.to_vec())
@@ -332,7 +334,7 @@ fn an_episode_that_contradicts_itself_is_refused() {
         ),
     ];
     for (step, change, expected) in cases {
-        let mut assembly = assembly(Keep::Latents);
+        let mut assembly = assembly(KeptData::Latents);
         let fault = (0..=STEPS).find_map(|at| {
             let mut record = record(at);
             record.course_walls = 5;
@@ -352,7 +354,7 @@ fn an_episode_that_contradicts_itself_is_refused() {
 #[test]
 fn a_committed_episode_names_the_wall_that_was_hit() {
     for (hit_wall, expected) in [(0, None), (1, Some(1))] {
-        let mut assembly = assembly(Keep::Latents);
+        let mut assembly = assembly(KeptData::Latents);
         let mut last = record(0);
         last.terminated = 1;
         assembly.push(&last).unwrap();
@@ -370,7 +372,7 @@ fn a_committed_episode_names_the_wall_that_was_hit() {
 #[test]
 fn the_end_wall_is_reached_by_a_level_up_that_passes_no_wall() {
     for (level_up, is_refused) in [(1, false), (0, true)] {
-        let mut assembly = assembly(Keep::Latents);
+        let mut assembly = assembly(KeptData::Latents);
         let mut last = record(0);
         (last.terminated, last.level_up) = (1, level_up);
         assembly.push(&last).unwrap();

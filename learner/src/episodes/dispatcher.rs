@@ -20,13 +20,13 @@ use skein_protocol::ticket::{ControlRecord, Message, Ticket};
 use skein_protocol::transition::{RecordFault, TransitionRecord};
 
 use super::assembly::{Assembled, Assembly, SegmentEnd};
-use super::failures::Failures;
+use super::failures::EpisodeFailures;
 use super::faults::{Faults, Refusal, Reissue};
 use super::situation::{EpisodeOut, Situation};
 use crate::episode::CommittedEpisode;
 
 pub use super::failures::HopelessEpisode;
-pub use super::order::{Order, Place};
+pub use super::order::{BatchPlace, EpisodeOrder};
 
 /// Number of episodes an actor may spoil in a row before other actors are preferred to it.
 const MOST_SPOILED: u32 = 3;
@@ -39,9 +39,9 @@ pub struct Dispatcher {
     /// Length of the latent codes that actors send.
     latent: usize,
     /// Orders without an actor, in the order to fly them.
-    waiting: VecDeque<Order>,
-    actors: BTreeMap<ActorId, Actor>,
-    failures: Failures,
+    waiting: VecDeque<EpisodeOrder>,
+    actors: BTreeMap<ActorId, AttachedActor>,
+    failures: EpisodeFailures,
     faults: Faults,
     /// Time by stage of actors that are gone.
     times_of_departed: Times,
@@ -54,11 +54,11 @@ pub struct Dispatcher {
 }
 
 #[derive(Debug)]
-struct Actor {
+struct AttachedActor {
     incarnation: ActorIncarnation,
     last_sign: Instant,
     /// Tickets that it holds, in the order it flies them.
-    tickets: VecDeque<Issued>,
+    tickets: VecDeque<IssuedTicket>,
     /// Number of episodes it has spoiled since the last one committed.
     spoiled: u32,
     /// Its time by stage when first heard. An actor taken for dead by mistake is thus not counted
@@ -70,7 +70,7 @@ struct Actor {
     may_wait: bool,
 }
 
-impl Actor {
+impl AttachedActor {
     fn times_since_first_heard(&self) -> Times {
         self.times.since(&self.first_times)
     }
@@ -81,7 +81,7 @@ impl Actor {
 }
 
 #[derive(Debug)]
-struct Issued {
+struct IssuedTicket {
     since: Instant,
     assembly: Assembly,
     /// `true` if no heartbeat has come since the ticket was issued. A record for such a ticket
@@ -89,7 +89,7 @@ struct Issued {
     no_heartbeat_since: bool,
 }
 
-impl Issued {
+impl IssuedTicket {
     fn ticket(&self) -> &Ticket {
         &self.assembly.order().ticket
     }
@@ -104,7 +104,7 @@ impl Dispatcher {
             latent,
             waiting: VecDeque::new(),
             actors: BTreeMap::new(),
-            failures: Failures::default(),
+            failures: EpisodeFailures::default(),
             faults: Faults::default(),
             times_of_departed: Times::default(),
             control_messages: Vec::new(),
@@ -125,7 +125,10 @@ impl Dispatcher {
 
     /// Time by stage of all actors, as last reported.
     pub fn actor_times(&self) -> Times {
-        let living = self.actors.values().map(Actor::times_since_first_heard);
+        let living = self
+            .actors
+            .values()
+            .map(AttachedActor::times_since_first_heard);
         living.fold(self.times_of_departed, |sum, times| sum.plus(&times))
     }
 
@@ -166,7 +169,7 @@ impl Dispatcher {
     }
 
     /// Takes an order; it is flown after those taken before.
-    pub fn order(&mut self, order: Order) {
+    pub fn order(&mut self, order: EpisodeOrder) {
         self.waiting.push_back(order);
     }
 
@@ -207,7 +210,7 @@ impl Dispatcher {
                 self.failures.heard(status.actor, now);
                 let actor = self.actors.entry(status.actor).or_insert_with(|| {
                     tracing::info!(actor = %status.actor, pid = status.pid, "actor attached");
-                    Actor {
+                    AttachedActor {
                         incarnation: status.incarnation,
                         last_sign: now,
                         tickets: VecDeque::new(),
@@ -237,7 +240,7 @@ impl Dispatcher {
         &mut self,
         record: &TransitionRecord,
         now: Instant,
-    ) -> Result<Option<(Place, CommittedEpisode)>, HopelessEpisode> {
+    ) -> Result<Option<(BatchPlace, CommittedEpisode)>, HopelessEpisode> {
         let id = ActorId(record.actor);
         let Some(actor) = self
             .actors
@@ -248,7 +251,7 @@ impl Dispatcher {
             return Ok(None);
         };
         actor.last_sign = now;
-        let is_of = |issued: &Issued| {
+        let is_of = |issued: &IssuedTicket| {
             issued.ticket().episode.0 == record.episode
                 && issued.ticket().attempt.0 == record.attempt
         };
@@ -274,7 +277,7 @@ impl Dispatcher {
         id: ActorId,
         record: &TransitionRecord,
         now: Instant,
-    ) -> Result<Option<(Place, CommittedEpisode)>, HopelessEpisode> {
+    ) -> Result<Option<(BatchPlace, CommittedEpisode)>, HopelessEpisode> {
         let Some(issued) = self
             .actors
             .get_mut(&id)
@@ -392,7 +395,7 @@ impl Dispatcher {
         let mut messages = std::mem::take(&mut self.control_messages);
         self.is_wake_due |= !messages.is_empty();
         let credit = self.limits.tickets_per_actor;
-        let any_trusted = self.actors.values().any(Actor::is_trusted);
+        let any_trusted = self.actors.values().any(AttachedActor::is_trusted);
         while !self.waiting.is_empty() {
             let with_credit = self.actors.iter_mut().filter(|(_, actor)| {
                 actor.tickets.len() < credit && (actor.is_trusted() || !any_trusted)
@@ -410,7 +413,7 @@ impl Dispatcher {
             let assembly =
                 Assembly::new(order, begins, longest, self.latent, id, actor.incarnation);
             self.is_wake_due |= actor.may_wait || actor.tickets.is_empty();
-            actor.tickets.push_back(Issued {
+            actor.tickets.push_back(IssuedTicket {
                 since: now,
                 assembly,
                 no_heartbeat_since: true,
@@ -482,7 +485,7 @@ impl Dispatcher {
         }
     }
 
-    fn reissue(&mut self, issued: Issued, id: ActorId, why: Reissue) {
+    fn reissue(&mut self, issued: IssuedTicket, id: ActorId, why: Reissue) {
         let mut order = issued.assembly.into_order();
         if self.is_worth_logging(id) {
             tracing::warn!(

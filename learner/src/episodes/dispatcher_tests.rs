@@ -10,7 +10,7 @@ use skein_protocol::stages::Stage;
 use skein_protocol::ticket::{Control, CourseChoice, Exploration};
 use skein_protocol::transition::{Outcome, RecordKind};
 
-use super::super::assembly::Keep;
+use super::super::assembly::KeptData;
 use super::super::failures;
 use super::*;
 
@@ -26,7 +26,7 @@ pub(super) fn limits() -> TransportSection {
     }
 }
 
-pub(super) fn order(episode: u64) -> Order {
+pub(super) fn order(episode: u64) -> EpisodeOrder {
     let ticket = Ticket {
         run: RUN,
         episode: EpisodeId(episode),
@@ -38,11 +38,11 @@ pub(super) fn order(episode: u64) -> Order {
         seed: episode,
         segment: None,
     };
-    Order {
+    EpisodeOrder {
         ticket,
         epoch: Epoch(0),
-        keep: Keep::Latents,
-        place: Place {
+        keep: KeptData::Latents,
+        place: BatchPlace {
             batch: 0,
             index: episode as usize,
         },
@@ -132,7 +132,7 @@ pub(super) fn feed(
     dispatcher: &mut Dispatcher,
     records: &[TransitionRecord],
     now: Instant,
-) -> Vec<(Place, CommittedEpisode)> {
+) -> Vec<(BatchPlace, CommittedEpisode)> {
     records
         .iter()
         .filter_map(|record| dispatcher.on_record(record, now).unwrap())
@@ -409,9 +409,9 @@ fn actors_beyond_the_limit_get_no_tickets_until_there_is_room() {
     );
 }
 
-/// Possible next events of one of three actors.
+/// Possible next mishaps of one of three actors.
 #[derive(Debug, Clone, Copy)]
-enum Event {
+enum Mishap {
     FlyNext,
     LoseRecord(usize),
     RepeatRecord(usize),
@@ -422,16 +422,16 @@ enum Event {
     Silence,
 }
 
-fn event() -> impl Strategy<Value = (u32, Event)> {
+fn mishap() -> impl Strategy<Value = (u32, Mishap)> {
     let kind = prop_oneof![
-        8 => Just(Event::FlyNext),
-        1 => (0..4_usize).prop_map(Event::LoseRecord),
-        1 => (0..4_usize).prop_map(Event::RepeatRecord),
-        1 => (0..4_usize).prop_map(Event::Poison),
-        1 => Just(Event::DieMidway),
-        1 => Just(Event::SkipTicket),
-        1 => Just(Event::Restart),
-        1 => Just(Event::Silence),
+        8 => Just(Mishap::FlyNext),
+        1 => (0..4_usize).prop_map(Mishap::LoseRecord),
+        1 => (0..4_usize).prop_map(Mishap::RepeatRecord),
+        1 => (0..4_usize).prop_map(Mishap::Poison),
+        1 => Just(Mishap::DieMidway),
+        1 => Just(Mishap::SkipTicket),
+        1 => Just(Mishap::Restart),
+        1 => Just(Mishap::Silence),
     ];
     (0..3_u32, kind)
 }
@@ -439,7 +439,9 @@ fn event() -> impl Strategy<Value = (u32, Event)> {
 proptest! {
     /// Arbitrary mishaps followed by quiet: the promise still holds.
     #[test]
-    fn every_order_is_committed_exactly_once_and_whole(events in prop::collection::vec(event(), 0..60)) {
+    fn every_order_is_committed_exactly_once_and_whole(
+        mishaps in prop::collection::vec(mishap(), 0..60),
+    ) {
         const ORDERS: u64 = 12;
         let mut now = Instant::now();
         let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
@@ -449,9 +451,9 @@ proptest! {
         let mut committed: BTreeMap<u64, CommittedEpisode> = BTreeMap::new();
         // At `MOST_FAILURES` the episode would be given up, which another test covers.
         let mut poisonings: BTreeMap<EpisodeId, usize> = BTreeMap::new();
-        let calm = (0..3 * ORDERS as usize).map(|turn| ((turn % 3) as u32, Event::FlyNext));
-        let quiet = calm.clone().chain([(0, Event::Silence)]).chain(calm);
-        for (actor, event) in events.into_iter().chain(quiet) {
+        let calm = (0..3 * ORDERS as usize).map(|turn| ((turn % 3) as u32, Mishap::FlyNext));
+        let quiet = calm.clone().chain([(0, Mishap::Silence)]).chain(calm);
+        for (actor, mishap) in mishaps.into_iter().chain(quiet) {
             now += Duration::from_millis(100);
             let index = actor as usize;
             for (other, incarnation) in (0..3).zip(incarnations) {
@@ -462,29 +464,31 @@ proptest! {
                 held[other].extend(tickets_for(&messages, other as u32, incarnations[other]));
             }
             let next = held[index].front().cloned();
-            let mut sent = next.map(|ticket| records(&ticket, actor, incarnations[index])).unwrap_or_default();
+            let mut sent = next
+                .map(|ticket| records(&ticket, actor, incarnations[index]))
+                .unwrap_or_default();
             let (mut forget, mut restart) = (true, false);
-            match event {
-                Event::FlyNext => {}
-                Event::LoseRecord(at) if at < sent.len() => drop(sent.remove(at)),
-                Event::RepeatRecord(at) if at < sent.len() => sent.insert(at, sent[at]),
-                Event::Poison(at) if at < sent.len() => {
+            match mishap {
+                Mishap::FlyNext => {}
+                Mishap::LoseRecord(at) if at < sent.len() => drop(sent.remove(at)),
+                Mishap::RepeatRecord(at) if at < sent.len() => sent.insert(at, sent[at]),
+                Mishap::Poison(at) if at < sent.len() => {
                     let poisoned = poisonings.entry(EpisodeId(sent[at].episode)).or_default();
                     *poisoned += 1;
                     if *poisoned < failures::MOST_FAILURES {
                         sent[at].reward = f32::NAN;
                     }
                 }
-                Event::DieMidway => {
+                Mishap::DieMidway => {
                     sent.truncate(1);
                     restart = true;
                 }
-                Event::SkipTicket => sent.clear(),
-                Event::Restart => {
+                Mishap::SkipTicket => sent.clear(),
+                Mishap::Restart => {
                     sent.clear();
                     restart = true;
                 }
-                Event::Silence => {
+                Mishap::Silence => {
                     sent.clear();
                     forget = false;
                     now += Duration::from_secs(6);
@@ -497,7 +501,8 @@ proptest! {
                 prop_assert_eq!(place.index as u64, episode.episode.0);
                 prop_assert!(episode.check().is_ok());
                 prop_assert_eq!(episode.steps() as u64, 2 + episode.episode.0 % 3);
-                prop_assert!(committed.insert(episode.episode.0, episode).is_none(), "committed twice");
+                let earlier = committed.insert(episode.episode.0, episode);
+                prop_assert!(earlier.is_none(), "committed twice");
             }
             if forget {
                 held[index].pop_front();

@@ -33,7 +33,7 @@ pub struct HopelessEpisode {
 
 /// Failed episodes, and actors that could fly them.
 #[derive(Debug, Default)]
-pub(super) struct Failures {
+pub(super) struct EpisodeFailures {
     by_episode: BTreeMap<EpisodeId, Failure>,
     /// Time of the last heartbeat, for actors that may come back.
     heard: BTreeMap<ActorId, Instant>,
@@ -46,7 +46,7 @@ struct Failure {
     by_others: bool,
 }
 
-impl Failures {
+impl EpisodeFailures {
     /// Records an actor's heartbeat.
     pub(super) fn heard(&mut self, actor: ActorId, now: Instant) {
         self.heard.insert(actor, now);

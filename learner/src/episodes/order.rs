@@ -6,20 +6,20 @@ use skein_protocol::ticket::Ticket;
 
 /// An episode to fly, or a segment of one.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Order {
+pub struct EpisodeOrder {
     /// Ticket to fly.
     pub ticket: Ticket,
     /// Epoch that the episode belongs to.
     pub epoch: Epoch,
     /// Data to keep of the episode.
-    pub keep: Keep,
+    pub keep: KeptData,
     /// Batch that waits for the episode, and its position there.
-    pub place: Place,
+    pub place: BatchPlace,
 }
 
 /// Data that the learner keeps of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Keep {
+pub enum KeptData {
     /// Latent codes and telemetry only.
     Latents,
     /// Depth images too, copied once out of shared memory.
@@ -28,7 +28,7 @@ pub enum Keep {
 
 /// Position in a batch of episodes ordered together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Place {
+pub struct BatchPlace {
     /// Number of the batch.
     pub batch: u64,
     /// Index of the episode in the batch.

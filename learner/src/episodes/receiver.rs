@@ -21,7 +21,7 @@ use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::Times;
 use skein_protocol::ticket::Ticket;
 
-use super::assembly::Keep;
+use super::assembly::KeptData;
 use super::dispatcher::{Dispatcher, HopelessEpisode};
 use super::faults::Faults;
 use super::server::Server;
@@ -59,7 +59,7 @@ pub struct Shared {
 
 /// Episodes ordered together, taken out in order.
 #[derive(Debug)]
-pub struct Batch {
+pub struct EpisodeBatch {
     episodes: Receiver<CommittedEpisode>,
     remaining: usize,
     shared: Arc<Shared>,
@@ -93,7 +93,7 @@ pub(super) enum Command {
     Fly {
         batch: u64,
         epoch: Epoch,
-        keep: Keep,
+        keep: KeptData,
         tickets: Vec<Ticket>,
         deliver: Sender<CommittedEpisode>,
     },
@@ -165,9 +165,9 @@ impl EpisodeReceiver {
     pub fn fly(
         &mut self,
         epoch: Epoch,
-        keep: Keep,
+        keep: KeptData,
         tickets: Vec<Ticket>,
-    ) -> Result<Batch, ReceiverError> {
+    ) -> Result<EpisodeBatch, ReceiverError> {
         let (deliver, episodes) = mpsc::channel();
         let remaining = tickets.len();
         let batch = self.next_batch;
@@ -179,7 +179,7 @@ impl EpisodeReceiver {
             tickets,
             deliver,
         })?;
-        Ok(Batch {
+        Ok(EpisodeBatch {
             episodes,
             remaining,
             shared: self.shared.clone(),
@@ -291,7 +291,7 @@ impl Shared {
     }
 }
 
-impl Batch {
+impl EpisodeBatch {
     /// Number of episodes that were not taken out yet.
     pub fn remaining(&self) -> usize {
         self.remaining

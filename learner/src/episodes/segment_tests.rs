@@ -10,7 +10,7 @@ use super::tests::{INCARNATION, RUN, attach, feed, limits, order, records, ticke
 use super::*;
 
 /// Order of the one-step segment of episode 0 that follows `flown` steps.
-fn segment(flown: usize) -> Order {
+fn segment(flown: usize) -> EpisodeOrder {
     let mut order = order(0);
     order.ticket.segment = Some(Segment {
         steps: 1,

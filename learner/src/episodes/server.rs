@@ -21,7 +21,7 @@ use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::{ControlRecord, Message};
 
-use super::dispatcher::{Dispatcher, HopelessEpisode, Order, Place};
+use super::dispatcher::{BatchPlace, Dispatcher, EpisodeOrder, HopelessEpisode};
 use super::receiver::{Command, ReceiverError, Shared};
 use crate::episode::CommittedEpisode;
 
@@ -63,7 +63,7 @@ enum Outgoing {
 
 /// Request of the training thread, besides its commands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Wish {
+enum Request {
     /// Continue.
     Serve,
     /// Tell the actors to leave, and end.
@@ -109,12 +109,12 @@ impl Server {
     ) -> Result<(), ReceiverError> {
         loop {
             match self.take_commands(inbox) {
-                Wish::Serve => {}
-                Wish::Finish => {
+                Request::Serve => {}
+                Request::Finish => {
                     self.say_stop();
                     return Ok(());
                 }
-                Wish::Vanish => return Ok(()),
+                Request::Vanish => return Ok(()),
             }
             let now = Instant::now();
             self.take_status(now, shared);
@@ -137,7 +137,7 @@ impl Server {
     }
 
     /// Executes the training thread's commands; returns its final request.
-    fn take_commands(&mut self, inbox: &Receiver<Command>) -> Wish {
+    fn take_commands(&mut self, inbox: &Receiver<Command>) -> Request {
         loop {
             match inbox.try_recv() {
                 Ok(Command::Publish(snapshot)) => {
@@ -158,17 +158,17 @@ impl Server {
                     };
                     self.deliveries.insert(batch, delivery);
                     for (index, ticket) in tickets.into_iter().enumerate() {
-                        self.dispatcher.order(Order {
+                        self.dispatcher.order(EpisodeOrder {
                             ticket,
                             epoch,
                             keep,
-                            place: Place { batch, index },
+                            place: BatchPlace { batch, index },
                         });
                     }
                 }
-                Ok(Command::Finish) => return Wish::Finish,
-                Err(TryRecvError::Disconnected) => return Wish::Vanish,
-                Err(TryRecvError::Empty) => return Wish::Serve,
+                Ok(Command::Finish) => return Request::Finish,
+                Err(TryRecvError::Disconnected) => return Request::Vanish,
+                Err(TryRecvError::Empty) => return Request::Serve,
             }
         }
     }
@@ -189,7 +189,7 @@ impl Server {
             }
         }
         if heard {
-            self.tell_times(shared);
+            self.share_times(shared);
         }
         if anyone_empty_handed {
             // Not only at the next heartbeat: a new actor cannot fly before it has a snapshot.
@@ -198,7 +198,7 @@ impl Server {
         }
     }
 
-    fn tell_times(&self, shared: &Shared) {
+    fn share_times(&self, shared: &Shared) {
         shared.update_times(self.dispatcher.actor_times().plus(self.timer.times()));
     }
 
@@ -230,7 +230,7 @@ impl Server {
     }
 
     /// Delivers the next episodes of the batch, and keeps early ones.
-    fn deliver(&mut self, place: Place, episode: CommittedEpisode) {
+    fn deliver(&mut self, place: BatchPlace, episode: CommittedEpisode) {
         let Some(delivery) = self.deliveries.get_mut(&place.batch) else {
             return;
         };
@@ -286,7 +286,7 @@ impl Server {
         }
         self.last_heartbeat = Some(now);
         shared.update_situation(self.dispatcher.situation(now), now);
-        self.tell_times(shared);
+        self.share_times(shared);
         self.trouble.unless(self.ports.maintain());
         let heartbeat = ControlRecord::heartbeat(self.run);
         self.trouble.unless(self.ports.send_control(heartbeat));

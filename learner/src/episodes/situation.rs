@@ -92,12 +92,12 @@ mod tests {
              episode 7 with actor 3 for 31 s, 12 records, the actor heard 0.3 s ago"
         ));
         assert!(text.ends_with("; and 1 more"), "{text}");
-        let nobody = Situation {
+        let no_actor = Situation {
             waiting: 5,
             ..Situation::default()
         };
         assert_eq!(
-            nobody.to_string(),
+            no_actor.to_string(),
             "no actor is attached; episodes that wait for one: 5"
         );
     }

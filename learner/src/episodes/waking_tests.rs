@@ -60,7 +60,7 @@ fn an_actor_that_is_asked_to_rejoin_is_woken() {
 
 /// State of an actor between two looks for tickets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-enum Stage {
+enum LookState {
     #[default]
     Looks,
     FoundNothing,
@@ -70,8 +70,8 @@ enum Stage {
 /// An actor that looks for tickets before each episode. Without a ticket, it sends a heartbeat and
 /// waits.
 #[derive(Default)]
-struct Actor {
-    stage: Stage,
+struct SimulatedActor {
+    stage: LookState,
     tickets: VecDeque<Ticket>,
     /// Stays set until the actor looks.
     is_called: bool,
@@ -80,17 +80,21 @@ struct Actor {
     sent: VecDeque<TransitionRecord>,
 }
 
-struct World {
+struct Simulation {
     dispatcher: Dispatcher,
-    actors: Vec<Actor>,
+    actors: Vec<SimulatedActor>,
     now: Instant,
 }
 
-impl World {
+impl Simulation {
     fn new(episodes: u64) -> Self {
         let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
         (0..episodes).for_each(|episode| dispatcher.order(order(episode)));
-        let mut actors = vec![Actor::default(), Actor::default(), Actor::default()];
+        let mut actors = vec![
+            SimulatedActor::default(),
+            SimulatedActor::default(),
+            SimulatedActor::default(),
+        ];
         actors.iter_mut().for_each(|actor| actor.heartbeats = 1);
         Self {
             dispatcher,
@@ -100,29 +104,29 @@ impl World {
     }
 
     /// Lets actor `id` do its next action; returns `true` if there was one.
-    fn actor_goes_on(&mut self, id: usize) -> bool {
+    fn actor_acts(&mut self, id: usize) -> bool {
         let actor = &mut self.actors[id];
         actor.stage = match actor.stage {
-            Stage::Looks => match actor.tickets.pop_front() {
+            LookState::Looks => match actor.tickets.pop_front() {
                 Some(ticket) => {
                     actor.sent.extend(records(&ticket, id as u32, INCARNATION));
-                    Stage::Looks
+                    LookState::Looks
                 }
-                None => Stage::FoundNothing,
+                None => LookState::FoundNothing,
             },
-            Stage::FoundNothing => {
+            LookState::FoundNothing => {
                 actor.heartbeats += 1;
-                Stage::Waits
+                LookState::Waits
             }
-            Stage::Waits if std::mem::take(&mut actor.is_called) => Stage::Looks,
-            Stage::Waits => return false,
+            LookState::Waits if std::mem::take(&mut actor.is_called) => LookState::Looks,
+            LookState::Waits => return false,
         };
         true
     }
 
     /// Lets the learner do a round, which takes in at most `most` records per actor; returns `true`
     /// if anything arrived.
-    fn learner_goes_on(&mut self, most: usize) -> bool {
+    fn learner_acts(&mut self, most: usize) -> bool {
         let mut has_heard = false;
         for (id, actor) in self.actors.iter_mut().enumerate() {
             for _ in 0..std::mem::take(&mut actor.heartbeats) {
@@ -161,22 +165,25 @@ impl World {
 
 proptest! {
     #[test]
-    fn no_actor_sleeps_through_a_ticket(steps in prop::collection::vec((0..4_usize, 0..9_usize), 0..300)) {
-        let mut world = World::new(60);
+    fn no_actor_sleeps_through_a_ticket(
+        steps in prop::collection::vec((0..4_usize, 0..9_usize), 0..300),
+    ) {
+        let mut simulation = Simulation::new(60);
         for (who, most) in steps {
-            if who < world.actors.len() {
-                world.actor_goes_on(who);
+            if who < simulation.actors.len() {
+                simulation.actor_acts(who);
             } else {
-                world.learner_goes_on(most);
+                simulation.learner_acts(most);
             }
         }
         // To the end; an actor that waits without being woken stays where it is.
         loop {
-            let actors = (0..world.actors.len()).filter(|&id| world.actor_goes_on(id)).count();
-            if actors == 0 && !world.learner_goes_on(usize::MAX) {
+            let ids = 0..simulation.actors.len();
+            let actors = ids.filter(|&id| simulation.actor_acts(id)).count();
+            if actors == 0 && !simulation.learner_acts(usize::MAX) {
                 break;
             }
         }
-        prop_assert_eq!(world.dispatcher.open_orders(), 0);
+        prop_assert_eq!(simulation.dispatcher.open_orders(), 0);
     }
 }

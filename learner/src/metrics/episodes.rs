@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use skein_protocol::transition::Outcome;
 use xxhash_rust::xxh3::Xxh3Default;
 
-use crate::disk::{Disk, Patient};
+use crate::disk::{Disk, PatientWriter};
 use crate::episode::CommittedEpisode;
 
 /// A row of `episodes.csv`; the fields are its columns.
@@ -97,7 +97,7 @@ impl EpisodesExtent {
         if self.bytes == 0 {
             return Ok(());
         }
-        let found = match File::open(path).and_then(|file| summed(file, self.bytes)) {
+        let found = match File::open(path).and_then(|file| checksum_of(file, self.bytes)) {
             Ok((bytes, _)) if bytes < self.bytes => {
                 Err(format!("ends after {bytes} bytes of {}", self.bytes))
             }
@@ -126,20 +126,20 @@ impl EpisodesExtent {
 }
 
 /// Reads at most `bytes` bytes of `file` from its position; returns their number and checksum.
-fn summed(file: impl Read, bytes: u64) -> io::Result<(u64, Xxh3Default)> {
+fn checksum_of(file: impl Read, bytes: u64) -> io::Result<(u64, Xxh3Default)> {
     let mut sum = Xxh3Default::new();
     let read = io::copy(&mut file.take(bytes), &mut sum)?;
     Ok((read, sum))
 }
 
 /// A writer that keeps a checksum of everything in the file.
-struct Summed<W> {
+struct Checksummed<W> {
     inner: W,
     bytes: u64,
     sum: Xxh3Default,
 }
 
-impl<W> Summed<W> {
+impl<W> Checksummed<W> {
     fn extent(&self) -> EpisodesExtent {
         EpisodesExtent {
             bytes: self.bytes,
@@ -148,7 +148,7 @@ impl<W> Summed<W> {
     }
 }
 
-impl<W: Write> Write for Summed<W> {
+impl<W: Write> Write for Checksummed<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let taken = self.inner.write(bytes)?;
         self.sum.update(&bytes[..taken]);
@@ -161,7 +161,7 @@ impl<W: Write> Write for Summed<W> {
     }
 }
 
-impl<W> std::fmt::Debug for Summed<W> {
+impl<W> std::fmt::Debug for Checksummed<W> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         self.extent().fmt(f)
     }
@@ -171,7 +171,7 @@ impl<W> std::fmt::Debug for Summed<W> {
 #[derive(Debug)]
 pub struct EpisodesCsv {
     path: PathBuf,
-    writer: csv::Writer<Summed<Patient<File>>>,
+    writer: csv::Writer<Checksummed<PatientWriter<File>>>,
 }
 
 /// Reason why `episodes.csv` cannot be written or continued.
@@ -232,7 +232,7 @@ impl EpisodesCsv {
         })?;
         Ok(Self {
             path: path.to_owned(),
-            writer: csv::Writer::from_writer(Summed {
+            writer: csv::Writer::from_writer(Checksummed {
                 inner: disk.patient(path, file),
                 bytes: 0,
                 sum: Xxh3Default::new(),
@@ -262,11 +262,11 @@ impl EpisodesCsv {
         file.set_len(end).map_err(io)?;
         end_line(&mut file).map_err(io)?;
         file.rewind().map_err(io)?;
-        let (bytes, sum) = summed(&file, u64::MAX).map_err(io)?;
+        let (bytes, sum) = checksum_of(&file, u64::MAX).map_err(io)?;
         let inner = disk.patient(path, file);
         let writer = csv::WriterBuilder::new()
             .has_headers(false)
-            .from_writer(Summed { inner, bytes, sum });
+            .from_writer(Checksummed { inner, bytes, sum });
         Ok(Self {
             path: path.to_owned(),
             writer,
@@ -377,7 +377,8 @@ mod tests {
         write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..1);
         assert_eq!(
             fs::read_to_string(&path).unwrap(),
-            "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n0,0,0,0,1,3,0,0.03,reached_end\n"
+            "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
+             0,0,0,0,1,3,0,0.03,reached_end\n"
         );
     }
 
@@ -391,7 +392,8 @@ mod tests {
             let mut csv = EpisodesCsv::create(&path, &disk()).unwrap();
             csv.write(&EpisodeRow { total_reward: value, ..row(0) }).unwrap();
             csv.flush().unwrap();
-            let read: EpisodeRow = csv::Reader::from_path(&path).unwrap().deserialize().next().unwrap().unwrap();
+            let mut reader = csv::Reader::from_path(&path).unwrap();
+            let read: EpisodeRow = reader.deserialize().next().unwrap().unwrap();
             prop_assert_eq!(read.total_reward.to_bits(), bits);
         }
     }

@@ -16,7 +16,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use prost::Message;
 use serde::{Deserialize, Serialize};
 
-use crate::disk::{Disk, Patient};
+use crate::disk::{Disk, PatientWriter};
 use crate::report::notify_user;
 
 /// Start of our files' names, before the second of their creation. TensorBoard reads files whose
@@ -29,7 +29,7 @@ pub struct EventWriter {
     /// Files of earlier incarnations, then the present one.
     files: Vec<EventFile>,
     path: PathBuf,
-    file: BufWriter<Patient<File>>,
+    file: BufWriter<PatientWriter<File>>,
 }
 
 /// An event file, as far as it belongs to the run.
@@ -72,7 +72,7 @@ impl EventWriter {
         fs::create_dir_all(directory).map_err(at(directory.to_owned()))?;
         let (files, others): (Vec<_>, Vec<_>) = files
             .into_iter()
-            .partition(|file| Begun::of(&file.name).is_some());
+            .partition(|file| CreationStamp::of(&file.name).is_some());
         // A damaged list may name other files; those are not cut.
         for EventFile { name, .. } in others {
             tracing::warn!(name, "not the name of one of our event files: left alone");
@@ -155,20 +155,20 @@ impl EventWriter {
 /// Creates a file in `directory` whose name sorts after the one created at `latest`, even if the
 /// clock has gone back. TensorBoard reads files in alphabetical order. The number distinguishes
 /// files created within one second.
-fn begin(directory: &Path, latest: Option<Begun>) -> (PathBuf, io::Result<File>) {
+fn begin(directory: &Path, latest: Option<CreationStamp>) -> (PathBuf, io::Result<File>) {
     let now = now_secs() as u64;
     let first = match latest {
-        Some(latest) if latest.second >= now => Begun {
+        Some(latest) if latest.second >= now => CreationStamp {
             number: latest.number.saturating_add(1),
             ..latest
         },
-        _ => Begun {
+        _ => CreationStamp {
             second: now,
             number: 0,
         },
     };
     (first.number..first.number.saturating_add(1000))
-        .map(|number| directory.join(Begun { number, ..first }.name()))
+        .map(|number| directory.join(CreationStamp { number, ..first }.name()))
         .find_map(|path| match File::create_new(&path) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => None,
             result => Some((path, result)),
@@ -183,12 +183,12 @@ fn begin(directory: &Path, latest: Option<Begun>) -> (PathBuf, io::Result<File>)
 
 /// Creation time of one of our event files, as in its name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-struct Begun {
+struct CreationStamp {
     second: u64,
     number: u32,
 }
 
-impl Begun {
+impl CreationStamp {
     fn name(self) -> String {
         format!("{NAME}{}.skein.{:06}", self.second, self.number)
     }
@@ -205,7 +205,7 @@ impl Begun {
 
 /// Cuts our files in `directory` back to `files` and removes all others of ours. Returns the
 /// creation time of the latest of `files`.
-fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, EventError> {
+fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<CreationStamp>, EventError> {
     let at = |path: &Path| {
         let path = path.to_owned();
         move |source| EventError { path, source }
@@ -213,7 +213,7 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, Even
     for entry in fs::read_dir(directory).map_err(at(directory))? {
         let name = entry.map_err(at(directory))?.file_name();
         let known = |file: &EventFile| name == file.name.as_str();
-        if name.to_str().and_then(Begun::of).is_some() && !files.iter().any(known) {
+        if name.to_str().and_then(CreationStamp::of).is_some() && !files.iter().any(known) {
             let path = directory.join(&name);
             fs::remove_file(&path).map_err(at(&path))?;
         }
@@ -234,7 +234,10 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, Even
             file.set_len(*bytes).map_err(at(&path))?;
         }
     }
-    Ok(files.iter().filter_map(|file| Begun::of(&file.name)).max())
+    Ok(files
+        .iter()
+        .filter_map(|file| CreationStamp::of(&file.name))
+        .max())
 }
 
 fn now_secs() -> f64 {

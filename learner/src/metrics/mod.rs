@@ -25,14 +25,14 @@ pub use window::MovingAverage;
 
 /// Averages over the latest training episodes; part of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Windows {
+pub struct EpisodeWindows {
     /// Average return.
     pub total_reward: MovingAverage,
     /// Average number of walls passed; decides which snapshots are candidates.
     pub walls_passed: MovingAverage,
 }
 
-impl Windows {
+impl EpisodeWindows {
     /// Empty averages over `episodes` episodes.
     pub fn new(episodes: usize) -> Self {
         Self {
@@ -57,7 +57,7 @@ pub struct MetricsState {
     /// Event files with their lengths.
     pub events: Vec<EventFile>,
     /// Averages over the latest episodes.
-    pub windows: Windows,
+    pub windows: EpisodeWindows,
 }
 
 impl MetricsState {
@@ -67,7 +67,7 @@ impl MetricsState {
             episodes: 0,
             episodes_extent: EpisodesExtent::empty(),
             events: Vec::new(),
-            windows: Windows::new(window_episodes),
+            windows: EpisodeWindows::new(window_episodes),
         }
     }
 }
@@ -92,7 +92,7 @@ pub struct Metrics {
     rows: u64,
     episodes: EpisodesCsv,
     events: EventWriter,
-    windows: Windows,
+    windows: EpisodeWindows,
 }
 
 /// Reason why metrics cannot be written.
@@ -221,7 +221,7 @@ impl Metrics {
     }
 
     /// Averages over the latest episodes.
-    pub fn windows(&self) -> &Windows {
+    pub fn windows(&self) -> &EpisodeWindows {
         &self.windows
     }
 }

@@ -9,12 +9,12 @@ use super::{Layout, Parameters};
 
 /// Indices of a layer's two tensors in its network's [`Parameters`].
 #[derive(Debug, Clone, Copy)]
-struct Affine {
+struct LayerTensors {
     weight: usize,
     bias: usize,
 }
 
-impl Affine {
+impl LayerTensors {
     fn describe(layout: &mut Layout, name: &str, weight_shape: &[i64], outputs: i64) -> Self {
         // PyTorch takes dimension 1 for the inputs, even where a transposed convolution's weight
         // has its outputs there.
@@ -29,12 +29,17 @@ impl Affine {
 
 /// A fully connected layer.
 #[derive(Debug, Clone, Copy)]
-pub struct Linear(Affine);
+pub struct Linear(LayerTensors);
 
 impl Linear {
     /// Describes a layer with weight `[outputs, inputs]`.
     pub fn describe(layout: &mut Layout, name: &str, inputs: i64, outputs: i64) -> Self {
-        Self(Affine::describe(layout, name, &[outputs, inputs], outputs))
+        Self(LayerTensors::describe(
+            layout,
+            name,
+            &[outputs, inputs],
+            outputs,
+        ))
     }
 
     /// Maps `[n, inputs]` to `[n, outputs]`.
@@ -48,7 +53,7 @@ impl Linear {
 
 /// A convolution with stride 2 and no padding.
 #[derive(Debug, Clone, Copy)]
-pub struct Convolution(Affine);
+pub struct Convolution(LayerTensors);
 
 impl Convolution {
     /// Describes a layer with weight `[outputs, inputs, height, width]`.
@@ -59,7 +64,7 @@ impl Convolution {
         outputs: i64,
         [height, width]: [i64; 2],
     ) -> Self {
-        Self(Affine::describe(
+        Self(LayerTensors::describe(
             layout,
             name,
             &[outputs, inputs, height, width],
@@ -79,7 +84,7 @@ impl Convolution {
 
 /// A transposed convolution with stride 2 and no padding.
 #[derive(Debug, Clone, Copy)]
-pub struct TransposedConvolution(Affine);
+pub struct TransposedConvolution(LayerTensors);
 
 impl TransposedConvolution {
     /// Describes a layer with weight `[inputs, outputs, height, width]`.
@@ -90,7 +95,7 @@ impl TransposedConvolution {
         outputs: i64,
         [height, width]: [i64; 2],
     ) -> Self {
-        Self(Affine::describe(
+        Self(LayerTensors::describe(
             layout,
             name,
             &[inputs, outputs, height, width],

@@ -184,10 +184,10 @@ fn policy_inputs_carry_no_gradient_and_critic_inputs_do() {
         from_image: Some(LATENT),
         ..algorithm::Inputs::same(OBSERVATION)
     };
-    for ahead in [LooksAhead::Learned, LooksAhead::Target] {
-        let mut batch = Batch::new(seen.columns(), inputs, Device::Cpu);
+    for ahead in [NextStateEncoder::Learned, NextStateEncoder::Target] {
+        let mut batch = TensorBatch::new(seen.columns(), inputs, Device::Cpu);
         let (now, next) = (batch.observations.copy(), batch.next_observations.copy());
-        perception.look(&mut batch, &critic, &target, ahead);
+        perception.encode(&mut batch, &critic, &target, ahead);
         let carry = [
             &batch.states,
             &batch.observations,
@@ -205,7 +205,7 @@ fn policy_inputs_carry_no_gradient_and_critic_inputs_do() {
         );
         assert_eq!(
             batch.next_observations == batch.next_states,
-            ahead == LooksAhead::Target,
+            ahead == NextStateEncoder::Target,
             "two encoders see two things"
         );
         for (seen, flown) in [
@@ -308,7 +308,7 @@ fn a_reward_that_only_the_image_shows_is_learned() {
         let (mut data, mut noise) = (Noise::new(1), Noise::new(2));
         let losses: Vec<f32> = (0..120)
             .map(|_| {
-                let seen = Transitions::looking(OBSERVATION, 8, &mut data);
+                let seen = Transitions::one_step_task_in_images(OBSERVATION, 8, &mut data);
                 let metrics = algorithm
                     .update(&mut Team::new(1), seen.columns(), &mut noise)
                     .unwrap();

@@ -28,12 +28,12 @@ use skein_protocol::config::{Config, EncoderTraining, ReplaySection, View};
 use skein_protocol::ids::EpisodeId;
 use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode};
 
-use crate::episode::{CommittedEpisode, EpisodeFault};
+use crate::episode::{CommittedEpisode, MalformedEpisode};
 use images::ImageStore;
 use ring::{Ring, RowLayout};
 
 pub use ring::RingState;
-pub use state::{ReplayState, RestoreError};
+pub use state::{ReplayRestoreError, ReplayState};
 use success::success_steps;
 
 /// The split replay buffer.
@@ -89,7 +89,7 @@ pub struct Minibatch {
 pub enum InsertError {
     /// The episode's parts do not fit together.
     #[error(transparent)]
-    Fault(#[from] EpisodeFault),
+    Fault(#[from] MalformedEpisode),
     /// A segment does not follow what was stored last.
     #[error(
         "a segment of episode {episode} from its step {first_step} on \

@@ -18,7 +18,7 @@ pub(super) struct RowLayout {
 }
 
 /// Mutable view of one row.
-pub(super) struct RowMut<'a> {
+pub(super) struct TransitionRowMut<'a> {
     pub(super) observation: &'a mut [f32],
     pub(super) next_observation: &'a mut [f32],
     pub(super) true_state: &'a mut [f32],
@@ -30,7 +30,7 @@ pub(super) struct RowMut<'a> {
 
 /// View of one row.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Row<'a> {
+pub(super) struct TransitionRow<'a> {
     pub(super) observation: &'a [f32],
     pub(super) next_observation: &'a [f32],
     pub(super) true_state: &'a [f32],
@@ -57,13 +57,13 @@ impl RowLayout {
         2 * (self.observation + self.true_state) + ACTION + 2
     }
 
-    fn row(self, values: &[f32]) -> Row<'_> {
+    fn row(self, values: &[f32]) -> TransitionRow<'_> {
         let (observation, rest) = values.split_at(self.observation);
         let (next_observation, rest) = rest.split_at(self.observation);
         let (true_state, rest) = rest.split_at(self.true_state);
         let (next_true_state, rest) = rest.split_at(self.true_state);
         let (action, rest) = rest.split_at(ACTION);
-        Row {
+        TransitionRow {
             observation,
             next_observation,
             true_state,
@@ -74,14 +74,14 @@ impl RowLayout {
         }
     }
 
-    fn row_mut(self, values: &mut [f32]) -> RowMut<'_> {
+    fn row_mut(self, values: &mut [f32]) -> TransitionRowMut<'_> {
         let (observation, rest) = values.split_at_mut(self.observation);
         let (next_observation, rest) = rest.split_at_mut(self.observation);
         let (true_state, rest) = rest.split_at_mut(self.true_state);
         let (next_true_state, rest) = rest.split_at_mut(self.true_state);
         let (action, rest) = rest.split_at_mut(ACTION);
         let (reward, terminated) = rest.split_at_mut(1);
-        RowMut {
+        TransitionRowMut {
             observation,
             next_observation,
             true_state,
@@ -173,7 +173,7 @@ impl Ring {
 
     /// Claims the next slot, the oldest row's if the ring is full. `image`: number of the
     /// observation's depth image, while images are stored.
-    pub(super) fn claim(&mut self, image: Option<u32>) -> RowMut<'_> {
+    pub(super) fn claim(&mut self, image: Option<u32>) -> TransitionRowMut<'_> {
         let width = self.layout.width();
         let slot = (self.inserted % self.capacity as u64) as usize;
         if self.len() < self.capacity {
@@ -188,7 +188,7 @@ impl Ring {
     }
 
     /// The row in `slot`, below [`Ring::len`].
-    pub(super) fn row(&self, slot: usize) -> Row<'_> {
+    pub(super) fn row(&self, slot: usize) -> TransitionRow<'_> {
         let width = self.layout.width();
         self.layout
             .row(&self.rows[slot * width..(slot + 1) * width])

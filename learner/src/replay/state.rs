@@ -24,7 +24,7 @@ pub struct ReplayState {
 /// Reason why a stored content does not fit the configured buffer.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("the replay buffer's {part} cannot be restored: {problem}")]
-pub struct RestoreError {
+pub struct ReplayRestoreError {
     /// Name of the part: `success part`, `regular part` or `depth images`.
     pub part: &'static str,
     /// Description of what does not fit.
@@ -47,12 +47,12 @@ impl Replay {
     /// Restores the buffer as it was when [`Replay::state`] was called.
     ///
     /// # Errors
-    /// [`RestoreError`] when the content does not fit `config`.
-    pub fn restore(config: &Config, state: ReplayState) -> Result<Self, RestoreError> {
+    /// [`ReplayRestoreError`] when the content does not fit `config`.
+    pub fn restore(config: &Config, state: ReplayState) -> Result<Self, ReplayRestoreError> {
         let mut replay = Self::new(config);
         let layout = super::RowLayout::of(config);
         let (success, regular) = capacities(&config.replay);
-        let fail = |part| move |problem| RestoreError { part, problem };
+        let fail = |part| move |problem| ReplayRestoreError { part, problem };
         replay.success =
             Ring::restore(success, layout, state.success).map_err(fail("success part"))?;
         replay.regular =

@@ -27,7 +27,7 @@ use crate::networks::native::{
 };
 use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
 /// Policy, critic, target critic and temperature, each with its optimizer state.
 #[derive(Debug)]
@@ -47,12 +47,12 @@ pub struct NativeSac {
     discount: f32,
     target_rate: f32,
     target_entropy: f32,
-    work: Work,
+    buffers: UpdateBuffers,
 }
 
 /// Buffers of one update, kept from update to update.
 #[derive(Debug, Default)]
-struct Work {
+struct UpdateBuffers {
     rows: usize,
     /// Policy network outputs, `[2 rows, 4]`: first for the next observations s', then for s.
     outputs: Vec<f32>,
@@ -111,26 +111,26 @@ impl NativeSac {
             discount: section.discount as f32,
             target_rate: section.target_rate as f32,
             target_entropy: section.target_entropy.value() as f32,
-            work: Work::default(),
+            buffers: UpdateBuffers::default(),
         }
     }
 
     /// Draws actions from the current policy: a' for the next observations, a for the observations.
     fn draw(&mut self, team: &mut Team, columns: Columns<'_>, noise: &mut Noise) {
         let policy = &self.policy_parameters.values;
-        let Work {
+        let UpdateBuffers {
             rows,
             outputs,
             sample,
-            policy: given,
+            policy: activations,
             ..
-        } = &mut self.work;
+        } = &mut self.buffers;
         let (next_outputs, state_outputs) = outputs.split_at_mut(*rows * 2 * ACTION);
         self.policy
             .forward_through(team, policy, columns.next_observations, next_outputs);
         self.policy
-            .forward(team, policy, columns.observations, given);
-        state_outputs.copy_from_slice(output(given));
+            .forward(team, policy, columns.observations, activations);
+        state_outputs.copy_from_slice(output(activations));
         noise.fill_normal(&mut sample.noise);
         sample.draw(self.isa, outputs);
     }
@@ -144,15 +144,15 @@ impl NativeSac {
         columns: Columns<'_>,
         temperature: f32,
     ) -> [f32; 2] {
-        let Work {
+        let UpdateBuffers {
             rows,
             sample,
             joined,
             target_values,
-            critic: given,
+            critic: activations,
             critic_grad,
             ..
-        } = &mut self.work;
+        } = &mut self.buffers;
         let (next_actions, next_log_prob) =
             (&sample.actions[..*rows * ACTION], &sample.log_prob[..*rows]);
         join(columns.next_states, next_actions, joined);
@@ -161,7 +161,7 @@ impl NativeSac {
 
         join(columns.states, columns.actions, joined);
         let critic = &self.critic_parameters.values;
-        self.critic.forward(team, critic, joined, given);
+        self.critic.forward(team, critic, joined, activations);
         let (mut loss, mut value) = (0.0, 0.0);
         let share = 1.0 / *rows as f32;
         let grad = &mut critic_grad.values;
@@ -169,7 +169,7 @@ impl NativeSac {
             let soft_value = smaller(pair(target_values, row)) - temperature * next_log_prob[row];
             let target =
                 columns.rewards[row] + (1.0 - columns.terminated[row]) * soft_value * self.discount;
-            let values = pair(&given.values, row);
+            let values = pair(&activations.values, row);
             for (value, grad) in values.iter().zip(&mut grad[row * ESTIMATES..]) {
                 let error = value - target;
                 loss += 0.5 * f64::from(error * error);
@@ -179,7 +179,7 @@ impl NativeSac {
         }
         let into = &mut self.critic_parameters.gradient;
         self.critic
-            .gradient(team, critic, joined, given, critic_grad, into);
+            .gradient(team, critic, joined, activations, critic_grad, into);
         [loss, value].map(|sum| (sum / *rows as f64) as f32)
     }
 
@@ -192,36 +192,42 @@ impl NativeSac {
         columns: Columns<'_>,
         temperature: f32,
     ) -> [f32; 2] {
-        let Work {
+        let UpdateBuffers {
             rows,
             sample,
             joined,
-            critic: given,
+            critic: activations,
             drawn_grad,
             action_gradient,
-            policy: policy_given,
+            policy: policy_activations,
             policy_grad,
             ..
-        } = &mut self.work;
+        } = &mut self.buffers;
         let (policy, critic) = (
             &self.policy_parameters.values,
             &self.critic_parameters.values,
         );
         let (actions, log_prob) = (&sample.actions[*rows * ACTION..], &sample.log_prob[*rows..]);
         join(columns.states, actions, joined);
-        self.critic.forward(team, critic, joined, given);
+        self.critic.forward(team, critic, joined, activations);
         let (mut loss, mut log_prob_sum) = (0.0, 0.0);
         let share = 1.0 / *rows as f32;
         for (row, &log_prob) in log_prob.iter().enumerate() {
-            let values = pair(&given.values, row);
+            let values = pair(&activations.values, row);
             log_prob_sum += f64::from(log_prob);
             loss += f64::from(temperature * log_prob - smaller(values));
             drawn_grad[row * ESTIMATES..][..ESTIMATES]
                 .copy_from_slice(&share_of_smaller(values).map(|part| -share * part));
         }
         let action = self.inputs.critic..self.inputs.critic + ACTION;
-        self.critic
-            .backward_through(team, critic, given, drawn_grad, action, action_gradient);
+        self.critic.backward_through(
+            team,
+            critic,
+            activations,
+            drawn_grad,
+            action,
+            action_gradient,
+        );
         // Back through the drawn actions, then through the policy.
         sample.backward(
             *rows,
@@ -230,28 +236,33 @@ impl NativeSac {
             output_mut(policy_grad),
         );
         self.policy
-            .backward(team, policy, policy_given, policy_grad);
+            .backward(team, policy, policy_activations, policy_grad);
         let into = &mut self.policy_parameters.gradient;
-        self.policy
-            .gradient(team, columns.observations, policy_given, policy_grad, into);
+        self.policy.gradient(
+            team,
+            columns.observations,
+            policy_activations,
+            policy_grad,
+            into,
+        );
         [loss, log_prob_sum].map(|sum| (sum / *rows as f64) as f32)
     }
 
     /// Allocates the buffers for an update of `rows` transitions.
-    fn places(&self, rows: usize) -> Work {
+    fn allocate(&self, rows: usize) -> UpdateBuffers {
         let numbers = |rows: usize, width: usize| vec![0.0; rows * width];
-        Work {
+        UpdateBuffers {
             rows,
             outputs: numbers(2 * rows, 2 * ACTION),
-            sample: Sample::places(2 * rows),
+            sample: Sample::allocate(2 * rows),
             joined: numbers(rows, self.inputs.critic + ACTION),
             target_values: numbers(rows, ESTIMATES),
-            critic: self.critic.places(rows),
-            critic_grad: self.critic.places(rows),
+            critic: self.critic.allocate(rows),
+            critic_grad: self.critic.allocate(rows),
             drawn_grad: numbers(rows, ESTIMATES),
             action_gradient: numbers(rows, ACTION),
-            policy: self.policy.places(rows),
-            policy_grad: self.policy.places(rows),
+            policy: self.policy.allocate(rows),
+            policy_grad: self.policy.allocate(rows),
         }
     }
 
@@ -300,8 +311,8 @@ impl Algorithm for NativeSac {
         noise: &mut Noise,
     ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
         let rows = columns.check(self.inputs);
-        if self.work.rows != rows {
-            self.work = self.places(rows);
+        if self.buffers.rows != rows {
+            self.buffers = self.allocate(rows);
         }
         let temperature = exp(self.log_temperature.values[0]);
         self.draw(team, columns, noise);
@@ -338,7 +349,7 @@ impl Algorithm for NativeSac {
 }
 
 impl Stateful for NativeSac {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let mut parts = self
             .policy_parameters
             .parts("sac.policy.parameters", "sac.policy.adam");
@@ -350,7 +361,7 @@ impl Stateful for NativeSac {
             self.log_temperature
                 .parts("sac.log_temperature", "sac.temperature.adam"),
         );
-        let target = Part::Numbers(&mut self.target_parameters);
+        let target = StatePart::Numbers(&mut self.target_parameters);
         parts.push(("sac.target.parameters".to_owned(), target));
         parts
     }

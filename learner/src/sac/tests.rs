@@ -51,7 +51,7 @@ fn train(sac: &mut dyn Algorithm, updates: usize, seed: u64) -> Vec<Metrics> {
         .map(|_| {
             update(
                 sac,
-                &Transitions::guessing(OBSERVATION, 32, &mut data),
+                &Transitions::one_step_task(OBSERVATION, 32, &mut data),
                 &mut noise,
             )
             .unwrap()
@@ -125,7 +125,7 @@ fn an_update_that_is_not_finite_changes_nothing() {
         let mut sac = sac(engine, &small(), 1);
         train(&mut *sac, 3, 5);
         let before = state(&mut *sac);
-        let sound = Transitions::guessing(OBSERVATION, 32, &mut Noise::new(1));
+        let sound = Transitions::one_step_task(OBSERVATION, 32, &mut Noise::new(1));
         let mut refused = |damage: fn(&mut Transitions)| {
             let mut damaged = sound.clone();
             damage(&mut damaged);
@@ -159,7 +159,7 @@ fn truncated_episode_still_bootstraps() {
         // state.
         let learned = |terminated: f32, next: f32| {
             let mut sac = sac(engine, &small(), 1);
-            let mut last = Transitions::guessing(OBSERVATION, 1, &mut Noise::new(1));
+            let mut last = Transitions::one_step_task(OBSERVATION, 1, &mut Noise::new(1));
             last.terminated[0] = terminated;
             last.next_observations.fill(next);
             let metrics = update(&mut *sac, &last, &mut Noise::new(2)).unwrap();
@@ -218,7 +218,7 @@ fn the_right_action_is_learned_in_a_one_step_task() {
         for seed in 1..=3 {
             let mut sac = sac(engine, &section, seed);
             train(&mut *sac, 600, seed);
-            let test = Transitions::guessing(OBSERVATION, 256, &mut Noise::new(seed + 100));
+            let test = Transitions::one_step_task(OBSERVATION, 256, &mut Noise::new(seed + 100));
             let actions = mode(&*sac, &section, &test.observations);
             let observations = test.observations.chunks_exact(OBSERVATION);
             let squared = observations

@@ -10,14 +10,14 @@ use tch::{Device, Tensor, no_grad_guard};
 use super::losses::{critic_loss, policy_loss, soft_targets, temperature_loss};
 use super::reported;
 use crate::algorithm::{Algorithm, Columns, Inputs};
-use crate::batch::Batch;
+use crate::batch::TensorBatch;
 use crate::error::{UpdateError, finite};
 use crate::metrics::Scalar;
 use crate::networks::{Critic, Layout, Parameters, Policy, PolicySample};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
-use crate::perception::{LooksAhead, Perception};
-use crate::state::{Part, Stateful};
+use crate::perception::{NextStateEncoder, Perception};
+use crate::state::{StatePart, Stateful};
 
 /// Policy, critic, target critic and temperature, each with its optimizer.
 #[derive(Debug)]
@@ -101,7 +101,7 @@ impl TorchSac {
 
     /// Soft Bellman targets (eq. 3), `[n]`: r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' |
     /// s')), with a' drawn from the current policy.
-    fn targets(&self, batch: &Batch, temperature: &Tensor, noise: &mut Noise) -> Tensor {
+    fn targets(&self, batch: &TensorBatch, temperature: &Tensor, noise: &mut Noise) -> Tensor {
         let _guard = no_grad_guard();
         let next = self.draw(&batch.next_observations, noise);
         let next_values =
@@ -137,10 +137,10 @@ impl Algorithm for TorchSac {
         columns: Columns<'_>,
         noise: &mut Noise,
     ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
-        let mut batch = Batch::new(columns, self.inputs, self.log_temperature.device());
+        let mut batch = TensorBatch::new(columns, self.inputs, self.log_temperature.device());
         if let Some(perception) = &self.perception {
             let (critic, target) = (&self.critic_parameters, &self.target_parameters);
-            perception.look(&mut batch, critic, target, LooksAhead::Learned);
+            perception.encode(&mut batch, critic, target, NextStateEncoder::Learned);
         }
         let temperature = self.log_temperature.detach().exp();
 
@@ -217,7 +217,7 @@ impl Algorithm for TorchSac {
 }
 
 impl Stateful for TorchSac {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let own = [
             (
                 "sac.policy.parameters",
@@ -233,7 +233,7 @@ impl Stateful for TorchSac {
             ),
             ("sac.log_temperature", self.log_temperature.detach()),
         ];
-        let own = own.map(|(name, tensor)| (name.to_owned(), Part::Tensor(tensor)));
+        let own = own.map(|(name, tensor)| (name.to_owned(), StatePart::Tensor(tensor)));
         let mut parts = Vec::from(own);
         parts.extend(self.policy_optimizer.parts("sac.policy.adam"));
         parts.extend(self.critic_optimizer.parts("sac.critic.adam"));

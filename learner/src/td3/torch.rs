@@ -9,15 +9,15 @@ use skein_protocol::seeds::{Purpose, derive};
 use tch::{Device, Tensor, no_grad_guard};
 
 use crate::algorithm::{Algorithm, Columns, Inputs};
-use crate::batch::Batch;
+use crate::batch::TensorBatch;
 use crate::error::{UpdateError, finite};
 use crate::metrics::Scalar;
 use crate::networks::{Critic, Layout, Parameters, Policy};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
-use crate::perception::{LooksAhead, Perception};
+use crate::perception::{NextStateEncoder, Perception};
 use crate::sac::losses::critic_loss;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
 /// Policy and critic, their target networks, and their optimizers.
 #[derive(Debug)]
@@ -81,7 +81,7 @@ impl TorchTd3 {
 
     /// Bellman targets, `[n]`: r + γ (1 - terminated) min Q̄(s', a'), where a' is the target
     /// policy's action plus clipped noise (eq. 14 and 15).
-    fn targets(&self, batch: &Batch, noise: &mut Noise) -> Tensor {
+    fn targets(&self, batch: &TensorBatch, noise: &mut Noise) -> Tensor {
         let Td3Section {
             discount,
             target_noise,
@@ -103,7 +103,7 @@ impl TorchTd3 {
     }
 
     /// Policy loss, a scalar: the mean of -Q₁ of the policy's actions (eq. 1).
-    fn policy_loss(&self, batch: &Batch) -> Tensor {
+    fn policy_loss(&self, batch: &TensorBatch) -> Tensor {
         let actions = self
             .policy
             .output(&self.policy_parameters, &batch.observations)
@@ -125,10 +125,10 @@ impl Algorithm for TorchTd3 {
         noise: &mut Noise,
     ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
         let number = self.updates() + 1;
-        let mut batch = Batch::new(columns, self.inputs, self.device);
+        let mut batch = TensorBatch::new(columns, self.inputs, self.device);
         if let Some(perception) = &self.perception {
             let (critic, target) = (&self.critic_parameters, &self.target_critic);
-            perception.look(&mut batch, critic, target, LooksAhead::Target);
+            perception.encode(&mut batch, critic, target, NextStateEncoder::Target);
         }
 
         let targets = self.targets(&batch, noise);
@@ -194,7 +194,7 @@ impl Algorithm for TorchTd3 {
 }
 
 impl Stateful for TorchTd3 {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let own = [
             ("td3.policy.parameters", &self.policy_parameters),
             ("td3.critic.parameters", &self.critic_parameters),
@@ -204,7 +204,7 @@ impl Stateful for TorchTd3 {
         let own = own.map(|(name, parameters)| {
             (
                 name.to_owned(),
-                Part::Tensor(parameters.flat().shallow_clone()),
+                StatePart::Tensor(parameters.flat().shallow_clone()),
             )
         });
         let mut parts = Vec::from(own);

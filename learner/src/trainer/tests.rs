@@ -33,7 +33,7 @@ fn config() -> Config {
 
 /// One epoch, as the training loop does it. With a lag, `keep` was chosen when its episodes were
 /// ordered.
-fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
+fn learn(trainer: &mut Trainer, epoch: u64, keep: KeptData) {
     for number in epoch * EPISODES..(epoch + 1) * EPISODES {
         let mut flown = episode(number, STEPS / EPISODES as usize, Outcome::Collided);
         flown.level_up[4] = true;
@@ -42,7 +42,7 @@ fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
             .rewards
             .iter_mut()
             .for_each(|reward| *reward = reward.sin());
-        if keep == Keep::Depth {
+        if keep == KeptData::Depth {
             flown = with_images(flown);
         }
         trainer.take_in(flown).unwrap();
@@ -86,14 +86,14 @@ fn end_to_end(algorithm: AlgorithmName) -> Config {
 
 fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
     CheckpointState {
-        progress: Progress {
+        progress: TrainingProgress {
             episodes: epochs * EPISODES,
             epochs,
             version: epochs,
             environment_steps: trainer.steps(),
             vae_steps: trainer.vae_updates(),
             policy_updates: trainer.updates(),
-            ..Progress::start(config().evaluation.window_episodes as usize)
+            ..TrainingProgress::start(config().evaluation.window_episodes as usize)
         },
         tensors: trainer.tensors(),
         replay: trainer.replay().state(),
@@ -153,7 +153,7 @@ fn end_to_end_training_continues_bit_for_bit_too_and_keeps_its_images_to_the_end
     for algorithm in [AlgorithmName::Sac, AlgorithmName::Td3] {
         let config = end_to_end(algorithm);
         let undisturbed = train(&config, 1, &[]);
-        let Progress {
+        let TrainingProgress {
             vae_steps,
             policy_updates,
             environment_steps,
@@ -194,7 +194,7 @@ fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
         before.iter().filter(|value| **value == 0.0).count() < 10,
         "it is initialised"
     );
-    (0..3).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+    (0..3).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
     let moved = encoder(&trainer)
         .iter()
         .zip(&before)
@@ -207,7 +207,7 @@ fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
     );
     assert_eq!(
         (trainer.keep(), trainer.reconstruct(&[0; IMAGE_PIXELS])),
-        (Keep::Depth, None)
+        (KeptData::Depth, None)
     );
     assert!(
         trainer
@@ -229,7 +229,7 @@ fn the_policy_average_flies_where_configured_and_does_not_change_learning() {
         let mut config = config();
         config.learning.average_updates = averaged;
         let mut trainer = Trainer::new(&config).unwrap();
-        (0..6).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+        (0..6).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
         let policy = trainer.snapshot(PolicyVersion(6)).values[trainer.layout.policy()].to_vec();
         (policy, trainer.algorithm.named_tensors())
     };
@@ -270,14 +270,18 @@ fn a_u_net_runs_on_libtorch_and_leaves_the_policys_start_unchanged() {
         policy(&mut trainer) == policy(&mut plain),
         "both begin alike"
     );
-    (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
-    assert_eq!(trainer.keep(), Keep::Latents, "the VAE was never frozen");
+    (0..4).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
+    assert_eq!(
+        trainer.keep(),
+        KeptData::Latents,
+        "the VAE was never frozen"
+    );
 }
 
 #[test]
 fn a_state_that_lacks_a_tensor_or_miscounts_is_refused_by_name() {
     let mut trainer = Trainer::new(&config()).unwrap();
-    learn(&mut trainer, 0, Keep::Depth);
+    learn(&mut trainer, 0, KeptData::Depth);
     let mut refusal = |damage: fn(&mut CheckpointState)| {
         let mut state = state(&mut trainer, 1);
         damage(&mut state);
@@ -313,8 +317,12 @@ fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
         config.vae.latent = latent;
         let mut trainer = Trainer::new(&config).unwrap();
         // The last epoch arrives late: its images were ordered before the freeze.
-        (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
-        assert_eq!(trainer.keep(), Keep::Latents, "the VAE was never frozen");
+        (0..4).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
+        assert_eq!(
+            trainer.keep(),
+            KeptData::Latents,
+            "the VAE was never frozen"
+        );
         assert!(
             all_codes_are_the_encoders(&trainer, 4),
             "{engine}, {precision}, {latent} numbers"
@@ -329,14 +337,14 @@ fn episodes_are_stored_a_second_time_mirrored() {
     config.learning.observation = Observation::LatentVelocityAction;
     config.replay.capacity = 1000;
     let mut trainer = Trainer::new(&config).unwrap();
-    (0..3).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+    (0..3).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
     assert_eq!(
         (trainer.steps(), trainer.replay().len()),
         (3 * STEPS as u64, 6 * STEPS)
     );
     assert_eq!(
         trainer.keep(),
-        Keep::Depth,
+        KeptData::Depth,
         "mirror images are encoded after the VAE is frozen, too"
     );
     assert!(
@@ -372,7 +380,7 @@ fn stored_codes_are_recomputed_as_often_as_configured_while_the_vae_is_trained()
     let mut trainer = Trainer::new(&config()).unwrap();
     let mut renewed = Vec::new();
     for epoch in 0..3 {
-        learn(&mut trainer, epoch, Keep::Depth);
+        learn(&mut trainer, epoch, KeptData::Depth);
         renewed.push(all_codes_are_the_encoders(&trainer, epoch + 1));
     }
     assert_eq!(renewed, [false, true, true]);

@@ -15,7 +15,7 @@ use crate::best::{is_better, is_candidate};
 use crate::checkpoint::BestSnapshot;
 use crate::curriculum;
 use crate::episode::CommittedEpisode;
-use crate::episodes::assembly::Keep;
+use crate::episodes::assembly::KeptData;
 use crate::evaluation;
 use crate::metrics::Scalar;
 
@@ -32,7 +32,7 @@ impl Training<'_> {
         let version = self.progress.version();
         let (run, number) = (self.identity.run, self.progress.evaluations);
         let tickets = curriculum::confirmation(self.config, run, number, version);
-        let flown = self.evaluate(tickets, Keep::Latents)?;
+        let flown = self.evaluate(tickets, KeptData::Latents)?;
         pass(FaultPoint::LearnerCandidateFlown);
         self.note_trained(&flown);
         let passed: f64 = flown
@@ -125,7 +125,7 @@ impl Training<'_> {
         version: PolicyVersion,
         courses: Range<u32>,
         episodes: u64,
-        keep: Keep,
+        keep: KeptData,
     ) -> Result<Vec<CommittedEpisode>, TrainingError> {
         let (run, number) = (self.identity.run, self.progress.evaluations);
         let tickets = curriculum::evaluation(self.config, run, number, version, courses, episodes);
@@ -136,7 +136,7 @@ impl Training<'_> {
     fn evaluate(
         &mut self,
         tickets: Vec<Ticket>,
-        keep: Keep,
+        keep: KeptData,
     ) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         let total = tickets.len() as u64;
@@ -179,9 +179,9 @@ impl Training<'_> {
             version,
             0..courses,
             self.config.evaluation.episodes,
-            Keep::Latents,
+            KeptData::Latents,
         )?;
-        let pictured = self.evaluate_on(version, 0..1, 1, Keep::Depth)?;
+        let pictured = self.evaluate_on(version, 0..1, 1, KeptData::Depth)?;
         pass(FaultPoint::LearnerEvaluated);
         Ok(self.disk.with_room(self.directory.root(), || {
             evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;

@@ -9,7 +9,7 @@ use crate::UpdateError;
 use crate::checkpoint::CheckpointError;
 use crate::device::DeviceError;
 use crate::episodes::receiver::ReceiverError;
-use crate::evaluation::EvaluationError;
+use crate::evaluation::EvaluationWriteError;
 use crate::metrics::MetricsError;
 use crate::replay::InsertError;
 use crate::trainer::TrainerRestoreError;
@@ -33,7 +33,7 @@ pub enum TrainingError {
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
     #[error(transparent)]
-    Evaluation(#[from] EvaluationError),
+    Evaluation(#[from] EvaluationWriteError),
     #[error("cannot start a thread: {0}")]
     Thread(#[source] io::Error),
     #[error("{}: {source}", path.display())]
@@ -80,7 +80,7 @@ pub enum TrainingError {
 impl TrainingError {
     /// `true` if a new incarnation of the learner may get further: the transport failed, and
     /// nothing that was computed is at fault. Any other error would recur.
-    pub fn is_of_the_transport(&self) -> bool {
+    pub fn is_transport_failure(&self) -> bool {
         matches!(self, Self::EpisodeReceiver(ReceiverError::Transport(_)))
     }
 }
@@ -100,12 +100,12 @@ mod tests {
             why: "the simulator broke down".to_owned(),
         };
         let error = |error: ReceiverError| TrainingError::from(error);
-        assert!(error(ReceiverError::Transport("no memory".to_owned())).is_of_the_transport());
-        assert!(!error(hopeless.into()).is_of_the_transport());
+        assert!(error(ReceiverError::Transport("no memory".to_owned())).is_transport_failure());
+        assert!(!error(hopeless.into()).is_transport_failure());
         let diverged = UpdateError::NonFinite {
             tensor: "critic loss",
             update: 7,
         };
-        assert!(!TrainingError::from(diverged).is_of_the_transport());
+        assert!(!TrainingError::from(diverged).is_transport_failure());
     }
 }

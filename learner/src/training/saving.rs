@@ -16,9 +16,9 @@ use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{Ending, Summary};
 
-use super::{EpochCurves, StopWatch, Training, TrainingError};
+use super::{EpochCurves, StopMonitor, Training, TrainingError};
 use crate::checkpoint::{
-    CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, Progress,
+    CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, TrainingProgress,
 };
 use crate::disk::Disk;
 use crate::episodes::receiver::EpisodeReceiver;
@@ -92,7 +92,7 @@ impl<'a> Training<'a> {
             identity,
             directory,
             stop,
-            stop_watch: StopWatch::of(stop),
+            stop_monitor: StopMonitor::of(stop),
             layout: SnapshotLayout::of(config),
             trainer,
             reporter,
@@ -220,9 +220,9 @@ impl<'a> Training<'a> {
     }
 
     /// Returns the progress, with the counters that other parts keep.
-    fn full_progress(&self) -> Progress {
+    fn full_progress(&self) -> TrainingProgress {
         let newest = self.snapshots.get(&self.progress.version());
-        Progress {
+        TrainingProgress {
             policy_sha256: newest.map(Snapshot::sha256).unwrap_or_default(),
             environment_steps: self.trainer.steps(),
             vae_steps: self.trainer.vae_updates(),
@@ -239,7 +239,7 @@ impl<'a> Training<'a> {
     }
 
     /// Saves everything; returns the progress.
-    pub(super) fn save(&mut self) -> Result<Progress, TrainingError> {
+    pub(super) fn save(&mut self) -> Result<TrainingProgress, TrainingError> {
         self.reporter
             .update(|progress| progress.phase = Phase::Finishing);
         self.metrics.flush()?;
@@ -250,7 +250,7 @@ impl<'a> Training<'a> {
 
     /// Gives up an epoch half done: resets the files to the newest checkpoint, from which the next
     /// incarnation resumes. Returns that checkpoint's progress.
-    pub(super) fn roll_back(&mut self) -> Result<Progress, TrainingError> {
+    pub(super) fn roll_back(&mut self) -> Result<TrainingProgress, TrainingError> {
         tracing::warn!(
             episodes = self.progress.episodes,
             checkpoint = self.saved.episodes,
@@ -271,7 +271,7 @@ impl<'a> Training<'a> {
     /// needs its actors.
     pub(super) fn conclude(
         self,
-        end: Result<(Ending, Progress), TrainingError>,
+        end: Result<(Ending, TrainingProgress), TrainingError>,
     ) -> Result<Summary, TrainingError> {
         // The times of a thread are gone once it has ended.
         let thread_cpu_secs = threads::cpu_secs();
@@ -310,7 +310,7 @@ fn save_summary(
 /// Reopens the metrics at the position of `saved`.
 fn resume_metrics(
     directory: &RunDirectory,
-    saved: &Progress,
+    saved: &TrainingProgress,
     disk: &Disk,
 ) -> Result<Metrics, MetricsError> {
     disk.with_room(directory.root(), || {
@@ -346,10 +346,10 @@ fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<
 }
 
 /// Progress of a run that has not begun.
-fn start(config: &Config, trainer: &Trainer) -> Progress {
-    Progress {
+fn start(config: &Config, trainer: &Trainer) -> TrainingProgress {
+    TrainingProgress {
         policy_sha256: trainer.snapshot(PolicyVersion(0)).sha256(),
-        ..Progress::start(config.evaluation.window_episodes as usize)
+        ..TrainingProgress::start(config.evaluation.window_episodes as usize)
     }
 }
 
@@ -357,7 +357,7 @@ fn start(config: &Config, trainer: &Trainer) -> Progress {
 fn restore(
     trainer: &mut Trainer,
     checkpoint: CheckpointState,
-) -> Result<(Progress, BTreeMap<PolicyVersion, Snapshot>), TrainingError> {
+) -> Result<(TrainingProgress, BTreeMap<PolicyVersion, Snapshot>), TrainingError> {
     let CheckpointState {
         progress,
         tensors,
@@ -386,7 +386,7 @@ fn restore(
 }
 
 /// First report of this incarnation.
-fn first_report(config: &Config, saved: &Progress) -> progress::Progress {
+fn first_report(config: &Config, saved: &TrainingProgress) -> progress::Progress {
     let windows = &saved.metrics.windows;
     progress::Progress {
         episodes: saved.episodes,
@@ -404,7 +404,7 @@ fn summary(
     identity: &RunIdentity,
     config: &Config,
     ending: Ending,
-    progress: &Progress,
+    progress: &TrainingProgress,
     resumes: u64,
 ) -> Summary {
     let best = progress.best.as_ref();

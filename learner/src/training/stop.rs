@@ -12,14 +12,14 @@ use crate::episodes::receiver::Shared;
 const GRACE: Duration = Duration::from_secs(60);
 
 /// Checks the stop flag between updates.
-pub(super) struct StopWatch<'a> {
+pub(super) struct StopMonitor<'a> {
     stop: &'a AtomicBool,
     grace: Duration,
     /// Time at which the flag was first seen set.
     seen: Option<Instant>,
 }
 
-impl<'a> StopWatch<'a> {
+impl<'a> StopMonitor<'a> {
     pub(super) fn of(stop: &'a AtomicBool) -> Self {
         Self {
             stop,
@@ -33,7 +33,7 @@ impl<'a> StopWatch<'a> {
     ///
     /// # Errors
     /// [`TrainingError::Abandoned`] when that takes too long, or no actor is there to fly it.
-    pub(super) fn amid_episode(&mut self, receiver: &Shared) -> Result<(), TrainingError> {
+    pub(super) fn during_episode(&mut self, receiver: &Shared) -> Result<(), TrainingError> {
         if self.stop.load(Ordering::Relaxed) && receiver.live_actors().is_empty() {
             return Err(TrainingError::Abandoned);
         }
@@ -65,9 +65,9 @@ mod tests {
     #[test]
     fn updates_continue_after_the_stop_but_not_for_long() {
         let stop = AtomicBool::new(false);
-        let mut watch = StopWatch {
+        let mut watch = StopMonitor {
             grace: Duration::from_millis(20),
-            ..StopWatch::of(&stop)
+            ..StopMonitor::of(&stop)
         };
         std::thread::sleep(Duration::from_millis(30));
         watch.after_update().unwrap();

@@ -15,9 +15,9 @@ use tch::{Device, Tensor};
 
 use crate::error::UpdateError;
 use crate::noise::Noise;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
-pub use native::{LAYERS, NativeVae, Pass, Spent};
+pub use native::{LAYERS, LayerTimes, NativeVae, Pass};
 pub use torch::{TorchVae, images_from_bytes};
 
 /// Encoder, decoder and their optimizer, computed by the configured engine.
@@ -111,7 +111,7 @@ impl Vae {
 }
 
 impl Stateful for Vae {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         match self {
             Self::Native(vae) => vae.parts(),
             Self::Libtorch(vae) => vae.parts(),

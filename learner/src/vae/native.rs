@@ -23,21 +23,21 @@ use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{DecoderName, VaeSection};
 use skein_protocol::seeds::{Purpose, derive};
 
-use self::batch::Batch;
+use self::batch::BatchBuffers;
 use self::buffer::Buffer;
 use self::elementwise::{sigmoids, squares};
-use self::members::{Member, by_image, share};
-use self::network::Network;
-use self::order::Order;
-use self::step::{Objective, Step};
-use self::stopwatch::Pass as LayerPass;
+use self::members::{MemberScratch, by_image, share};
+use self::network::VaeNetwork;
+use self::order::ParameterOrder;
+use self::step::{LossParts, StepContext};
+use self::stopwatch::Pass;
 use super::VaeMetrics;
 use crate::error::UpdateError;
 use crate::networks::{Decoder, Encoder, Layout};
 use crate::noise::Noise;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
-pub use stopwatch::{LAYERS, Pass, Spent};
+pub use stopwatch::{LAYERS, LayerTimes, Pass};
 
 /// Images reconstructed at once: bounds memory, and reads the weights once for all of them.
 const CHUNK: usize = 32;
@@ -47,11 +47,11 @@ const CHUNK: usize = 32;
 pub struct NativeVae {
     isa: Isa,
     team: Team,
-    members: Vec<Member>,
-    order: Order,
+    members: Vec<MemberScratch>,
+    order: ParameterOrder,
     /// Length of the prefix of PyTorch's order that actors need.
     published_len: usize,
-    network: Network,
+    network: VaeNetwork,
     /// `true` if `network` has packed the present parameters.
     packed: bool,
     parameters: Buffer,
@@ -59,7 +59,7 @@ pub struct NativeVae {
     /// Gradient, except for the weights of the decoder's first convolution, which exists only block
     /// by block.
     gradient: Buffer,
-    batch: Batch,
+    batch: BatchBuffers,
     noise: Vec<f32>,
     steps: u64,
     learning_rate: f64,
@@ -77,21 +77,21 @@ impl NativeVae {
         let mut layout = Layout::default();
         let published_len = Encoder::describe(&mut layout, section.latent).published_len();
         let _ = Decoder::describe(&mut layout, section.latent, DecoderName::Plain);
-        let order = Order::of(&layout);
+        let order = ParameterOrder::of(&layout);
         let initial = layout.initial_values(derive(run_seed, Purpose::VaeParameters, 0));
         let len = initial.len();
         let team = Team::new(threads);
         let mut vae = Self {
             isa,
-            members: (0..team.size()).map(|_| Member::new(isa)).collect(),
+            members: (0..team.size()).map(|_| MemberScratch::new(isa)).collect(),
             team,
             published_len,
-            network: Network::new(isa, section.latent, &order),
+            network: VaeNetwork::new(isa, section.latent, &order),
             packed: false,
             parameters: Buffer::zeroed(len),
             moments: [len, len].map(Buffer::zeroed),
             gradient: Buffer::zeroed(len),
-            batch: Batch::default(),
+            batch: BatchBuffers::default(),
             noise: Vec::new(),
             steps: 0,
             learning_rate: section.learning_rate,
@@ -124,9 +124,9 @@ impl NativeVae {
     }
 
     /// Computes loss and gradient for these images and `self.noise`.
-    fn objective(&mut self, images: &[u8]) -> Objective {
+    fn objective(&mut self, images: &[u8]) -> LossParts {
         self.pack();
-        let mut step = Step {
+        let mut step = StepContext {
             isa: self.isa,
             team: &mut self.team,
             members: &mut self.members,
@@ -140,7 +140,7 @@ impl NativeVae {
 
     /// Checks that everything a step would use is finite. For the gradient, its squared norm must
     /// not overflow; for the decoder's first convolution, a bound of it.
-    fn check(&mut self, objective: &Objective) -> Result<(), UpdateError> {
+    fn check(&mut self, objective: &LossParts) -> Result<(), UpdateError> {
         let watch = &mut self.members[0].watch;
         watch.start();
         let blocks = self.network.unfold.place.weight.clone();
@@ -185,7 +185,7 @@ impl NativeVae {
             &mut blocks,
             |_, block, member| {
                 let _ = block.gradient(isa, input, &mut member.unfold);
-                member.watch.layer(network::UNFOLD, LayerPass::Gradient);
+                member.watch.layer(network::UNFOLD, Pass::Gradient);
                 block.step(isa, adam, &mut member.unfold);
                 member.watch.adam_and_packing();
             },
@@ -225,11 +225,11 @@ impl NativeVae {
             &mut parts,
             |index, code, member| {
                 let depth = &images[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
-                for (image, len) in member.images.iter_mut().zip(network.seen_lens()) {
+                for (image, len) in member.images.iter_mut().zip(network.encoder_lens()) {
                     image.resize(len);
                 }
                 let images = member.images.each_mut().map(|image| &mut **image);
-                network.see(parameters, depth, images, &mut member.watch);
+                network.encoder_forward(parameters, depth, images, &mut member.watch);
                 network.mean(parameters, &member.images[4], code);
             },
         );
@@ -256,14 +256,17 @@ impl NativeVae {
             );
             network.unfold.multiply(&mut self.team, &batch.unfolded);
             let network = &*network;
-            let mut drawn = by_image(batch.drawn.each_mut().map(|buffer| &mut **buffer), count);
+            let mut drawn = by_image(
+                batch.decoder_maps.each_mut().map(|buffer| &mut **buffer),
+                count,
+            );
             share(
                 &mut self.team,
                 &mut self.members,
                 &mut drawn,
                 |index, images, member| {
                     let images = images.each_mut().map(|image| &mut **image);
-                    network.draw(
+                    network.decoder_forward(
                         parameters,
                         index,
                         images,
@@ -273,8 +276,8 @@ impl NativeVae {
                 },
             );
             drop(drawn);
-            sigmoids(isa, &mut batch.drawn[3]);
-            seen.extend_from_slice(&batch.drawn[3]);
+            sigmoids(isa, &mut batch.decoder_maps[3]);
+            seen.extend_from_slice(&batch.decoder_maps[3]);
         }
         seen
     }
@@ -304,12 +307,12 @@ impl NativeVae {
     }
 
     /// Returns the time per layer and pass since the last call.
-    pub fn take_spent(&mut self) -> Spent {
-        let mut spent = Spent::default();
+    pub fn take_times(&mut self) -> LayerTimes {
+        let mut times = LayerTimes::default();
         for member in &mut self.members {
-            spent.add(&std::mem::take(&mut member.watch.spent));
+            times.add(&std::mem::take(&mut member.watch.times));
         }
-        spent
+        times
     }
 
     /// Floating-point operations per image of each layer's passes, in the order of [`LAYERS`] and
@@ -338,7 +341,7 @@ impl NativeVae {
         noise: &[f32],
     ) -> ([f32; 3], Vec<f32>) {
         self.noise = noise.to_vec();
-        let Objective {
+        let LossParts {
             loss,
             error,
             divergence,
@@ -364,16 +367,16 @@ impl NativeVae {
 }
 
 impl Stateful for NativeVae {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         // The caller may change the parameters.
         self.packed = false;
         let [first, second] = &mut self.moments;
         // Names differ from the other engine's, because the numbers are in another order.
         let parts = [
-            ("parameters", Part::Numbers(&mut self.parameters)),
-            ("adam.first_moment", Part::Numbers(first)),
-            ("adam.second_moment", Part::Numbers(second)),
-            ("adam.steps", Part::Count(&mut self.steps)),
+            ("parameters", StatePart::Numbers(&mut self.parameters)),
+            ("adam.first_moment", StatePart::Numbers(first)),
+            ("adam.second_moment", StatePart::Numbers(second)),
+            ("adam.steps", StatePart::Count(&mut self.steps)),
         ];
         let named = |(name, part)| (format!("vae.native.{name}"), part);
         parts.into_iter().map(named).collect()

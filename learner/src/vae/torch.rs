@@ -12,7 +12,7 @@ use crate::error::{UpdateError, finite};
 use crate::networks::{Decoder, Encoded, Encoder, Layout, Parameters, pixels};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
 /// Images encoded or reconstructed at once outside of training: bounds memory at some 50 MB, at no
 /// loss of speed.
@@ -32,7 +32,7 @@ pub struct TorchVae {
 }
 
 /// The loss and its parts, scalars; see [`VaeMetrics`].
-struct Objective {
+struct LossTensors {
     loss: Tensor,
     error: Tensor,
     divergence: Tensor,
@@ -70,7 +70,7 @@ impl TorchVae {
         let pixels = pixels(&images.to_device(self.device()));
 
         let code_noise = noise.normal(&[pixels.size()[0], self.latent], pixels.device());
-        let Objective {
+        let LossTensors {
             loss,
             error,
             divergence,
@@ -96,7 +96,7 @@ impl TorchVae {
 
     /// Computes the loss and its two parts for these pixels, `[n, 1, 72, 128]`, and standard normal
     /// noise, `[n, latent]`.
-    fn objective(&self, pixels: &Tensor, code_noise: &Tensor) -> Objective {
+    fn objective(&self, pixels: &Tensor, code_noise: &Tensor) -> LossTensors {
         // The code is sampled as mean + std · noise, so that gradients reach mean and std
         // (arXiv:1312.6114, section 2.4).
         let Encoded {
@@ -109,7 +109,7 @@ impl TorchVae {
 
         let error = squared_error(&reconstructed, pixels);
         let divergence = divergence(&mean, &log_variance);
-        Objective {
+        LossTensors {
             loss: &error + &divergence * self.kl_weight,
             error,
             divergence,
@@ -194,7 +194,7 @@ impl TorchVae {
         let noise = Tensor::from_slice(noise)
             .view([-1, self.latent])
             .to_kind(kind);
-        let Objective {
+        let LossTensors {
             loss,
             error,
             divergence,
@@ -209,11 +209,11 @@ impl TorchVae {
 }
 
 impl Stateful for TorchVae {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let mut parts = self.optimizer.parts("vae.adam");
         parts.push((
             "vae.parameters".into(),
-            Part::Tensor(self.parameters.flat().shallow_clone()),
+            StatePart::Tensor(self.parameters.flat().shallow_clone()),
         ));
         parts
     }

@@ -38,28 +38,28 @@ impl NativeCritic {
     }
 
     /// Allocates buffers for the activations of `rows` rows.
-    pub fn places(&self, rows: usize) -> CriticLayers {
+    pub fn allocate(&self, rows: usize) -> CriticLayers {
         CriticLayers {
             networks: (0..self.networks)
-                .map(|_| self.network.places(rows))
+                .map(|_| self.network.allocate(rows))
                 .collect(),
             values: vec![0.0; rows * ESTIMATES],
         }
     }
 
     /// Computes both estimates for `joined`, `[rows, critic input + 2]`; keeps all activations in
-    /// `given`.
+    /// `activations`.
     pub fn forward(
         &self,
         team: &mut Team,
         parameters: &[f32],
         joined: &[f32],
-        given: &mut CriticLayers,
+        activations: &mut CriticLayers,
     ) {
-        for (number, layers) in given.networks.iter_mut().enumerate() {
+        for (number, layers) in activations.networks.iter_mut().enumerate() {
             self.network
                 .forward(team, self.of(number, parameters), joined, layers);
-            scatter(output(layers), number, &mut given.values);
+            scatter(output(layers), number, &mut activations.values);
         }
     }
 
@@ -86,16 +86,18 @@ impl NativeCritic {
         team: &mut Team,
         parameters: &[f32],
         joined: &[f32],
-        given: &CriticLayers,
+        activations: &CriticLayers,
         grad: &mut CriticLayers,
         into: &mut [f32],
     ) {
         for (number, layers) in grad.networks.iter_mut().enumerate() {
             gather(&grad.values, number, output_mut(layers));
-            let (parameters, given) = (self.of(number, parameters), &given.networks[number]);
-            self.network.backward(team, parameters, given, layers);
+            let (parameters, activations) =
+                (self.of(number, parameters), &activations.networks[number]);
+            self.network.backward(team, parameters, activations, layers);
             let into = &mut into[number * self.len..][..self.len];
-            self.network.gradient(team, joined, given, layers, into);
+            self.network
+                .gradient(team, joined, activations, layers, into);
         }
     }
 
@@ -105,7 +107,7 @@ impl NativeCritic {
         &self,
         team: &mut Team,
         parameters: &[f32],
-        given: &CriticLayers,
+        activations: &CriticLayers,
         grad: &[f32],
         columns: Range<usize>,
         into: &mut [f32],
@@ -113,12 +115,18 @@ impl NativeCritic {
         let mut own_grad = vec![0.0; grad.len() / self.networks];
         let mut own = vec![0.0; into.len()];
         into.fill(0.0);
-        for (number, given) in given.networks.iter().enumerate() {
+        for (number, activations) in activations.networks.iter().enumerate() {
             gather(grad, number, &mut own_grad);
             let parameters = self.of(number, parameters);
             let columns = columns.clone();
-            self.network
-                .backward_through(team, parameters, given, &own_grad, columns, &mut own);
+            self.network.backward_through(
+                team,
+                parameters,
+                activations,
+                &own_grad,
+                columns,
+                &mut own,
+            );
             into.iter_mut().zip(&own).for_each(|(sum, own)| *sum += own);
         }
     }

@@ -33,11 +33,11 @@ thread_local! {
 #[derive(Debug)]
 pub struct Dense {
     isa: Isa,
-    layers: Vec<Layer>,
+    layers: Vec<DenseLayer>,
 }
 
 #[derive(Debug)]
-struct Layer {
+struct DenseLayer {
     inputs: usize,
     outputs: usize,
     /// Ranges in the network's flat vector, of shapes `[outputs, inputs]` and `[outputs]`.
@@ -45,7 +45,7 @@ struct Layer {
     bias: Range<usize>,
 }
 
-impl Layer {
+impl DenseLayer {
     /// The weight matrix, `[outputs, inputs]`.
     fn weights<'a>(&self, parameters: &'a [f32]) -> Matrix<'a> {
         Matrix::of_rows(&parameters[self.weight.clone()], self.inputs)
@@ -62,7 +62,7 @@ impl Dense {
         };
         let layers = tensors.chunks_exact(2).map(|tensors| {
             let [weight, bias] = [&tensors[0], &tensors[1]];
-            Layer {
+            DenseLayer {
                 outputs: weight.shape[0] as usize,
                 inputs: weight.shape[1] as usize,
                 weight: place(weight.len()),
@@ -74,12 +74,12 @@ impl Dense {
     }
 
     /// Allocates a buffer per layer, for `rows` rows.
-    pub fn places(&self, rows: usize) -> Layers {
-        let places = self
+    pub fn allocate(&self, rows: usize) -> Layers {
+        let allocate = self
             .layers
             .iter()
             .map(|layer| vec![0.0; rows * layer.outputs]);
-        places.collect()
+        allocate.collect()
     }
 
     fn inputs(&self) -> usize {
@@ -130,16 +130,22 @@ impl Dense {
         );
     }
 
-    /// Computes all hᵢ into `given`, from h₀ = `input`, `[rows, inputs]`.
-    pub fn forward(&self, team: &mut Team, parameters: &[f32], input: &[f32], given: &mut Layers) {
-        let mut parts = self.parts(input.len() / self.inputs(), team.size(), given);
+    /// Computes all hᵢ into `activations`, from h₀ = `input`, `[rows, inputs]`.
+    pub fn forward(
+        &self,
+        team: &mut Team,
+        parameters: &[f32],
+        input: &[f32],
+        activations: &mut Layers,
+    ) {
+        let mut parts = self.parts(input.len() / self.inputs(), team.size(), activations);
         team.split_rows(&mut parts, 1, 1, |_, parts| {
-            for Part { first, layers } in parts {
+            for RowGroup { first, layers } in parts {
                 let rows = layers[0].len() / self.layers[0].outputs;
                 let mut input = &input[*first * self.inputs()..][..rows * self.inputs()];
-                for (index, given) in layers.iter_mut().enumerate() {
-                    self.layer_forward(index, parameters, input, given);
-                    input = given;
+                for (index, activations) in layers.iter_mut().enumerate() {
+                    self.layer_forward(index, parameters, input, activations);
+                    input = activations;
                 }
             }
         });
@@ -178,18 +184,24 @@ impl Dense {
     }
 
     /// Computes the gradient in each layer's sums zᵢ = hᵢ₋₁ Wᵢᵀ + bᵢ. The caller fills the last
-    /// buffer of `grad`; this fills the others. `given`: activations of the same rows.
-    pub fn backward(&self, team: &mut Team, parameters: &[f32], given: &Layers, grad: &mut Layers) {
+    /// buffer of `grad`; this fills the others. `activations`: those of the same rows.
+    pub fn backward(
+        &self,
+        team: &mut Team,
+        parameters: &[f32],
+        activations: &Layers,
+        grad: &mut Layers,
+    ) {
         let rows = grad[0].len() / self.layers[0].outputs;
         let mut parts = self.parts(rows, team.size(), grad);
         team.split_rows(&mut parts, 1, 1, |_, parts| {
-            for Part { first, layers } in parts {
+            for RowGroup { first, layers } in parts {
                 for index in (1..layers.len()).rev() {
                     let [into, from] = &mut layers[index - 1..=index] else {
                         unreachable!("two layers side by side")
                     };
-                    let before =
-                        &given[index - 1][*first * self.layers[index - 1].outputs..][..into.len()];
+                    let before = &activations[index - 1][*first * self.layers[index - 1].outputs..]
+                        [..into.len()];
                     self.layer_backward(index, parameters, from, before, into);
                 }
             }
@@ -197,12 +209,12 @@ impl Dense {
     }
 
     /// Computes the gradient in some columns of the input, `[rows, columns]`, from the gradient in
-    /// the last layer's sums, `[rows, outputs]`. `given`: as for [`Dense::backward`].
+    /// the last layer's sums, `[rows, outputs]`. `activations`: as for [`Dense::backward`].
     pub fn backward_through(
         &self,
         team: &mut Team,
         parameters: &[f32],
-        given: &Layers,
+        activations: &Layers,
         grad: &[f32],
         columns: Range<usize>,
         into: &mut [f32],
@@ -220,7 +232,7 @@ impl Dense {
                     for index in (1..self.layers.len()).rev() {
                         let width = self.layers[index - 1].outputs;
                         to.resize(rows * width, 0.0);
-                        let before = &given[index - 1][start * width..][..rows * width];
+                        let before = &activations[index - 1][start * width..][..rows * width];
                         self.layer_backward(index, parameters, from, before, to);
                         std::mem::swap(from, to);
                     }
@@ -234,18 +246,22 @@ impl Dense {
     }
 
     /// Computes the gradient in all parameters, summed over rows: ∂Wᵢ = ∂zᵢᵀ hᵢ₋₁, ∂bᵢ = Σ ∂zᵢ.
-    /// `given` and `grad` have as many rows as `input`.
+    /// `activations` and `grad` have as many rows as `input`.
     pub fn gradient(
         &self,
         team: &mut Team,
         input: &[f32],
-        given: &Layers,
+        activations: &Layers,
         grad: &Layers,
         into: &mut [f32],
     ) {
         for (index, layer) in self.layers.iter().enumerate() {
             let (grad, inputs) = (&grad[index], layer.inputs);
-            let input = if index == 0 { input } else { &given[index - 1] };
+            let input = if index == 0 {
+                input
+            } else {
+                &activations[index - 1]
+            };
             let left = Matrix::of_rows(grad, layer.outputs);
             let right = Terms::Matrix(input, inputs);
             gradient(team, self.isa, left, right, &mut into[layer.weight.clone()]);
@@ -267,9 +283,9 @@ impl Dense {
     }
 
     /// Splits the rows into groups that go through all layers, equally many per member.
-    fn parts<'a>(&self, rows: usize, members: usize, layers: &'a mut Layers) -> Vec<Part<'a>> {
+    fn parts<'a>(&self, rows: usize, members: usize, layers: &'a mut Layers) -> Vec<RowGroup<'a>> {
         let rows_each = rows_each(rows, members);
-        let part = |first| Part {
+        let part = |first| RowGroup {
             first,
             layers: Vec::with_capacity(layers.len()),
         };
@@ -291,7 +307,7 @@ fn rows_each(rows: usize, members: usize) -> usize {
 }
 
 /// A group of rows, in the buffers of all layers.
-struct Part<'a> {
+struct RowGroup<'a> {
     first: usize,
     layers: Vec<&'a mut [f32]>,
 }

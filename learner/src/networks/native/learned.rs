@@ -2,7 +2,7 @@
 
 use skein_kernels::{AdamStep, Isa, Team};
 
-use crate::state::Part;
+use crate::state::StatePart;
 
 /// A network's parameters, or log α, with the state of its optimizer.
 #[derive(Debug)]
@@ -48,18 +48,18 @@ impl Learned {
     }
 
     /// The values under `name`, and Adam's state under names that begin with `adam`.
-    pub fn parts(&mut self, name: &str, adam: &str) -> Vec<(String, Part<'_>)> {
+    pub fn parts(&mut self, name: &str, adam: &str) -> Vec<(String, StatePart<'_>)> {
         vec![
-            (name.to_owned(), Part::Numbers(&mut self.values)),
+            (name.to_owned(), StatePart::Numbers(&mut self.values)),
             (
                 format!("{adam}.first_moment"),
-                Part::Numbers(&mut self.first_moment),
+                StatePart::Numbers(&mut self.first_moment),
             ),
             (
                 format!("{adam}.second_moment"),
-                Part::Numbers(&mut self.second_moment),
+                StatePart::Numbers(&mut self.second_moment),
             ),
-            (format!("{adam}.steps"), Part::Count(&mut self.steps)),
+            (format!("{adam}.steps"), StatePart::Count(&mut self.steps)),
         ]
     }
 }

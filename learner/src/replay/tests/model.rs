@@ -136,7 +136,10 @@ fn assert_same(replay: &Replay, model: &Model) {
 prop_compose! {
     /// Episodes of 1 to 12 steps with crossings anywhere and every outcome.
     fn episodes()(
-        shapes in prop::collection::vec((prop::collection::vec(prop::bool::weighted(0.2), 1..12), 0..3_usize), 1..20)
+        shapes in prop::collection::vec(
+            (prop::collection::vec(prop::bool::weighted(0.2), 1..12), 0..3_usize),
+            1..20,
+        )
     ) -> Vec<CommittedEpisode> {
         shapes
             .into_iter()
@@ -184,7 +187,11 @@ proptest! {
                 model.set_latents(|vector| final_code(vector[0] as u8));
             }
             let images_live = replay.image_count().is_some();
-            replay.insert(if images_live { with_images(episode.clone()) } else { episode.clone() }).unwrap();
+            let flown = match images_live {
+                true => with_images(episode.clone()),
+                false => episode.clone(),
+            };
+            replay.insert(flown).unwrap();
             model.insert(episode);
             assert_same(&replay, &model);
             let restored = Replay::restore(&config, replay.state()).unwrap();

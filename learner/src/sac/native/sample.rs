@@ -36,7 +36,7 @@ pub(super) struct Sample {
 
 impl Sample {
     /// Allocates buffers for `rows` rows.
-    pub(super) fn places(rows: usize) -> Self {
+    pub(super) fn allocate(rows: usize) -> Self {
         let element = || vec![0.0; rows * ACTION];
         Self {
             noise: element(),

@@ -112,14 +112,14 @@ fn assert_one_update_is_equal(
 
 #[test]
 fn gradients_and_one_update_are_the_references() {
-    // `told`: width of the critic's own input, if it has one.
-    for (number, (observation, told)) in OBSERVATIONS
+    // `critic_width`: width of the critic's own input, if it has one.
+    for (number, (observation, critic_width)) in OBSERVATIONS
         .into_iter()
         .zip([None, Some(5), Some(50)])
         .enumerate()
     {
         let inputs = Inputs {
-            critic: told.unwrap_or(observation),
+            critic: critic_width.unwrap_or(observation),
             ..Inputs::same(observation)
         };
         for (width, rows) in [
@@ -139,8 +139,8 @@ fn gradients_and_one_update_are_the_references() {
             let (mut native, mut torch) = both(&section, inputs, seed);
             let mut noise = Noise::new(seed);
             let mut transitions = Transitions::random(observation, rows, &mut noise);
-            if let Some(told) = told {
-                transitions = transitions.telling(told, &mut noise);
+            if let Some(critic_width) = critic_width {
+                transitions = transitions.with_critic_states(critic_width, &mut noise);
             }
             let context = format!(
                 "{observation} seen, width {width}, {rows} rows, {} networks",

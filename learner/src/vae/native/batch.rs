@@ -1,17 +1,17 @@
 //! Buffers of a minibatch, kept between its passes.
 
 use super::buffer::Buffer;
-use super::network::Network;
-use super::order::Affine;
+use super::network::VaeNetwork;
+use super::order::LayerRanges;
 use super::unfold;
 
 /// Activations, and the gradients of the loss in them, image by image, channels last. Reused from
 /// step to step. All shapes are per batch of n images.
 #[derive(Debug, Default)]
-pub(super) struct Batch {
+pub(super) struct BatchBuffers {
     /// Pixels, then the outputs of the encoder's four convolutions after ReLU, `[n, pixels,
     /// channels]` each.
-    pub(super) seen: [Buffer; 5],
+    pub(super) encoder_maps: [Buffer; 5],
     /// Mean and log-variance of the latent code, `[n, 2 latent]`.
     pub(super) heads: Buffer,
     /// Sampled latent codes, `[n, latent]`.
@@ -20,48 +20,54 @@ pub(super) struct Batch {
     pub(super) unfolded: Buffer,
     /// Outputs of the decoder's four transposed convolutions, `[n, pixels, channels]` each, after
     /// ReLU. The last one holds the gradient before its sigmoid after the backward pass.
-    pub(super) drawn: [Buffer; 4],
+    pub(super) decoder_maps: [Buffer; 4],
     /// Gradients before ReLU of the encoder's outputs, shaped like them; pixels need none.
-    pub(super) seen_flow: [Buffer; 4],
+    pub(super) encoder_maps_grad: [Buffer; 4],
     /// Gradient in `heads`, `[n, 2 latent]`.
-    pub(super) heads_flow: Buffer,
+    pub(super) heads_grad: Buffer,
     /// Gradient in `codes`, `[n, latent]`.
-    pub(super) codes_flow: Buffer,
+    pub(super) codes_grad: Buffer,
     /// Gradient before ReLU of `unfolded`, `[n, 3, 1024]`.
-    pub(super) unfolded_flow: Buffer,
+    pub(super) unfolded_grad: Buffer,
     /// Gradients before ReLU of the decoder's outputs, except the last one's.
-    pub(super) drawn_flow: [Buffer; 3],
+    pub(super) decoder_maps_grad: [Buffer; 3],
     /// Gradient in each bias of the encoder's convolutions, image by image, `[n, biases]`.
-    pub(super) seen_sums: Buffer,
+    pub(super) encoder_bias_sums: Buffer,
     /// Gradient in each bias of the decoder's convolutions, image by image, `[n, biases]`.
-    pub(super) drawn_sums: Buffer,
+    pub(super) decoder_bias_sums: Buffer,
     /// Squared error of each image, `[n]`.
     pub(super) errors: Vec<f64>,
 }
 
-impl Batch {
+impl BatchBuffers {
     /// Makes room for `images` images.
-    pub(super) fn resize(&mut self, network: &Network, images: usize) {
+    pub(super) fn resize(&mut self, network: &VaeNetwork, images: usize) {
         let latent = network.latent();
-        let (seen, drawn) = (network.seen_lens(), network.drawn_lens());
+        let (seen, drawn) = (network.encoder_lens(), network.decoder_lens());
         let resize = |buffers: &mut [Buffer], lens: &[usize]| {
             for (buffer, len) in buffers.iter_mut().zip(lens) {
                 buffer.resize(images * len);
             }
         };
-        resize(&mut self.seen, &seen);
-        resize(&mut self.seen_flow, &seen[1..]);
-        resize(&mut self.drawn, &drawn);
-        resize(&mut self.drawn_flow, &drawn[..3]);
+        resize(&mut self.encoder_maps, &seen);
+        resize(&mut self.encoder_maps_grad, &seen[1..]);
+        resize(&mut self.decoder_maps, &drawn);
+        resize(&mut self.decoder_maps_grad, &drawn[..3]);
         for (buffer, len) in [
             (&mut self.heads, 2 * latent),
-            (&mut self.heads_flow, 2 * latent),
+            (&mut self.heads_grad, 2 * latent),
             (&mut self.codes, latent),
-            (&mut self.codes_flow, latent),
+            (&mut self.codes_grad, latent),
             (&mut self.unfolded, unfold::INPUT_LEN),
-            (&mut self.unfolded_flow, unfold::INPUT_LEN),
-            (&mut self.seen_sums, sums_len(network.encoder_places())),
-            (&mut self.drawn_sums, sums_len(network.decoder_places())),
+            (&mut self.unfolded_grad, unfold::INPUT_LEN),
+            (
+                &mut self.encoder_bias_sums,
+                sums_len(network.encoder_places()),
+            ),
+            (
+                &mut self.decoder_bias_sums,
+                sums_len(network.decoder_places()),
+            ),
         ] {
             buffer.resize(images * len);
         }
@@ -70,7 +76,7 @@ impl Batch {
 }
 
 /// Length of an image's bias sums for these layers, in whole cache lines.
-fn sums_len(places: [&Affine; 4]) -> usize {
+fn sums_len(places: [&LayerRanges; 4]) -> usize {
     places
         .iter()
         .map(|place| place.bias.len())

@@ -11,7 +11,7 @@ const BOUND: f32 = LOG_VARIANCE_BOUND as f32;
 /// Samples codes as mean + std · noise (arXiv:1312.6114, section 2.4), `[n, latent]`. `heads`:
 /// means and unbounded log-variances side by side, `[n, 2 latent]`; `noise`: standard normal, `[n,
 /// latent]`. Returns the sum of the divergences from the standard normal, in nats (appendix B).
-pub(super) fn draw(
+pub(super) fn sample(
     isa: Isa,
     latent: usize,
     heads: &[f32],
@@ -43,36 +43,37 @@ pub(super) fn draw(
 
 /// Computes the gradient in the heads, `[n, 2 latent]`, from the gradient in the codes, `[n,
 /// latent]`, and from the divergence, weighted by `divergence_weight`.
-pub(super) fn flow_back(
+pub(super) fn backward(
     isa: Isa,
     latent: usize,
     heads: &[f32],
     noise: &[f32],
-    codes_flow: &[f32],
+    codes_grad: &[f32],
     divergence_weight: f32,
-    heads_flow: &mut [f32],
+    heads_grad: &mut [f32],
 ) {
     let rows = heads
         .chunks_exact(2 * latent)
         .zip(noise.chunks_exact(latent));
-    let flows = codes_flow
+    let grads = codes_grad
         .chunks_exact(latent)
-        .zip(heads_flow.chunks_exact_mut(2 * latent));
-    for ((heads, noise), (grad, into)) in rows.zip(flows) {
+        .zip(heads_grad.chunks_exact_mut(2 * latent));
+    for ((heads, noise), (grad, into)) in rows.zip(grads) {
         let (means, log_variances) = heads.split_at(latent);
-        let (mean_flow, log_variance_flow) = into.split_at_mut(latent);
+        let (mean_grad, log_variance_grad) = into.split_at_mut(latent);
         isa.vectorised(
             #[inline(always)]
             || {
                 for place in 0..latent {
                     let (mean, unbounded) = (means[place], log_variances[place]);
                     let log_variance = unbounded.clamp(-BOUND, BOUND);
-                    mean_flow[place] = divergence_weight.mul_add(mean, grad[place]);
+                    mean_grad[place] = divergence_weight.mul_add(mean, grad[place]);
                     let drawn = 0.5 * grad[place] * noise[place] * exp(0.5 * log_variance);
-                    let flow = (0.5 * divergence_weight).mul_add(exp(log_variance) - 1.0, drawn);
+                    let gradient =
+                        (0.5 * divergence_weight).mul_add(exp(log_variance) - 1.0, drawn);
                     // The log-variance has no effect outside its bounds.
-                    log_variance_flow[place] = if (-BOUND..=BOUND).contains(&unbounded) {
-                        flow
+                    log_variance_grad[place] = if (-BOUND..=BOUND).contains(&unbounded) {
+                        gradient
                     } else {
                         0.0
                     };
@@ -94,7 +95,7 @@ mod tests {
         // ½ (1 + (2 - ln 2 - 1)) for the first code, 0 for the second, which is the prior.
         (heads[0], heads[LATENT + 1]) = (1.0, 2.0_f32.ln());
         let mut codes = [0.0; 2 * LATENT];
-        let found = draw(Isa::best(), LATENT, &heads, &[0.5; 2 * LATENT], &mut codes);
+        let found = sample(Isa::best(), LATENT, &heads, &[0.5; 2 * LATENT], &mut codes);
         let expected = 0.5 * (1.0 + 1.0 - std::f64::consts::LN_2);
         assert!((found - expected).abs() < 1e-6, "{found} is not {expected}");
         assert_eq!((codes[0], codes[2], codes[LATENT]), (1.5, 0.5, 0.5));
@@ -113,7 +114,7 @@ mod tests {
         let weight = 0.3;
         let loss = |heads: &[f32]| {
             let mut codes = [0.0; LATENT];
-            let divergence = draw(Isa::best(), LATENT, heads, &noise, &mut codes);
+            let divergence = sample(Isa::best(), LATENT, heads, &noise, &mut codes);
             let linear: f64 = codes
                 .iter()
                 .zip(&grad)
@@ -122,7 +123,7 @@ mod tests {
             linear + f64::from(weight) * divergence
         };
         let mut found = [0.0; 2 * LATENT];
-        flow_back(
+        backward(
             Isa::best(),
             LATENT,
             &heads,

@@ -9,26 +9,26 @@ use skein_kernels::{
     Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product, spread,
 };
 
-use super::order::Affine;
+use super::order::LayerRanges;
 
 /// Stride of every kernel.
 pub(super) const STRIDE: usize = 2;
 
 /// A layer with weights `[channels, window]`.
 #[derive(Debug)]
-pub(super) struct Layer {
+pub(super) struct ConvLayer {
     pub(super) windows: Windows,
     /// Number of channels per row.
     pub(super) channels: usize,
-    pub(super) place: Affine,
+    pub(super) place: LayerRanges,
     /// Weights packed for looking, `[window, channels]`.
     looking: Panels,
     /// Weights packed for spreading, `[channels, window]`.
     spreading: Panels,
 }
 
-impl Layer {
-    pub(super) fn new(isa: Isa, windows: Windows, channels: usize, place: Affine) -> Self {
+impl ConvLayer {
+    pub(super) fn new(isa: Isa, windows: Windows, channels: usize, place: LayerRanges) -> Self {
         assert_eq!(
             place.weight.len(),
             channels * windows.window_len(),
@@ -104,18 +104,18 @@ impl Layer {
 
 /// A fully connected layer with weights `[outputs, inputs]`.
 #[derive(Debug)]
-pub(super) struct Linear {
+pub(super) struct LinearLayer {
     pub(super) inputs: usize,
     pub(super) outputs: usize,
-    pub(super) place: Affine,
+    pub(super) place: LayerRanges,
     /// Weights packed for the forward pass, `[inputs, outputs]`.
     forward: Panels,
     /// Weights packed for the backward pass, `[outputs, inputs]`.
     backward: Panels,
 }
 
-impl Linear {
-    pub(super) fn new(isa: Isa, inputs: usize, outputs: usize, place: Affine) -> Self {
+impl LinearLayer {
+    pub(super) fn new(isa: Isa, inputs: usize, outputs: usize, place: LayerRanges) -> Self {
         assert_eq!(
             (place.weight.len(), place.bias.len()),
             (inputs * outputs, outputs),

@@ -8,7 +8,7 @@ use super::unfold::UnfoldScratch;
 
 /// Working memory of one team member.
 #[derive(Debug)]
-pub(super) struct Member {
+pub(super) struct MemberScratch {
     pub(super) columns: Vec<f32>,
     pub(super) unfold: UnfoldScratch,
     /// Encoder outputs of one image, for encoding without a batch.
@@ -16,7 +16,7 @@ pub(super) struct Member {
     pub(super) watch: Stopwatch,
 }
 
-impl Member {
+impl MemberScratch {
     pub(super) fn new(isa: Isa) -> Self {
         Self {
             columns: Vec::new(),
@@ -31,9 +31,9 @@ impl Member {
 /// item.
 pub(super) fn share<T: Send>(
     team: &mut Team,
-    members: &mut [Member],
+    members: &mut [MemberScratch],
     items: &mut [T],
-    work: impl Fn(usize, &mut T, &mut Member) + Sync,
+    work: impl Fn(usize, &mut T, &mut MemberScratch) + Sync,
 ) {
     let (size, count) = (members.len(), items.len());
     let (mut rest, mut first) = (items, 0);

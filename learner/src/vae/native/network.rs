@@ -5,8 +5,8 @@ use skein_protocol::snapshot::{ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNE
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
 
 use super::elementwise::{LANES, fill, rectify, scale};
-use super::layer::{Layer, Linear, STRIDE};
-use super::order::{Affine, Order};
+use super::layer::{ConvLayer, LinearLayer, STRIDE};
+use super::order::{LayerRanges, ParameterOrder};
 use super::stopwatch::{Pass, Stopwatch};
 use super::unfold::{self, Unfold};
 
@@ -23,28 +23,28 @@ pub(super) const DECODER: usize = 7;
 
 /// All layers of the VAE.
 #[derive(Debug)]
-pub(super) struct Network {
+pub(super) struct VaeNetwork {
     isa: Isa,
-    pub(super) encoder: [Layer; 4],
+    pub(super) encoder: [ConvLayer; 4],
     /// Both heads as one layer: mean, then log-variance.
-    pub(super) heads: Linear,
+    pub(super) heads: LinearLayer,
     /// Weights of the mean head alone, `[3072, latent]`, for encoding.
     mean: Panels,
-    pub(super) linear: Linear,
+    pub(super) linear: LinearLayer,
     pub(super) unfold: Unfold,
     /// Transposed convolutions after the first one.
-    pub(super) decoder: [Layer; 3],
+    pub(super) decoder: [ConvLayer; 3],
 }
 
-impl Network {
+impl VaeNetwork {
     /// Describes the network for codes of `latent` numbers.
-    pub(super) fn new(isa: Isa, latent: usize, order: &Order) -> Self {
+    pub(super) fn new(isa: Isa, latent: usize, order: &ParameterOrder) -> Self {
         let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
         let encoder = std::array::from_fn(|index| {
             let windows = Windows::new(size, ENCODER_CHANNELS[index], [ENCODER_KERNEL; 2], STRIDE);
             size = windows.positions();
             let place = order.layer(&format!("encoder.conv{}", index + 1));
-            Layer::new(isa, windows, ENCODER_CHANNELS[index + 1], place)
+            ConvLayer::new(isa, windows, ENCODER_CHANNELS[index + 1], place)
         });
         assert!(
             (2 * latent).is_multiple_of(LANES),
@@ -64,7 +64,7 @@ impl Network {
             size = grown(size, kernel);
             let windows = Windows::new(size, DECODER_CHANNELS[layer + 1], kernel, STRIDE);
             let place = order.layer(&format!("decoder.conv{}", layer + 1));
-            Layer::new(isa, windows, DECODER_CHANNELS[layer], place)
+            ConvLayer::new(isa, windows, DECODER_CHANNELS[layer], place)
         });
         assert_eq!(
             size,
@@ -74,9 +74,9 @@ impl Network {
         Self {
             isa,
             encoder,
-            heads: Linear::new(isa, ENCODER_FEATURES, 2 * latent, heads),
+            heads: LinearLayer::new(isa, ENCODER_FEATURES, 2 * latent, heads),
             mean: Panels::new(isa),
-            linear: Linear::new(
+            linear: LinearLayer::new(
                 isa,
                 latent,
                 unfold::INPUT_LEN,
@@ -94,7 +94,7 @@ impl Network {
             .pack(Matrix::of_rows(mean, ENCODER_FEATURES).transposed());
         self.heads.pack(parameters);
         self.linear.pack(parameters);
-        let mut layers: Vec<&mut Layer> =
+        let mut layers: Vec<&mut ConvLayer> =
             self.encoder.iter_mut().chain(&mut self.decoder).collect();
         team.split_rows(&mut layers, 1, 1, |_, layers| {
             layers.iter_mut().for_each(|layer| layer.pack(parameters));
@@ -103,7 +103,7 @@ impl Network {
 
     /// Runs the encoder's convolutions: depth, `[72, 128]`, to pixels in [0, 1] and four feature
     /// maps, the last of which are the features.
-    pub(super) fn see(
+    pub(super) fn encoder_forward(
         &self,
         parameters: &[f32],
         depth: &[u8],
@@ -136,7 +136,7 @@ impl Network {
 
     /// Runs the decoder's convolutions for image `index` of a batch whose codes have gone through
     /// [`Unfold::multiply`]. Fills four feature maps, the last one before its sigmoid.
-    pub(super) fn draw(
+    pub(super) fn decoder_forward(
         &self,
         parameters: &[f32],
         index: usize,
@@ -145,7 +145,7 @@ impl Network {
         watch: &mut Stopwatch,
     ) {
         let [first, rest @ ..] = images;
-        let bias = |place: &Affine| &parameters[place.bias.clone()];
+        let bias = |place: &LayerRanges| &parameters[place.bias.clone()];
         self.unfold
             .add_up(self.isa, bias(&self.unfold.place), index, first);
         rectify(self.isa, first);
@@ -163,25 +163,25 @@ impl Network {
     }
 
     /// Lengths of the pixels and of each of the encoder's feature maps.
-    pub(super) fn seen_lens(&self) -> [usize; 5] {
+    pub(super) fn encoder_lens(&self) -> [usize; 5] {
         let [a, b, c, d] = [0, 1, 2, 3].map(|layer| self.encoder[layer].rows_len());
         [IMAGE_PIXELS, a, b, c, d]
     }
 
     /// Lengths of the decoder's feature maps.
-    pub(super) fn drawn_lens(&self) -> [usize; 4] {
+    pub(super) fn decoder_lens(&self) -> [usize; 4] {
         let [a, b, c] = [0, 1, 2].map(|layer| self.decoder[layer].windows.image_len());
         [unfold::IMAGE_LEN, a, b, c]
     }
 
     /// Parameter ranges of the encoder's convolutions, in order. Each image has its own sums for
     /// their biases.
-    pub(super) fn encoder_places(&self) -> [&Affine; 4] {
+    pub(super) fn encoder_places(&self) -> [&LayerRanges; 4] {
         [0, 1, 2, 3].map(|layer| &self.encoder[layer].place)
     }
 
     /// Parameter ranges of the decoder's convolutions, in order.
-    pub(super) fn decoder_places(&self) -> [&Affine; 4] {
+    pub(super) fn decoder_places(&self) -> [&LayerRanges; 4] {
         let [a, b, c] = [0, 1, 2].map(|layer| &self.decoder[layer].place);
         [&self.unfold.place, a, b, c]
     }

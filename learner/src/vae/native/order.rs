@@ -11,14 +11,14 @@ use crate::networks::Layout;
 
 /// Ranges of a layer's two tensors in the parameter vector.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct Affine {
+pub(super) struct LayerRanges {
     pub(super) weight: Range<usize>,
     pub(super) bias: Range<usize>,
 }
 
 /// A tensor of PyTorch's as four dimensions, with the permutation that leads to the native order.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Entry {
+struct OrderedTensor {
     /// Shape in PyTorch's order.
     name: String,
     /// Dimensions of `shape` from the outermost to the innermost in native order.
@@ -30,9 +30,9 @@ struct Entry {
 
 /// The order of the parameters.
 #[derive(Debug, Clone)]
-pub(super) struct Order {
+pub(super) struct ParameterOrder {
     /// Tensors, in PyTorch's order.
-    entries: Vec<Entry>,
+    entries: Vec<OrderedTensor>,
 }
 
 /// Returns the four dimensions of a tensor of this name and shape, and their native order.
@@ -68,17 +68,17 @@ const FEATURE_CHANNELS: usize = 256;
 /// Channels of the decoder's first feature map.
 const UNFOLDED_CHANNELS: usize = 1024;
 
-impl Order {
+impl ParameterOrder {
     /// Returns the order for the tensors of `layout`, encoder and decoder.
     pub(super) fn of(layout: &Layout) -> Self {
-        let mut entries: Vec<Entry> = layout
+        let mut entries: Vec<OrderedTensor> = layout
             .tensors()
             .iter()
             .map(|tensor| {
                 let shape: Vec<usize> = tensor.shape.iter().map(|&size| size as usize).collect();
                 let (shape, axes) = arranged(&tensor.name, &shape);
                 let name = tensor.name.clone();
-                Entry {
+                OrderedTensor {
                     name,
                     shape,
                     axes,
@@ -107,8 +107,8 @@ impl Order {
     ///
     /// # Panics
     /// When there is no such layer.
-    pub(super) fn layer(&self, name: &str) -> Affine {
-        Affine {
+    pub(super) fn layer(&self, name: &str) -> LayerRanges {
+        LayerRanges {
             weight: self.tensor(&format!("{name}.weight")),
             bias: self.tensor(&format!("{name}.bias")),
         }
@@ -166,7 +166,7 @@ impl Order {
     }
 }
 
-impl Entry {
+impl OrderedTensor {
     fn len(&self) -> usize {
         self.shape.iter().product()
     }
@@ -179,13 +179,13 @@ mod tests {
     use super::*;
     use crate::networks::{Decoder, Encoder};
 
-    fn order(latent: usize) -> (Order, usize) {
+    fn order(latent: usize) -> (ParameterOrder, usize) {
         let mut layout = Layout::default();
         let _ = (
             Encoder::describe(&mut layout, latent),
             Decoder::describe(&mut layout, latent, DecoderName::Plain),
         );
-        (Order::of(&layout), layout.len())
+        (ParameterOrder::of(&layout), layout.len())
     }
 
     #[test]
@@ -209,7 +209,7 @@ mod tests {
             let entries = order.entries.iter();
             entries
                 .take_while(|entry| entry.name != name)
-                .map(Entry::len)
+                .map(OrderedTensor::len)
                 .sum::<usize>()
         };
         // encoder.conv2 [64, 32, 4, 4]: output 5, input 7, kernel row 1, kernel column 2.

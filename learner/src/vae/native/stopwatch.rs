@@ -34,7 +34,7 @@ impl Pass {
 
 /// Seconds by layer and pass, summed over all team members.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Spent {
+pub struct LayerTimes {
     /// Seconds, `[layer][pass]`, in the order of [`LAYERS`] and [`Pass::ALL`].
     pub layers: [[f64; 3]; 10],
     /// Seconds spent on Adam and on packing the weights for the next step.
@@ -43,7 +43,7 @@ pub struct Spent {
     pub rest: f64,
 }
 
-impl Spent {
+impl LayerTimes {
     /// Adds the times of another member.
     pub(super) fn add(&mut self, other: &Self) {
         for (own, other) in self
@@ -68,14 +68,14 @@ impl Spent {
 #[derive(Debug)]
 pub(super) struct Stopwatch {
     last: Instant,
-    pub(super) spent: Spent,
+    pub(super) times: LayerTimes,
 }
 
 impl Default for Stopwatch {
     fn default() -> Self {
         Self {
             last: Instant::now(),
-            spent: Spent::default(),
+            times: LayerTimes::default(),
         }
     }
 }
@@ -88,17 +88,17 @@ impl Stopwatch {
 
     /// Books the lap under a layer's pass.
     pub(super) fn layer(&mut self, layer: usize, pass: Pass) {
-        self.spent.layers[layer][pass as usize] += self.lap();
+        self.times.layers[layer][pass as usize] += self.lap();
     }
 
     /// Books the lap under Adam and packing.
     pub(super) fn adam_and_packing(&mut self) {
-        self.spent.adam_and_packing += self.lap();
+        self.times.adam_and_packing += self.lap();
     }
 
     /// Books the lap under the rest.
     pub(super) fn rest(&mut self) {
-        self.spent.rest += self.lap();
+        self.times.rest += self.lap();
     }
 
     fn lap(&mut self) -> f64 {

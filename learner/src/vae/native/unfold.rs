@@ -13,7 +13,7 @@ use skein_kernels::{
 use super::buffer::Buffer;
 use super::elementwise::{fill, squares};
 use super::layer::STRIDE;
-use super::order::Affine;
+use super::order::LayerRanges;
 
 /// Rows of the image and of the kernel: the input has one row, so kernel row k makes image row k
 /// and nothing else.
@@ -31,8 +31,8 @@ const ROW: usize = (STRIDE * (INPUTS - 1) + KERNEL_WIDTH) * CHANNELS;
 /// Lengths of the input and of the image.
 pub(super) const INPUT_LEN: usize = INPUTS * INPUT_CHANNELS;
 pub(super) const IMAGE_LEN: usize = ROWS * ROW;
-/// Blocks that a run is cut into. One: [`super::order::Order`] keeps the weights of a kernel row as
-/// `[1024, 7 · 128]`, so blocks of less would read them in the wrong order.
+/// Blocks that a run is cut into. One: [`super::order::ParameterOrder`] keeps the weights of a
+/// kernel row as `[1024, 7 · 128]`, so blocks of less would read them in the wrong order.
 pub(super) const PARTS: usize = 1;
 /// Numbers of a run in a block.
 const PART: usize = RUN / PARTS;
@@ -44,7 +44,7 @@ const BLOCK: usize = INPUT_CHANNELS * PART;
 /// The layer's packed weights and the batch's columns.
 #[derive(Debug)]
 pub(super) struct Unfold {
-    pub(super) place: Affine,
+    pub(super) place: LayerRanges,
     /// Of each block, `[1024, PART]`.
     panels: [Panels; BLOCKS],
     /// The block weights seen as an image, so that a window holds all weights of one input channel.
@@ -86,7 +86,7 @@ pub(super) struct Block<'a> {
 }
 
 impl Unfold {
-    pub(super) fn new(isa: Isa, place: Affine) -> Self {
+    pub(super) fn new(isa: Isa, place: LayerRanges) -> Self {
         assert_eq!(place.weight.len(), BLOCKS * BLOCK, "the layer's weights");
         Self {
             place,
