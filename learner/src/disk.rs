@@ -1,9 +1,9 @@
 //! A full disk pauses the learner and loses nothing.
 //!
 //! A writer that finds no room warns, waits, and tries again until there is room or the run must
-//! stop. What was learned stays in memory meanwhile. [`Disk::with_room`] repeats the write of a whole
-//! file; [`PatientWriter`] continues a file that is appended to, so that nothing is written twice.
-//! Every other failure is returned to the caller.
+//! stop. What was learned stays in memory meanwhile. [`Disk::with_room`] repeats the write of a
+//! whole file; [`PatientWriter`] continues a file that is appended to, so that nothing is written
+//! twice. Every other failure is returned to the caller.
 
 use std::error::Error;
 use std::io::{self, ErrorKind, Write};

@@ -38,8 +38,8 @@ impl Critic {
         Self { networks }
     }
 
-    /// Returns both estimates of Q, `[n, 2]`. `observations`: `[n, observation]`, `actions`: `[n,
-    /// 2]`.
+    /// Returns both estimates of Q, `[n, 2]`. `observations`: `[n, observation]`, `actions`:
+    /// `[n, 2]`.
     pub fn forward(
         &self,
         parameters: &Parameters,

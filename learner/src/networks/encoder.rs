@@ -109,8 +109,8 @@ impl Encoder {
         self.published_len
     }
 
-    /// Returns the distribution of the latent code and the feature maps on the way. `pixels`: `[n,
-    /// 1, 72, 128]` in [0, 1].
+    /// Returns the distribution of the latent code and the feature maps on the way. `pixels`:
+    /// `[n, 1, 72, 128]` in [0, 1].
     pub fn encode(&self, parameters: &Parameters, pixels: &Tensor) -> Encoded {
         let [first, second, third, last] = self.published.maps(parameters, pixels);
         let features = last.flatten(1, -1);

@@ -155,7 +155,8 @@ impl Parameters {
         &self.views[place]
     }
 
-    /// Gradient of the scalar `loss` in all parameters, flat. Consumes the graph behind `loss`.
+    /// Gradient of the scalar `loss` with respect to all parameters, flat. Consumes the graph
+    /// behind `loss`.
     pub fn gradient(&self, loss: &Tensor) -> Tensor {
         let gradients = Tensor::run_backward(&[loss], &self.views, false, false);
         let flattened: Vec<Tensor> = gradients

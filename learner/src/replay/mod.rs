@@ -251,8 +251,8 @@ impl Replay {
         self.regular.forget_images();
     }
 
-    /// Recomputes every stored latent code with `encode`, which maps up to `chunk` images, `[n, 72,
-    /// 128]`, to as many codes. Does nothing once the VAE is frozen.
+    /// Recomputes every stored latent code with `encode`, which maps up to `chunk` images,
+    /// `[n, 72, 128]`, to as many codes. Does nothing once the VAE is frozen.
     ///
     /// # Errors
     /// The first error of `encode`; the buffer is unchanged then.

@@ -7,8 +7,8 @@
 use skein_protocol::config::{Config, CriticInput, View};
 use skein_protocol::{ACTION, LatentCode, TRUE_STATE};
 
-/// Layout of a row: `[observation | next observation | true state | next true state | action |
-/// reward | terminated]`, all `f32`.
+/// Layout of a row: observation, next observation, true state, next true state, action, reward,
+/// terminated, all `f32`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RowLayout {
     /// Length of an observation vector.
@@ -242,8 +242,8 @@ impl Ring {
 pub struct RingState {
     /// Number of transitions ever inserted.
     pub inserted: u64,
-    /// Rows in slot order, `[filled, width]`: `[observation | next observation | true state | next
-    /// true state | action | reward | terminated]`.
+    /// Rows in slot order, `[filled, width]`, laid out as observation, next observation, true
+    /// state, next true state, action, reward, terminated.
     pub rows: Vec<f32>,
     /// Number of the depth image of each row's observation, `[filled]`; empty once no images are
     /// kept.

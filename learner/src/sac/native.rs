@@ -65,15 +65,16 @@ struct UpdateBuffers {
     /// Critic activations: for the replayed actions, then overwritten by those for the drawn
     /// actions.
     critic: CriticLayers,
-    /// Gradient of the critic loss in the critic's activations, for the replayed actions.
+    /// Gradient of the critic loss with respect to the critic's activations, for the replayed
+    /// actions.
     critic_grad: CriticLayers,
-    /// Gradient of the policy loss in the two estimates of Q(s, a), `[rows, 2]`.
+    /// Gradient of the policy loss with respect to the two estimates of Q(s, a), `[rows, 2]`.
     drawn_grad: Vec<f32>,
-    /// Gradient of the policy loss in the drawn actions, through Q, `[rows, 2]`.
+    /// Gradient of the policy loss with respect to the drawn actions, through Q, `[rows, 2]`.
     action_gradient: Vec<f32>,
     /// Policy activations for the current states s, `[rows, width]` per layer.
     policy: Layers,
-    /// Gradient of the policy loss in those activations.
+    /// Gradient of the policy loss with respect to those activations.
     policy_grad: Layers,
 }
 

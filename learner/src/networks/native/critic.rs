@@ -18,11 +18,12 @@ pub struct NativeCritic {
     len: usize,
 }
 
-/// Activations of the critic's networks for some rows, or gradients in them.
+/// Activations of the critic's networks for some rows, or the loss's gradients with respect
+/// to them.
 #[derive(Debug, Default)]
 pub struct CriticLayers {
     networks: Vec<Layers>,
-    /// Both estimates, `[rows, 2]`, or the gradient in them.
+    /// Both estimates, `[rows, 2]`, or the gradient with respect to them.
     pub values: Vec<f32>,
 }
 
@@ -80,7 +81,8 @@ impl NativeCritic {
         }
     }
 
-    /// Computes the gradient in all parameters, from the gradient in the estimates, `grad.values`.
+    /// Computes the gradient with respect to all parameters, from the gradient with respect to the
+    /// estimates, `grad.values`.
     pub fn gradient(
         &self,
         team: &mut Team,
@@ -101,8 +103,8 @@ impl NativeCritic {
         }
     }
 
-    /// Computes the gradient in some columns of the input, `[rows, columns]`, from the gradient in
-    /// the estimates, `[rows, 2]`.
+    /// Computes the gradient with respect to some columns of the input, `[rows, columns]`, from the
+    /// gradient with respect to the estimates, `[rows, 2]`.
     pub fn backward_through(
         &self,
         team: &mut Team,
@@ -137,8 +139,8 @@ impl NativeCritic {
     }
 }
 
-/// Copies the output of network `number`, `[rows, outputs]`, to its columns of `values`, `[rows,
-/// 2]`.
+/// Copies the output of network `number`, `[rows, outputs]`, to its columns of `values`,
+/// `[rows, 2]`.
 fn scatter(own: &[f32], number: usize, values: &mut [f32]) {
     let each = ESTIMATES * own.len() / values.len();
     for (own, values) in own

@@ -21,7 +21,8 @@ const ROW_GRAIN: usize = 12;
 /// Columns of a bias's gradient that stay with one member.
 const COLUMN_GRAIN: usize = 64;
 
-/// One buffer per layer, `[rows, outputs]` each: its activations, or the gradient in its sums.
+/// One buffer per layer, `[rows, outputs]` each: its activations, or the gradient with respect to
+/// its sums.
 pub type Layers = Vec<Vec<f32>>;
 
 thread_local! {
@@ -183,8 +184,8 @@ impl Dense {
         });
     }
 
-    /// Computes the gradient in each layer's sums zᵢ = hᵢ₋₁ Wᵢᵀ + bᵢ. The caller fills the last
-    /// buffer of `grad`; this fills the others. `activations`: those of the same rows.
+    /// Computes the gradient with respect to each layer's sums zᵢ = hᵢ₋₁ Wᵢᵀ + bᵢ. The caller fills
+    /// the last buffer of `grad`; this fills the others. `activations`: those of the same rows.
     pub fn backward(
         &self,
         team: &mut Team,
@@ -208,8 +209,9 @@ impl Dense {
         });
     }
 
-    /// Computes the gradient in some columns of the input, `[rows, columns]`, from the gradient in
-    /// the last layer's sums, `[rows, outputs]`. `activations`: as for [`Dense::backward`].
+    /// Computes the gradient with respect to some columns of the input, `[rows, columns]`, from the
+    /// gradient with respect to the last layer's sums, `[rows, outputs]`. `activations`: as for
+    /// [`Dense::backward`].
     pub fn backward_through(
         &self,
         team: &mut Team,
@@ -245,8 +247,8 @@ impl Dense {
         });
     }
 
-    /// Computes the gradient in all parameters, summed over rows: ∂Wᵢ = ∂zᵢᵀ hᵢ₋₁, ∂bᵢ = Σ ∂zᵢ.
-    /// `activations` and `grad` have as many rows as `input`.
+    /// Computes the gradient with respect to all parameters, summed over rows:
+    /// ∂Wᵢ = ∂zᵢᵀ hᵢ₋₁, ∂bᵢ = Σ ∂zᵢ. `activations` and `grad` have as many rows as `input`.
     pub fn gradient(
         &self,
         team: &mut Team,

@@ -460,8 +460,8 @@ fn content_of_another_shape_is_not_restored() {
     );
 }
 
-/// Prints the time of a minibatch: `cargo test --release -p skein-learner -- --ignored --nocapture
-/// minibatch_of_256`.
+/// Prints the time of a minibatch:
+/// `cargo test --release -p skein-learner -- --ignored --nocapture minibatch_of_256`.
 #[test]
 #[ignore = "a measurement, not a claim"]
 fn time_of_a_minibatch_of_256_from_a_full_buffer() {

@@ -104,9 +104,9 @@ impl Sample {
         }
     }
 
-    /// Computes the gradient in the policy network's output, `[rows, 4]`, for the rows after the
-    /// first `skipped`. Incoming gradients: `log_prob_gradient` in each log π, `action_gradient`,
-    /// `[rows, 2]`, in the actions.
+    /// Computes the gradient with respect to the policy network's output, `[rows, 4]`, for the rows
+    /// after the first `skipped`. Incoming gradients: `log_prob_gradient`, with respect to each
+    /// log π, and `action_gradient`, `[rows, 2]`, with respect to the actions.
     ///
     /// ∂log π/∂x = 2 tanh x; ∂a/∂x = 1 - tanh²x; ∂x/∂mean = 1; ∂x/∂log_std = std · noise; log_std
     /// also enters log π directly, ∂log π/∂log_std = -1. No gradient passes a bound of log_std.

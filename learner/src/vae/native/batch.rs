@@ -5,12 +5,12 @@ use super::network::VaeNetwork;
 use super::order::LayerRanges;
 use super::unfold;
 
-/// Activations, and the gradients of the loss in them, image by image, channels last. Reused from
-/// step to step. All shapes are per batch of n images.
+/// Activations, and the gradients of the loss with respect to them, image by image, channels last.
+/// Reused from step to step. All shapes are per batch of n images.
 #[derive(Debug, Default)]
 pub(super) struct BatchBuffers {
-    /// Pixels, then the outputs of the encoder's four convolutions after ReLU, `[n, pixels,
-    /// channels]` each.
+    /// Pixels, then the outputs of the encoder's four convolutions after ReLU,
+    /// `[n, pixels, channels]` each.
     pub(super) encoder_maps: [Buffer; 5],
     /// Mean and log-variance of the latent code, `[n, 2 latent]`.
     pub(super) heads: Buffer,
@@ -23,17 +23,19 @@ pub(super) struct BatchBuffers {
     pub(super) decoder_maps: [Buffer; 4],
     /// Gradients before ReLU of the encoder's outputs, shaped like them; pixels need none.
     pub(super) encoder_maps_grad: [Buffer; 4],
-    /// Gradient in `heads`, `[n, 2 latent]`.
+    /// Gradient with respect to `heads`, `[n, 2 latent]`.
     pub(super) heads_grad: Buffer,
-    /// Gradient in `codes`, `[n, latent]`.
+    /// Gradient with respect to `codes`, `[n, latent]`.
     pub(super) codes_grad: Buffer,
     /// Gradient before ReLU of `unfolded`, `[n, 3, 1024]`.
     pub(super) unfolded_grad: Buffer,
     /// Gradients before ReLU of the decoder's outputs, except the last one's.
     pub(super) decoder_maps_grad: [Buffer; 3],
-    /// Gradient in each bias of the encoder's convolutions, image by image, `[n, biases]`.
+    /// Gradient with respect to each bias of the encoder's convolutions, image by image,
+    /// `[n, biases]`.
     pub(super) encoder_bias_sums: Buffer,
-    /// Gradient in each bias of the decoder's convolutions, image by image, `[n, biases]`.
+    /// Gradient with respect to each bias of the decoder's convolutions, image by image,
+    /// `[n, biases]`.
     pub(super) decoder_bias_sums: Buffer,
     /// Squared error of each image, `[n]`.
     pub(super) errors: Vec<f64>,
@@ -43,16 +45,16 @@ impl BatchBuffers {
     /// Makes room for `images` images.
     pub(super) fn resize(&mut self, network: &VaeNetwork, images: usize) {
         let latent = network.latent();
-        let (seen, drawn) = (network.encoder_lens(), network.decoder_lens());
+        let (encoder, decoder) = (network.encoder_lens(), network.decoder_lens());
         let resize = |buffers: &mut [Buffer], lens: &[usize]| {
             for (buffer, len) in buffers.iter_mut().zip(lens) {
                 buffer.resize(images * len);
             }
         };
-        resize(&mut self.encoder_maps, &seen);
-        resize(&mut self.encoder_maps_grad, &seen[1..]);
-        resize(&mut self.decoder_maps, &drawn);
-        resize(&mut self.decoder_maps_grad, &drawn[..3]);
+        resize(&mut self.encoder_maps, &encoder);
+        resize(&mut self.encoder_maps_grad, &encoder[1..]);
+        resize(&mut self.decoder_maps, &decoder);
+        resize(&mut self.decoder_maps_grad, &decoder[..3]);
         for (buffer, len) in [
             (&mut self.heads, 2 * latent),
             (&mut self.heads_grad, 2 * latent),

@@ -9,8 +9,9 @@ use crate::networks::LOG_VARIANCE_BOUND;
 const BOUND: f32 = LOG_VARIANCE_BOUND as f32;
 
 /// Samples codes as mean + std · noise (arXiv:1312.6114, section 2.4), `[n, latent]`. `heads`:
-/// means and unbounded log-variances side by side, `[n, 2 latent]`; `noise`: standard normal, `[n,
-/// latent]`. Returns the sum of the divergences from the standard normal, in nats (appendix B).
+/// means and unbounded log-variances side by side, `[n, 2 latent]`; `noise`: standard normal,
+/// `[n, latent]`. Returns the sum of the divergences from the standard normal, in nats (appendix
+/// B).
 pub(super) fn sample(
     isa: Isa,
     latent: usize,
@@ -41,8 +42,8 @@ pub(super) fn sample(
     0.5 * total
 }
 
-/// Computes the gradient in the heads, `[n, 2 latent]`, from the gradient in the codes, `[n,
-/// latent]`, and from the divergence, weighted by `divergence_weight`.
+/// Computes the gradient with respect to the heads, `[n, 2 latent]`, from the gradient with respect
+/// to the codes, `[n, latent]`, and from the divergence, weighted by `divergence_weight`.
 pub(super) fn backward(
     isa: Isa,
     latent: usize,

@@ -77,7 +77,7 @@ impl ConvLayer {
     }
 
     /// Computes the weights' gradient from rows and images of the whole batch: one holds the input,
-    /// the other the gradient in the output.
+    /// the other the gradient with respect to the output.
     pub(super) fn gradient(
         &self,
         team: &mut Team,
@@ -158,8 +158,8 @@ impl LinearLayer {
         );
     }
 
-    /// Computes the gradient in the input, `[n, inputs]`, from the gradient in the output, `[n,
-    /// outputs]`.
+    /// Computes the gradient with respect to the input, `[n, inputs]`, from the gradient with
+    /// respect to the output, `[n, outputs]`.
     pub(super) fn backward(
         &self,
         team: &mut Team,
@@ -170,7 +170,7 @@ impl LinearLayer {
         rows_times(team, grad, &self.backward, Start::Zero, finish, input);
     }
 
-    /// Computes the gradient in weights and biases.
+    /// Computes the gradient with respect to weights and biases.
     pub(super) fn gradient(
         &self,
         team: &mut Team,

@@ -1,9 +1,9 @@
 //! The native engine's order of parameters, and its conversion from and to PyTorch's.
 //!
-//! Images are channels-last, hence weights too: `[rows' channels, kernel row, kernel column,
-//! image's channels]` for both kinds of convolution. Rows are the output of a convolution and the
-//! input of a transposed one. Initial values are drawn, and snapshots published, in PyTorch's
-//! order, the contract with actors.
+//! Images are channels-last, hence weights too:
+//! `[rows' channels, kernel row, kernel column, image's channels]` for both kinds of convolution.
+//! Rows are the output of a convolution and the input of a transposed one. Initial values are
+//! drawn, and snapshots published, in PyTorch's order, the contract with actors.
 
 use std::ops::Range;
 

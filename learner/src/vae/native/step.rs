@@ -39,7 +39,7 @@ pub(super) struct StepContext<'a> {
 
 impl StepContext<'_> {
     /// Computes the loss of depth images, `[n, 72, 128]`, and its gradient. For the weights of the
-    /// decoder's first convolution, only the gradient in its output is left in
+    /// decoder's first convolution, only the gradient with respect to its output is left in
     /// [`super::unfold::Unfold`]. `noise`: standard normal, `[n, latent]`.
     pub(super) fn objective(
         &mut self,
@@ -344,7 +344,7 @@ impl<'a> BiasSums<'a> {
         Self { parts }
     }
 
-    /// Adds for `layer`. `grad`: the gradient in the layer's output, before its ReLU.
+    /// Adds for `layer`. `grad`: the gradient with respect to the layer's output, before its ReLU.
     fn add(&mut self, isa: Isa, layer: usize, grad: &[f32]) {
         column_sums(isa, grad, self.parts[layer]);
     }

@@ -21,9 +21,9 @@ pub const LAYERS: [&str; 10] = [
 pub enum Pass {
     /// Computes the output.
     Forward,
-    /// Computes the gradient in the input.
+    /// Computes the gradient with respect to the input.
     Backward,
-    /// Computes the gradient in weights and biases.
+    /// Computes the gradient with respect to weights and biases.
     Gradient,
 }
 

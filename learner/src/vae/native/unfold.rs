@@ -154,7 +154,7 @@ impl Unfold {
     }
 
     /// First half of the backward pass: gathers the columns of each input pixel from the gradient
-    /// in the images, `[n, 5, 11, 128]`.
+    /// with respect to the images, `[n, 5, 11, 128]`.
     pub(super) fn gather(&mut self, grad: &[f32]) {
         let images = grad.len() / (ROWS * ROW);
         self.columns.resize(BLOCKS * INPUTS * images * PART);
@@ -171,8 +171,9 @@ impl Unfold {
         }
     }
 
-    /// Second half: computes the gradient in the inputs of some images, `[3 · images, 1024]`,
-    /// starting with image `first` of the batch. It is zero where `gate` is not positive.
+    /// Second half: computes the gradient with respect to the inputs of some images,
+    /// `[3 · images, 1024]`, starting with image `first` of the batch. It is zero where `gate` is
+    /// not positive.
     ///
     /// The weights are the left operand and are read in place, not packed: pixels are few, weights
     /// are many.
