@@ -136,9 +136,14 @@ impl NativeSac {
         sample.draw(self.isa, outputs);
     }
 
-    /// Computes the critic's gradient. Both estimates are regressed (eq. 5) on the soft Bellman
-    /// target r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')) (eq. 3). Returns the loss
-    /// and the mean of the smaller estimate.
+    /// Computes the critic's gradient: regresses both estimates on the soft Bellman target y.
+    ///
+    /// ```text
+    /// y = r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s'))      (eq. 3)
+    /// loss = ½ Σ (Q(s, replayed action) - y)², mean over the batch       (eq. 5)
+    /// ```
+    ///
+    /// Returns the loss and the mean of the smaller estimate.
     fn critic_gradient(
         &mut self,
         team: &mut Team,
@@ -184,9 +189,14 @@ impl NativeSac {
         [loss, value].map(|sum| (sum / *rows as f64) as f32)
     }
 
-    /// Computes the policy's gradient: minimises α log π(a | s) - min Q(s, a) (eq. 7), so actions
-    /// of higher value become likelier, at a price for lost entropy. Returns the means of that and
-    /// of log π.
+    /// Computes the policy's gradient: makes actions of higher value likelier, at a price for lost
+    /// entropy.
+    ///
+    /// ```text
+    /// loss = α log π(a | s) - min Q(s, a), mean over the batch           (eq. 7)
+    /// ```
+    ///
+    /// Returns the loss and the mean of log π.
     fn policy_gradient(
         &mut self,
         team: &mut Team,

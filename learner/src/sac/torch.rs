@@ -99,8 +99,8 @@ impl TorchSac {
             .sample(&self.policy_parameters, observations, &noise)
     }
 
-    /// Soft Bellman targets (eq. 3), `[n]`: r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' |
-    /// s')), with a' drawn from the current policy.
+    /// Soft Bellman targets, `[n]` (eq. 3), with a' drawn from the current policy:
+    /// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')).
     fn targets(&self, batch: &TensorBatch, temperature: &Tensor, noise: &mut Noise) -> Tensor {
         let _guard = no_grad_guard();
         let next = self.draw(&batch.next_observations, noise);

@@ -79,8 +79,9 @@ impl TorchTd3 {
         }
     }
 
-    /// Bellman targets, `[n]`: r + γ (1 - terminated) min Q̄(s', a'), where a' is the target
-    /// policy's action plus clipped noise (eq. 14 and 15).
+    /// Bellman targets, `[n]` (eq. 14 and 15): r + γ (1 - terminated) min Q̄(s', a').
+    ///
+    /// a' is the target policy's action plus clipped noise.
     fn targets(&self, batch: &TensorBatch, noise: &mut Noise) -> Tensor {
         let Td3Section {
             discount,
