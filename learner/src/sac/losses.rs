@@ -78,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn truncated_episode_still_bootstraps() {
+    fn a_truncated_episode_still_bootstraps() {
         // The same last step twice: one episode crashed, the other was cut off by its step limit.
         // Only the crash has no future.
         let (crashed, truncated) = (1.0, 0.0);

@@ -153,7 +153,7 @@ fn an_update_that_is_not_finite_changes_nothing() {
 }
 
 #[test]
-fn truncated_episode_still_bootstraps() {
+fn a_truncated_episode_still_bootstraps() {
     for engine in ENGINES {
         // Metrics after learning from one transition, the last of its episode, for a given next
         // state.
