@@ -84,7 +84,7 @@ pub struct CommittedEpisode {
 pub struct MalformedEpisode {
     /// Number of the episode.
     pub episode: EpisodeId,
-    /// Its steps, counted by its actions.
+    /// Number of its steps, counted by its actions.
     pub steps: usize,
     /// Name of the part that is too short or too long.
     pub what: &'static str,

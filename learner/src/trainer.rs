@@ -44,7 +44,7 @@ pub enum TrainerRestoreError {
     /// The tensors contain another count than the counters.
     #[error("the stored {what} are {found}, but its counters say {expected}")]
     Count {
-        /// What is counted.
+        /// Name of the counter.
         what: &'static str,
         /// Count in the tensors.
         found: u64,
@@ -304,7 +304,7 @@ impl Trainer {
     }
 
     /// Returns the encoder as actors have it, so that codes computed here equal theirs to the last
-    /// bit, together with the team and the replay that its callers need.
+    /// bit. Also returns the team and the replay, which its callers need beside it.
     fn encoder(&mut self) -> (&Encoder, &mut Team, &mut Replay) {
         let updates = self.vae_updates();
         let made = self

@@ -17,9 +17,9 @@ const RECEIVER_PATIENCE: Duration = Duration::from_secs(20);
 #[derive(Debug)]
 pub struct Watchdog {
     done: Option<WorkDone>,
-    /// When this state was first seen.
+    /// Time at which this state was first seen.
     since: Instant,
-    /// When a warning about the present stall was last logged.
+    /// Time of the last warning about the present stall.
     warned: Option<Instant>,
 }
 

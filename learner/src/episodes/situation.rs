@@ -1,4 +1,4 @@
-//! Where the ordered episodes are: what the watchdog reports when nothing moves.
+//! Location of all ordered episodes, which the watchdog reports when nothing moves.
 
 use std::fmt;
 use std::time::Duration;

@@ -5,9 +5,11 @@
 //! depend neither on the processor nor on the number of threads. Buffers are allocated once per
 //! batch size and reused.
 //!
-//! Equation numbers are those of arXiv:1812.05905. Its symbols: s and s' are the states before and
-//! after the replayed action, a' and a are actions drawn from the policy in s' and s, Q is the
-//! critic, Q̄ the target critic, α the temperature, H̄ the target entropy.
+//! Equation numbers and symbols are those of arXiv:1812.05905:
+//! - s and s': states before and after the replayed action;
+//! - a and a': actions drawn from the policy in s and s';
+//! - Q and Q̄: critic and target critic, two estimates each;
+//! - α and H̄: temperature and target entropy; γ: discount.
 
 mod sample;
 
