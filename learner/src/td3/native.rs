@@ -236,7 +236,7 @@ impl Algorithm for NativeTd3 {
     ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
         let rows = columns.check(self.inputs);
         if self.work.rows != rows {
-            self.work = self.allocate(rows);
+            self.work = self.places(rows);
         }
         let improves = (self.updates() + 1).is_multiple_of(self.settings.policy_period);
         let [critic_loss, value] = self.critic_gradient(team, columns, noise);

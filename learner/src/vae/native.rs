@@ -30,7 +30,6 @@ use self::members::{MemberScratch, by_image, share};
 use self::network::VaeNetwork;
 use self::order::ParameterOrder;
 use self::step::{LossParts, StepContext};
-use self::stopwatch::Pass;
 use super::VaeMetrics;
 use crate::error::UpdateError;
 use crate::networks::{Decoder, Encoder, Layout};
