@@ -1,6 +1,6 @@
-//! Drawing a minibatch from a full split replay buffer, from small buffers to large ones.
+//! Sampling a minibatch from a full split replay buffer, from small buffers to large ones.
 //!
-//! The configured size is 2^17; the others show what a batch costs once its rows no longer lie in a
+//! The configured size is 2^17; the others show the cost of a batch whose rows no longer fit into a
 //! cache.
 
 use criterion::{BenchmarkId, Criterion, Throughput};
@@ -13,12 +13,12 @@ use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{ACTION, GROUND_TRUTH, LONGEST_LATENT};
 
-/// Transitions a minibatch.
+/// Transitions per minibatch.
 const BATCH: usize = 256;
 /// Steps of each episode that fills the buffer.
 const STEPS: usize = 64;
-/// Every so many steps pass a wall: more than the success part's share, so that it fills no later
-/// than the other.
+/// Steps per passed wall: more walls than the success share, so that the success part fills no
+/// later than the other.
 const STEPS_PER_WALL: usize = 4;
 
 fn main() {
@@ -28,7 +28,7 @@ fn main() {
     for exponent in [17, 10, 12, 14, 16, 18, 20] {
         let mut replay = None;
         group.bench_function(BenchmarkId::new("sample", 1_usize << exponent), |bencher| {
-            // Only when it is asked for: the large ones take a while to fill.
+            // Created on demand: large buffers take a while to fill.
             let replay = replay.get_or_insert_with(|| full(1 << exponent));
             let mut rng = Pcg64Mcg::seed_from_u64(1);
             let mut minibatch = Minibatch::default();
@@ -39,7 +39,7 @@ fn main() {
     criterion.final_summary();
 }
 
-/// A buffer for `capacity` transitions, both parts full.
+/// Returns a buffer for `capacity` transitions, both parts full.
 fn full(capacity: usize) -> Replay {
     let mut config = Config::default();
     config.replay.capacity = capacity;

@@ -1,4 +1,4 @@
-//! A VAE step, batch 16, on one thread: on our kernels, and on libtorch with automatic gradients.
+//! A VAE step, batch 16, on one thread: native, and on libtorch with automatic gradients.
 
 use criterion::{Criterion, Throughput};
 use skein_learner::device::use_threads;
@@ -8,7 +8,7 @@ use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::VaeSection;
 use tch::Device;
 
-/// As in `local.toml`.
+/// Images per batch, as in `local.toml`.
 const BATCH: usize = 16;
 
 fn main() {

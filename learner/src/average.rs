@@ -1,29 +1,27 @@
-//! The average of the policy over its latest updates, which flies in its place (Polyak averaging,
-//! as of a target network).
+//! Polyak average of the policy over its latest updates, which flies in the policy's place.
 //!
-//! Every update follows its own minibatch, so the policy goes on being tossed about when it no
-//! longer improves, and one snapshot flies worse than the next by chance. The average of many is
-//! steadier than any of them.
+//! Every update follows its own minibatch, so the policy keeps fluctuating after it stops
+//! improving, and snapshots differ in quality by chance. The average of many policies is steadier
+//! than any one of them.
 
 use crate::algorithm::Algorithm;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
-/// Updates at the beginning of which the average hardly looks back, because an untrained policy is
-/// worth forgetting.
+/// Number of first updates over which the average forgets faster, because an untrained policy is
+/// not worth remembering.
 const BEGINNING: f32 = 10.0;
 
 /// A moving average of a policy's parameters.
 #[derive(Debug)]
-pub struct Average {
-    /// The weight of the latest policy.
+pub struct PolicyAverage {
+    /// Weight of the latest policy.
     weight: f32,
     values: Vec<f32>,
     latest: Vec<f32>,
 }
 
-impl Average {
-    /// The average over some `updates`, exponentially weighted, of the policy of `algorithm`, which
-    /// it begins as.
+impl PolicyAverage {
+    /// Starts as the policy of `algorithm`; averages exponentially over about `updates` updates.
     pub fn new(updates: usize, algorithm: &dyn Algorithm) -> Self {
         let mut values = vec![0.0; algorithm.policy_layout().len()];
         algorithm.publish(&mut values);
@@ -34,7 +32,7 @@ impl Average {
         }
     }
 
-    /// Takes in the policy as an update has left it.
+    /// Takes in the policy as an update left it.
     pub fn take_in(&mut self, algorithm: &dyn Algorithm) {
         algorithm.publish(&mut self.latest);
         let weight = self
@@ -54,8 +52,11 @@ impl Average {
     }
 }
 
-impl Stateful for Average {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
-        vec![("policy_average".to_owned(), Part::Numbers(&mut self.values))]
+impl Stateful for PolicyAverage {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
+        vec![(
+            "policy_average".to_owned(),
+            StatePart::Numbers(&mut self.values),
+        )]
     }
 }

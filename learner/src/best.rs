@@ -1,17 +1,17 @@
-//! The best snapshot: candidates by training episodes, confirmed by evaluation episodes.
+//! The best snapshot: training episodes propose candidates, confirmation episodes decide.
 //!
-//! Training episodes are flown with exploration noise from all levels, so their average only says
-//! when it is worth looking. What counts is flown as the final evaluation will be: without noise,
-//! from the start of level 1.
+//! Training episodes have exploration noise and start at all levels, so their average only shows
+//! when a closer look pays. Confirmation episodes are flown like the final evaluation: without
+//! noise, from the start of level 1.
 
 use skein_protocol::config::EvaluationSection;
 
 use crate::checkpoint::BestSnapshot;
 use crate::metrics::MovingAverage;
 
-/// Whether the snapshot after `episodes` training episodes is worth confirming: enough episodes
-/// since the last candidate at `latest`, a full window, and an average not far below that of the
-/// best so far.
+/// `true` if the snapshot after `episodes` training episodes is worth confirming. It must be late
+/// enough after the last candidate at `latest`, have a full window, and an average not far below
+/// the best snapshot's.
 pub fn is_candidate(
     section: &EvaluationSection,
     episodes: u64,
@@ -29,8 +29,8 @@ pub fn is_candidate(
             .is_some_and(|mean| mean > 0.0 && mean >= threshold)
 }
 
-/// Whether a confirmed candidate replaces the best: more walls passed in evaluation, or as many and
-/// a better training average.
+/// `true` if a confirmed candidate replaces the best: more walls passed in confirmation episodes,
+/// or equally many and a better training average.
 pub fn is_better(candidate: &BestSnapshot, best: Option<&BestSnapshot>) -> bool {
     best.is_none_or(|best| {
         let rank = |snapshot: &BestSnapshot| {

@@ -1,4 +1,5 @@
-//! Which episode is flown where: tickets as a function of configuration, seed and episode number.
+//! Assigns courses, levels and seeds to episodes: tickets are a function of configuration, seed and
+//! episode number.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -9,10 +10,10 @@ use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::segment::Segment;
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 
-/// Evaluations are numbered this far apart, so that no two of their episodes share a number.
+/// Distance between the first episode numbers of two evaluations, so that no number occurs twice.
 const EVALUATION_STRIDE: u64 = 1 << 24;
 
-/// Epochs of the whole run; the last may be shorter.
+/// Number of epochs of the whole run; the last one may be shorter.
 pub fn epochs(config: &Config) -> u64 {
     config
         .run
@@ -20,8 +21,8 @@ pub fn epochs(config: &Config) -> u64 {
         .div_ceil(config.learning.episodes_per_epoch)
 }
 
-/// Tickets of `epoch`, in episode order. Where episodes are flown in segments, there is one
-/// episode, and `flown` are the actions of its segments so far, from reset on.
+/// Tickets of `epoch`, in episode order. With episodes flown in segments, an epoch is one episode,
+/// and `flown` holds the actions of its segments so far, from the reset on.
 pub fn training(
     config: &Config,
     run: RunId,
@@ -77,8 +78,8 @@ pub fn evaluation(
     (0..).zip(flown).map(ticket).collect()
 }
 
-/// Tickets of the episodes that confirm a candidate for the best snapshot. Generated courses are
-/// the same ones for each candidate, and none of them is trained on.
+/// Tickets of the confirmation episodes for a candidate. Generated courses are the same for every
+/// candidate, and training never uses them.
 pub fn confirmation(
     config: &Config,
     run: RunId,
@@ -102,14 +103,14 @@ pub fn confirmation(
     tickets
 }
 
-/// The level training episode `episode` starts at: the next one every few episodes, then the first
-/// again (paper, section 4.2).
+/// Start level of training episode `episode`: the next level every few episodes, then level 1 again
+/// (the paper, section 4.2).
 fn start_level(config: &Config, episode: u64) -> u8 {
     let step = episode / config.learning.episodes_per_level;
     (step % u64::from(config.learning.levels)) as u8 + 1
 }
 
-/// Where training episode `episode` is flown.
+/// Course of training episode `episode`.
 fn training_course(config: &Config, episode: u64) -> CourseChoice {
     let mut rng = Pcg64Mcg::seed_from_u64(derive(config.run.seed, Purpose::Course, episode));
     if rng.random::<f64>() < config.courses.generated_share {

@@ -1,9 +1,9 @@
 //! A full disk pauses the learner and loses nothing.
 //!
-//! Whoever writes and finds no room warns, waits, and tries again until there is room or the run is
-//! told to stop; what was learned stays in memory meanwhile. Files that are written whole are
-//! written again ([`Disk::with_room`]); to those that are appended to, what is missing is appended
-//! ([`Patient`]), so that nothing is in them twice. Any other failure is for the caller.
+//! A writer that finds no room warns, waits, and tries again until there is room or the run must
+//! stop. What was learned stays in memory meanwhile. [`Disk::with_room`] repeats the write of a
+//! whole file; [`PatientWriter`] continues a file that is appended to, so that nothing is written
+//! twice. Every other failure is returned to the caller.
 
 use std::error::Error;
 use std::io::{self, ErrorKind, Write};
@@ -14,12 +14,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// Between two attempts to write.
+/// Time between two attempts to write.
 const PAUSE: Duration = Duration::from_secs(1);
-/// Between two warnings.
+/// Time between two warnings.
 const WARN_EVERY: Duration = Duration::from_secs(60);
 
-/// The disk, as those who write see it.
+/// The run's disk, shared by all who write to it.
 #[derive(Debug, Clone)]
 pub struct Disk {
     stop: Arc<AtomicBool>,
@@ -28,7 +28,7 @@ pub struct Disk {
 }
 
 impl Disk {
-    /// The disk of a learner that `stop` tells to end; then nobody waits any more.
+    /// Returns the disk of a learner that ends when `stop` is set; then no writer waits any longer.
     pub fn new(stop: Arc<AtomicBool>) -> Self {
         Self {
             stop,
@@ -37,7 +37,7 @@ impl Disk {
         }
     }
 
-    /// What waits for room at the moment.
+    /// Description of the write that waits for room at the moment.
     pub fn waiting(&self) -> Option<String> {
         self.waiting
             .lock()
@@ -45,11 +45,10 @@ impl Disk {
             .clone()
     }
 
-    /// Repeats `attempt`, which writes `path` anew each time, as long as it fails because the disk
-    /// is full.
+    /// Repeats `attempt`, which writes all of `path` each time, as long as the disk is full.
     ///
     /// # Errors
-    /// What it fails of otherwise; that the disk is full, once the run is told to stop.
+    /// Returns any other failure at once, and the full disk itself once the run must stop.
     pub fn with_room<T, E: Error + 'static>(
         &self,
         path: &Path,
@@ -67,9 +66,9 @@ impl Disk {
         }
     }
 
-    /// A writer to the file at `path` that waits for room.
-    pub fn patient<W: Write>(&self, path: &Path, inner: W) -> Patient<W> {
-        Patient {
+    /// Returns a writer to the file at `path` that waits for room.
+    pub fn patient<W: Write>(&self, path: &Path, inner: W) -> PatientWriter<W> {
+        PatientWriter {
             disk: self.clone(),
             path: path.to_owned(),
             inner,
@@ -77,7 +76,7 @@ impl Disk {
     }
 }
 
-/// Whether `error`, or what caused it, is that there is no room.
+/// `true` if `error`, or one of its causes, is a full disk or an exceeded quota.
 fn is_full(error: &(dyn Error + 'static)) -> bool {
     successors(Some(error), |&error| error.source())
         .filter_map(|error| error.downcast_ref::<io::Error>())
@@ -89,7 +88,7 @@ fn is_full(error: &(dyn Error + 'static)) -> bool {
         })
 }
 
-/// Somebody who waits for room.
+/// A write that waits for room.
 struct Wait<'a> {
     disk: &'a Disk,
     warned: Option<Instant>,
@@ -106,9 +105,9 @@ impl<'a> Wait<'a> {
             .is_none_or(|warned| warned.elapsed() >= WARN_EVERY)
         {
             self.warned = Some(Instant::now());
-            tracing::warn!(path = %path.display(), %error, "the disk is full; training waits for room");
+            tracing::warn!(path = %path.display(), %error, "disk full: training waits for room");
         }
-        let text = format!("waits for room on the disk to write {}", path.display());
+        let text = format!("waiting for room on the disk to write {}", path.display());
         *self
             .disk
             .waiting
@@ -120,7 +119,7 @@ impl<'a> Wait<'a> {
 
 impl Drop for Wait<'_> {
     fn drop(&mut self) {
-        // Another one who waits says so again within a pause.
+        // Another waiting writer sets its own text again within one pause.
         *self
             .disk
             .waiting
@@ -129,18 +128,18 @@ impl Drop for Wait<'_> {
     }
 }
 
-/// Writes what there is room for, and waits for the rest: see [`Disk::patient`].
+/// A writer that waits for room instead of failing: see [`Disk::patient`].
 #[derive(Debug)]
-pub struct Patient<W> {
+pub struct PatientWriter<W> {
     disk: Disk,
     path: PathBuf,
     inner: W,
 }
 
-impl<W: Write> Write for Patient<W> {
+impl<W: Write> Write for PatientWriter<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let Self { disk, path, inner } = self;
-        // The system says no room only when it took nothing of these bytes.
+        // The system reports a full disk only if it took none of these bytes.
         disk.with_room(path, || inner.write(bytes))
     }
 
@@ -154,19 +153,19 @@ impl<W: Write> Write for Patient<W> {
 mod tests {
     use super::*;
 
-    /// A disk that has room again after so many attempts.
-    struct Small {
+    /// A disk that has room again after `refusals` attempts.
+    struct SmallDisk {
         written: Vec<u8>,
         refusals: usize,
     }
 
-    impl Write for Small {
+    impl Write for SmallDisk {
         fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
             if self.written.len() >= 5 && self.refusals > 0 {
                 self.refusals -= 1;
                 return Err(ErrorKind::StorageFull.into());
             }
-            // Never all at once, as a disk that is nearly full.
+            // Never all bytes at once, like a disk that is nearly full.
             let taken = bytes.len().min(3);
             self.written.extend_from_slice(&bytes[..taken]);
             Ok(taken)
@@ -187,7 +186,7 @@ mod tests {
     #[test]
     fn what_waited_for_room_is_written_once() {
         let disk = disk();
-        let small = Small {
+        let small = SmallDisk {
             written: Vec::new(),
             refusals: 4,
         };
@@ -203,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_waits_says_for_what_until_told_to_stop() {
+    fn a_waiting_write_is_reported_until_the_run_stops() {
         let disk = disk();
         let for_thread = disk.clone();
         let waiting = thread::spawn(move || {

@@ -1,16 +1,16 @@
 //! An episode as the learner keeps it: committed, complete, in order.
 //!
-//! The assembler builds it from streamed records; metrics and replay take it from there. It holds
-//! one observation more than it has steps: the closing observation is what the last step led to,
-//! and an episode that was cut off bootstraps from it. Of an episode in segments each segment is
-//! one of these, and what has been flown of it so far is one as well.
+//! The assembly builds it from streamed records; metrics and replay read it. It holds one
+//! observation more than steps: the closing observation follows the last step, and a truncated
+//! episode bootstraps from it. An episode flown in segments is committed segment by segment: each
+//! segment is a [`CommittedEpisode`], and so are the segments so far, joined.
 
 use skein_protocol::config::View;
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
 
-/// What the vehicle saw and where it was at the beginning of a step.
+/// Observation and pose of the vehicle at the beginning of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepObservation {
     /// The VAE's latent mean of the depth image.
@@ -21,12 +21,12 @@ pub struct StepObservation {
     pub position_m: [f32; 3],
     /// Orientation, world from body, as a unit quaternion (i, j, k, w).
     pub orientation: [f32; 4],
-    /// What the simulator knows beyond that, in its order and units.
+    /// Further state known to the simulator, in its order and units.
     pub ground_truth: [f32; GROUND_TRUTH],
 }
 
-/// What brings the numbers of the ground truth, in their order, to a common size: 10 m between
-/// walls, some metres to an opening, tenths of a newton.
+/// Factors that bring the ground truth's numbers, in their order, to a common size. They reflect 10
+/// m between walls, some metres to an opening, and tenths of a newton.
 #[rustfmt::skip]
 const TRUTH_SCALE: [f32; GROUND_TRUTH] = [
     0.2, 0.5, 0.5, 1.0, // the next wall: distance, left, up, clearance
@@ -38,70 +38,70 @@ const TRUTH_SCALE: [f32; GROUND_TRUTH] = [
     3.0, 3.0, 3.0,      // gust
 ];
 
-/// One whole episode of T steps, or T steps of one.
+/// A whole episode of T steps, or T consecutive steps of one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CommittedEpisode {
-    /// Its number.
+    /// Number of the episode.
     pub episode: EpisodeId,
-    /// The epoch it belongs to.
+    /// Epoch that the episode belongs to.
     pub epoch: Epoch,
-    /// The one snapshot all of it was flown with; of several segments, the first one's.
+    /// Snapshot that the episode was flown with; of several segments, the first one's.
     pub policy_version: PolicyVersion,
-    /// Who flew it, or the first segment of it; without influence on learning.
+    /// Actor that flew the episode, or its first segment; without influence on learning.
     pub actor: ActorId,
-    /// The level (1 is the first) whose start it took off from.
+    /// Level whose start the episode was reset to, from 1.
     pub level: u8,
-    /// Steps of the episode that were flown before these; 0 if it is whole.
+    /// Steps of the episode before these; 0 if the episode is whole.
     pub first_step: usize,
-    /// The action before the first; zero at reset.
+    /// Action before the first step; zero at the reset.
     pub action_before: [f32; ACTION],
-    /// `[T + 1]`, the closing observation last.
+    /// Observations, `[T + 1]`, the closing one last.
     pub observations: Vec<StepObservation>,
-    /// Lateral and vertical velocity command, each in [-1, 1]; `[T]`.
+    /// Lateral and vertical velocity commands, each in [-1, 1]; `[T]`.
     pub actions: Vec<[f32; ACTION]>,
-    /// `[T]`.
+    /// Rewards, `[T]`.
     pub rewards: Vec<f32>,
     /// Terms of each reward: collision, level-up, destination, open view; `[T]`.
     pub reward_terms: Vec<[f32; 4]>,
-    /// Whether a wall was crossed or the destination reached in the step; `[T]`.
+    /// `true` where the step crossed a wall or reached the destination; `[T]`.
     pub level_up: Vec<bool>,
-    /// How it ended; `None` of a segment whose episode goes on.
+    /// Outcome of the episode; `None` for a segment whose episode continues.
     pub outcome: Option<Outcome>,
-    /// Walls passed since reset; the end wall is none.
+    /// Walls passed since the reset, the end wall not counted.
     pub walls_passed: u8,
-    /// Walls of the course; 0 while the episode goes on.
+    /// Walls of the course; 0 while the episode continues.
     pub course_walls: u8,
-    /// The wall that was hit, from 1 in episode order, if it collided with one and not with the
-    /// corridor.
+    /// Wall that was hit, from 1 in order along the course; `None` if none was, or if the corridor
+    /// was hit.
     pub hit_wall: Option<u8>,
     /// Depth images of all observations, `[T + 1, 72, 128]`, while the VAE is trained.
     pub depth: Option<Vec<u8>>,
 }
 
-/// Why an episode's parts do not belong together.
+/// Reason why an episode's parts do not fit together.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("episode {episode} of {steps} steps has {found} {what} where {expected} are expected")]
-pub struct EpisodeFault {
-    /// The episode.
+pub struct MalformedEpisode {
+    /// Number of the episode.
     pub episode: EpisodeId,
-    /// Its steps, by the number of its actions.
+    /// Number of its steps, counted by its actions.
     pub steps: usize,
-    /// The part that is too short or too long.
+    /// Name of the part that is too short or too long.
     pub what: &'static str,
-    /// Its length.
+    /// Length of that part.
     pub found: usize,
-    /// The length it should have.
+    /// Length that it should have.
     pub expected: usize,
 }
 
 impl CommittedEpisode {
-    /// Steps flown, T.
+    /// Number of steps, T.
     pub fn steps(&self) -> usize {
         self.actions.len()
     }
 
-    /// Sum of all rewards, undiscounted; summed in double precision, so that it does not depend on
-    /// how the sum is arranged.
+    /// Undiscounted sum of all rewards, in double precision, so that the order of summation does
+    /// not matter.
     pub fn total_reward(&self) -> f32 {
         self.rewards
             .iter()
@@ -109,17 +109,16 @@ impl CommittedEpisode {
             .sum::<f64>() as f32
     }
 
-    /// How it ended.
+    /// Outcome of the episode.
     ///
     /// # Panics
-    /// When it is a segment whose episode goes on.
+    /// When this is a segment whose episode continues.
     pub fn ending(&self) -> Outcome {
-        self.outcome
-            .expect("only of episodes that have ended is asked how they did")
+        self.outcome.expect("only an ended episode has an outcome")
     }
 
-    /// Whether it ended in a state without a future. An episode that reached its step limit did
-    /// not, and its last step still bootstraps.
+    /// `true` if the episode ended in a state without a future. An episode at its step limit did
+    /// not: its last step still bootstraps.
     pub fn terminated(&self) -> bool {
         match self.outcome {
             Some(Outcome::Collided | Outcome::ReachedEnd) => true,
@@ -127,7 +126,7 @@ impl CommittedEpisode {
         }
     }
 
-    /// The same without images.
+    /// Returns a copy without images.
     #[must_use]
     pub fn without_images(&self) -> Self {
         Self {
@@ -141,9 +140,9 @@ impl CommittedEpisode {
         }
     }
 
-    /// Appends the segment that was flown next, but for its images.
+    /// Appends the segment that was flown next, except its images.
     pub fn extend(&mut self, segment: &Self) {
-        // Its first observation is this one's last, seen by another encoder perhaps.
+        // The segment's first observation replaces this one's last: perhaps another encoder saw it.
         self.observations.pop();
         self.observations.extend_from_slice(&segment.observations);
         self.actions.extend_from_slice(&segment.actions);
@@ -161,10 +160,11 @@ impl CommittedEpisode {
         view.write(step, into, |step, into| self.write_moment(step, view, into));
     }
 
-    /// Writes what a critic that is told the [ground
-    /// truth](skein_protocol::config::CriticInput::GroundTruth) gets at the beginning of `step`,
-    /// `[TRUE_STATE]`: that, the velocity, the tilt and the action before, which with latency has
-    /// yet to take effect; each number roughly within [-2, 2].
+    /// Writes the critic's input at the beginning of `step`, `[TRUE_STATE]`, where the critic sees
+    /// the [ground truth](skein_protocol::config::CriticInput::GroundTruth).
+    ///
+    /// It holds the ground truth, the velocity, the tilt, and the action before, which under
+    /// latency has yet to take effect. Each number is roughly within [-2, 2].
     pub fn write_true_state(&self, step: usize, into: &mut [f32]) {
         let seen = &self.observations[step];
         let [roll, pitch, ..] = seen.orientation;
@@ -194,12 +194,12 @@ impl CommittedEpisode {
         view.write_moment(&seen.latent, &seen.velocity_mps, &previous_action, into);
     }
 
-    /// Checks that every part has the length that the number of actions asks for, and that there is
-    /// a step.
+    /// Checks that there is a step, and that every part is as long as the number of actions
+    /// requires.
     ///
     /// # Errors
-    /// [`EpisodeFault`] names the first part that has not.
-    pub fn check(&self) -> Result<(), EpisodeFault> {
+    /// [`MalformedEpisode`] names the first part that is not.
+    pub fn check(&self) -> Result<(), MalformedEpisode> {
         let steps = self.steps();
         let images = self
             .depth
@@ -214,7 +214,7 @@ impl CommittedEpisode {
             ("bytes of depth images", images, (steps + 1) * IMAGE_PIXELS),
         ] {
             if found != expected {
-                return Err(EpisodeFault {
+                return Err(MalformedEpisode {
                     episode: self.episode,
                     steps,
                     what,
@@ -233,8 +233,8 @@ pub(crate) mod samples {
 
     use super::*;
 
-    /// An episode of `steps` steps whose every quantity is a function of (`episode`, step). Image t
-    /// is filled with [`shade`]; its latent is [`code`] of that.
+    /// An episode of `steps` steps, in which every number is a function of (`episode`, step). Image
+    /// t is filled with [`shade`]; its latent is [`code`] of that.
     pub(crate) fn episode(episode: u64, steps: usize, outcome: Outcome) -> CommittedEpisode {
         let at = |step: usize| episode as f32 * 1000.0 + step as f32;
         CommittedEpisode {
@@ -268,7 +268,7 @@ pub(crate) mod samples {
         }
     }
 
-    /// The same with its images.
+    /// Adds the images.
     pub(crate) fn with_images(mut committed: CommittedEpisode) -> CommittedEpisode {
         let episode = committed.episode.0;
         committed.depth = Some(

@@ -1,5 +1,5 @@
-//! What is written of the final evaluation: the report, where the episodes flew, and what the VAE
-//! makes of what they saw.
+//! Output files of the final evaluation: the report, the trajectories, and images with their
+//! reconstructions.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -17,31 +17,31 @@ use skein_run::durable;
 use crate::episode::CommittedEpisode;
 use crate::trainer::Trainer;
 
-/// Episodes a course of which the path is written.
-const PATHS: usize = 25;
-/// Images that are shown beside their reconstructions.
+/// Episodes per course whose trajectory is written.
+const TRAJECTORIES: usize = 25;
+/// Number of images shown beside their reconstructions.
 const PICTURES: usize = 8;
 
-/// Why an evaluation cannot be written.
+/// Reason why an evaluation cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write {}: {source}", path.display())]
-pub struct EvaluationError {
-    /// The file.
+pub struct EvaluationWriteError {
+    /// Path of the file.
     pub path: PathBuf,
-    /// Why.
+    /// Cause.
     #[source]
     pub source: io::Error,
 }
 
-/// Puts `content` in the place of the file at `path`, at once or not at all.
-fn replace<E>(path: &Path, content: Result<Vec<u8>, E>) -> Result<(), EvaluationError>
+/// Replaces the file at `path` by `content`, completely or not at all.
+fn replace<E>(path: &Path, content: Result<Vec<u8>, E>) -> Result<(), EvaluationWriteError>
 where
     E: Into<Box<dyn std::error::Error + Send + Sync>>,
 {
     content
         .map_err(io::Error::other)
         .and_then(|bytes| durable::replace(path, &bytes))
-        .map_err(|source| EvaluationError {
+        .map_err(|source| EvaluationWriteError {
             path: path.to_owned(),
             source,
         })
@@ -49,7 +49,7 @@ where
 
 /// A row of `evaluation_trajectories.csv`.
 #[derive(Debug, Serialize)]
-struct PathRow<'a> {
+struct TrajectoryRow<'a> {
     course: &'a str,
     episode: usize,
     step: usize,
@@ -63,15 +63,15 @@ struct PathRow<'a> {
 /// courses, course by course.
 ///
 /// # Errors
-/// [`EvaluationError`] names the file.
+/// [`EvaluationWriteError`] names the file.
 pub fn write_report(
     directory: &RunDirectory,
     config: &Config,
     policy_version: PolicyVersion,
     policy_sha256: &str,
     flown: &[CommittedEpisode],
-) -> Result<EvaluationReport, EvaluationError> {
-    let mut paths = csv::Writer::from_writer(Vec::new());
+) -> Result<EvaluationReport, EvaluationWriteError> {
+    let mut trajectories = csv::Writer::from_writer(Vec::new());
     let mut rows = Ok(());
     let mut courses = Vec::new();
     for (course, episodes) in config
@@ -86,16 +86,16 @@ pub fn write_report(
             .first()
             .map_or(0, |episode| episode.course_walls.into());
         courses.push(CourseEvaluation::of(&name, walls, &scores));
-        for (number, episode) in episodes.iter().take(PATHS).enumerate() {
-            rows = rows.and_then(|()| write_path(&mut paths, &name, number, episode));
+        for (number, episode) in episodes.iter().take(TRAJECTORIES).enumerate() {
+            rows = rows.and_then(|()| write_trajectory(&mut trajectories, &name, number, episode));
         }
     }
-    let paths = rows.map_err(io::Error::from).and_then(|()| {
-        paths
+    let trajectories = rows.map_err(io::Error::from).and_then(|()| {
+        trajectories
             .into_inner()
             .map_err(|error| io::Error::other(error.to_string()))
     });
-    replace(&directory.evaluation_trajectories_csv(), paths)?;
+    replace(&directory.evaluation_trajectories_csv(), trajectories)?;
     let report = EvaluationReport {
         policy_version,
         policy_sha256: policy_sha256.to_owned(),
@@ -117,15 +117,15 @@ fn score(episode: &CommittedEpisode) -> EpisodeScore {
     }
 }
 
-fn write_path(
-    paths: &mut csv::Writer<Vec<u8>>,
+fn write_trajectory(
+    trajectories: &mut csv::Writer<Vec<u8>>,
     course: &str,
     number: usize,
     episode: &CommittedEpisode,
 ) -> Result<(), csv::Error> {
     for (step, observation) in episode.observations.iter().enumerate() {
         let [x_m, y_m, z_m] = observation.position_m;
-        paths.serialize(PathRow {
+        trajectories.serialize(TrajectoryRow {
             course,
             episode: number,
             step,
@@ -138,16 +138,16 @@ fn write_path(
     Ok(())
 }
 
-/// Writes depth images of an episode beside their reconstructions, `reconstructions.safetensors`;
+/// Writes some depth images beside their reconstructions, `reconstructions.safetensors`. Writes
 /// nothing where there is no VAE.
 ///
 /// # Errors
-/// [`EvaluationError`] names the file.
+/// [`EvaluationWriteError`] names the file.
 pub fn write_reconstructions(
     directory: &RunDirectory,
     trainer: &mut Trainer,
     episodes: &[CommittedEpisode],
-) -> Result<(), EvaluationError> {
+) -> Result<(), EvaluationWriteError> {
     let depth = episodes
         .iter()
         .filter_map(|episode| episode.depth.as_deref())

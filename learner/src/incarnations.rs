@@ -1,4 +1,4 @@
-//! `incarnations.csv`: when the learner of a run was started, and from where it went on.
+//! `incarnations.csv`: when the learner of a run was started, and from which episode it resumed.
 
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -8,17 +8,20 @@ use skein_run::durable;
 
 const HEADER: &str = "incarnation,unix_secs,episodes\n";
 
-/// Notes that a learner begins to live, with the state after `episodes` episodes; returns how many
-/// incarnations there were before. A file that cannot be read as text is begun anew: nothing
-/// learned depends on it.
+/// Appends the row of a new incarnation that starts after `episodes` episodes; returns the number
+/// of earlier incarnations. A file that is not text is started again: nothing learned depends on
+/// it.
 ///
 /// # Errors
-/// Of the file system.
+/// Errors of the file system.
 pub fn begin_incarnation(path: &Path, episodes: u64) -> io::Result<u64> {
     let mut text = match fs::read_to_string(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => HEADER.to_owned(),
         Err(error) if error.kind() == io::ErrorKind::InvalidData => {
-            tracing::warn!(path = %path.display(), "damaged: begun anew, earlier incarnations are no longer counted");
+            tracing::warn!(
+                path = %path.display(),
+                "damaged: started again, earlier incarnations are no longer counted"
+            );
             HEADER.to_owned()
         }
         text => text?,
@@ -58,12 +61,12 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_file_is_begun_anew() {
+    fn a_damaged_file_is_started_again() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("incarnations.csv");
         begin_incarnation(&path, 0).unwrap();
         let mut bytes = fs::read(&path).unwrap();
-        // The end of the last line is lost.
+        // Cut off the end of the last line.
         bytes.pop();
         fs::write(&path, &bytes).unwrap();
         assert_eq!(begin_incarnation(&path, 500).unwrap(), 1);

@@ -1,8 +1,8 @@
-//! The learner: hands out tickets, commits the episodes flown for them, trains VAE and policy on
-//! them, and publishes snapshots.
+//! The learner: hands out tickets, commits the episodes flown for them, trains VAE and policy, and
+//! publishes snapshots.
 //!
-//! Training is a function of configuration and seed: episodes are taken in episode order, every
-//! random draw has a seed of its own, and nothing here depends on who flew an episode, or when.
+//! Training is a function of configuration and seed. Episodes are learned from in episode order,
+//! every random draw has its own seed, and nothing depends on which actor flew an episode, or when.
 
 pub mod algorithm;
 pub mod average;

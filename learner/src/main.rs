@@ -1,4 +1,4 @@
-//! `skein-learner --run DIR`: trains the run that was prepared in a directory.
+//! `skein-learner --run DIR`: trains the run prepared in a directory.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -18,9 +18,9 @@ use tokio::signal::unix::{SignalKind, signal};
 /// The learner of a run: hands out tickets, trains on the episodes that come back, publishes
 /// snapshots. Started by run_local.sh.
 ///
-/// It goes on from the newest undamaged checkpoint in the directory, if there is one. Progress goes
-/// to standard output, one JSON object a line. SIGTERM or SIGINT ends the training in order: what
-/// was learned is saved.
+/// Resumes from the newest undamaged checkpoint in the directory, if there is one. Prints progress
+/// to standard output, one JSON object per line. SIGTERM or SIGINT stops the training in order:
+/// what was learned is saved.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
@@ -43,10 +43,10 @@ fn main() -> ExitCode {
     }
 }
 
-/// Exit status after `error`: whether starting again may help.
+/// Exit status after `error`: says whether starting again may help.
 fn status_of(error: &anyhow::Error) -> ExitCode {
     match error.downcast_ref::<TrainingError>() {
-        Some(error) if error.is_of_the_transport() => ExitCode::from(EXIT_START_AGAIN),
+        Some(error) if error.is_transport_failure() => ExitCode::from(EXIT_START_AGAIN),
         _ => ExitCode::FAILURE,
     }
 }
@@ -54,21 +54,28 @@ fn status_of(error: &anyhow::Error) -> ExitCode {
 fn run(arguments: &Arguments) -> Result<()> {
     let directory = RunDirectory::new(&arguments.run);
     let (identity, config) = directory.open()?;
-    // Before anything of the run is touched, the log included: there may be another learner.
+    // Taken before any file of the run is touched, the log included: another learner may be
+    // running.
     let lock = LearnerLock::take(&directory, &identity)?;
     let log = directory.learner_log();
     log_to_file(&log, LogFormat::from_environment())
         .with_context(|| format!("cannot write {}", log.display()))?;
-    tracing::info!(run = %identity.run, incarnation = %lock.incarnation(), seed = config.run.seed, device = %config.run.device, "learner starts");
+    tracing::info!(
+        run = %identity.run,
+        incarnation = %lock.incarnation(),
+        seed = config.run.seed,
+        device = %config.run.device,
+        "learner starts"
+    );
     let stop = stop_on_signals().context("cannot listen to signals")?;
-    // A summary that cannot be read is made again, from the last checkpoint.
+    // An unreadable summary counts as missing: it is written again, from the last checkpoint.
     if directory
         .summary()
         .is_some_and(|summary| summary.ending == Ending::Completed)
     {
         let root = directory.root().display();
-        tracing::info!("the run is complete: nothing is left to do");
-        eprintln!("skein-learner: the run in {root} is complete: nothing is left to do");
+        tracing::info!("the run is complete: nothing left to do");
+        eprintln!("skein-learner: the run in {root} is complete: nothing left to do");
         return Ok(());
     }
     let summary = training::run(&directory, &identity, lock.incarnation(), &config, &stop)?;
@@ -76,7 +83,7 @@ fn run(arguments: &Arguments) -> Result<()> {
     Ok(())
 }
 
-/// A flag that SIGTERM and SIGINT set.
+/// Returns a flag that SIGTERM and SIGINT set.
 fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
@@ -99,7 +106,7 @@ fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
                     _ = interrupt.recv() => {}
                 }
             });
-            tracing::info!("told to stop");
+            tracing::info!("stop requested");
             flag.store(true, Ordering::Relaxed);
         })?;
     Ok(stop)

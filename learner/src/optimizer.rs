@@ -1,11 +1,11 @@
 //! Adam on flat vectors.
 //!
-//! Our own, because the library's optimizer keeps its state to itself: a resumed run could not
-//! continue bit for bit. On one flat vector the whole step is a handful of tensor operations.
+//! Skein has its own, because libtorch's optimizer does not expose its state, so a resumed run
+//! could not continue bit for bit. On one flat vector, a step is a handful of tensor operations.
 
 use tch::{Device, Kind, Tensor, no_grad_guard};
 
-use crate::state::Part;
+use crate::state::StatePart;
 
 const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
@@ -18,13 +18,13 @@ pub struct Adam {
     learning_rate: f64,
     first_moment: Tensor,
     second_moment: Tensor,
-    /// Steps done, one i64 on the processor: a tensor like the rest of the state, so that it is
-    /// stored and restored with it.
+    /// Steps done, one i64 on the CPU: a tensor like the rest of the state, so that it is stored
+    /// and restored with it.
     steps: Tensor,
 }
 
 impl Adam {
-    /// For a vector like `parameters`, before its first step.
+    /// Starts an optimizer for a vector like `parameters`.
     pub fn new(parameters: &Tensor, learning_rate: f64) -> Self {
         let zeros = || parameters.zeros_like();
         Self {
@@ -35,12 +35,12 @@ impl Adam {
         }
     }
 
-    /// Steps done so far.
+    /// Number of steps done so far.
     pub fn steps(&self) -> u64 {
         self.steps.int64_value(&[0]).unsigned_abs()
     }
 
-    /// One step of `parameters` against `gradient`, both of the shape given to [`Adam::new`].
+    /// Makes one step of `parameters` against `gradient`, both of the shape given to [`Adam::new`].
     pub fn step(&mut self, parameters: &mut Tensor, gradient: &Tensor) {
         let _guard = no_grad_guard();
         self.steps += 1;
@@ -48,8 +48,8 @@ impl Adam {
         // m ← β₁ m + (1 - β₁) g; v ← β₂ v + (1 - β₂) g²
         let _ = self.first_moment.lerp_(gradient, 1.0 - BETA_1);
         let _ = self.second_moment.lerp_(&gradient.square(), 1.0 - BETA_2);
-        // θ ← θ - lr · m̂ / (√v̂ + ε), where m̂ = m / (1 - β₁ᵗ) and v̂ = v / (1 - β₂ᵗ). The scalar
-        // factors are gathered in the denominator.
+        // θ ← θ - lr · m̂ / (√v̂ + ε), where m̂ = m / (1 - β₁ᵗ) and v̂ = v / (1 - β₂ᵗ). The
+        // denominator takes up the scalar factors.
         let bias_1 = 1.0 - BETA_1.powf(steps);
         let bias_2 = 1.0 - BETA_2.powf(steps);
         let denominator = self
@@ -61,8 +61,8 @@ impl Adam {
         let _ = parameters.addcdiv_(&self.first_moment, &denominator);
     }
 
-    /// The state under names that begin with `prefix`.
-    pub fn parts(&mut self, prefix: &str) -> Vec<(String, Part<'_>)> {
+    /// The state, under names that begin with `prefix`.
+    pub fn parts(&mut self, prefix: &str) -> Vec<(String, StatePart<'_>)> {
         [
             ("first_moment", &self.first_moment),
             ("second_moment", &self.second_moment),
@@ -71,7 +71,7 @@ impl Adam {
         .map(|(name, tensor)| {
             (
                 format!("{prefix}.{name}"),
-                Part::Tensor(tensor.shallow_clone()),
+                StatePart::Tensor(tensor.shallow_clone()),
             )
         })
         .into()
@@ -87,7 +87,7 @@ mod tests {
     use crate::state::Stateful;
 
     impl Stateful for Adam {
-        fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
             Adam::parts(self, "adam")
         }
     }

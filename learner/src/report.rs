@@ -1,5 +1,4 @@
-//! What the learner tells while it runs: progress lines on standard output, and where its time
-//! goes.
+//! Progress lines on standard output while the learner runs.
 
 use std::collections::VecDeque;
 use std::io::Write;
@@ -16,9 +15,9 @@ use crate::watchdog::Watchdog;
 
 /// Time between two lines.
 const INTERVAL: Duration = Duration::from_millis(500);
-/// How long the last line may take.
+/// Longest wait for the last line.
 const LAST_LINE_PATIENCE: Duration = Duration::from_secs(2);
-/// Rates are averaged over this many intervals.
+/// Number of intervals that rates are averaged over.
 const RATE_INTERVALS: usize = 10;
 
 /// Prints the learner's progress at intervals, whatever the training thread is doing.
@@ -29,17 +28,17 @@ pub struct Reporter {
     thread: Option<JoinHandle<()>>,
 }
 
-/// Says something to the user, by way of whoever reads the reports: a line that is none is shown as
-/// it is.
-pub fn tell(line: &str) {
+/// Shows `line` to the user. The program that reads the progress lines shows every line that is not
+/// JSON as it is.
+pub fn notify_user(line: &str) {
     tracing::warn!("{line}");
-    // Nobody may be listening; it is in the log.
+    // Standard output may be closed; the line is in the log.
     let _ = writeln!(std::io::stdout().lock(), "{line}");
 }
 
 impl Reporter {
-    /// Starts reporting, with `progress` as the first line: in it `elapsed_secs` are those of
-    /// earlier incarnations, to which this one's are added.
+    /// Starts reporting, with `progress` as the first line. Its `elapsed_secs` are those of earlier
+    /// incarnations; the time of this one is added.
     ///
     /// # Errors
     /// When the system grants no thread.
@@ -57,7 +56,7 @@ impl Reporter {
         })
     }
 
-    /// Changes what the next line says.
+    /// Changes the contents of the next line.
     pub fn update(&self, change: impl FnOnce(&mut Progress)) {
         change(&mut self.progress.lock().unwrap_or_else(PoisonError::into_inner));
     }
@@ -69,14 +68,14 @@ impl Drop for Reporter {
         let Some(thread) = self.thread.take() else {
             return;
         };
-        // Whoever reads the lines may be frozen, and the pipe full: then the last lines are lost,
-        // and the thread ends with the process.
+        // The reading process may be frozen and the pipe full. Then the last lines are lost, and
+        // the thread ends with the process.
         let deadline = Instant::now() + LAST_LINE_PATIENCE;
         while !thread.is_finished() && Instant::now() < deadline {
             thread::sleep(Duration::from_millis(5));
         }
         if thread.is_finished() {
-            // A panic of that thread was logged by the hook; it has no result that could be lost.
+            // The hook has logged any panic of that thread, and it has no result to lose.
             let _ = thread.join();
         }
     }
@@ -110,7 +109,7 @@ fn report(progress: &Mutex<Progress>, ended: &AtomicBool, receiver: &Shared, dis
             line.updates_per_sec = (line.updates - updates) as f64 / secs;
         }
         if let Ok(json) = serde_json::to_string(&line) {
-            // Nobody may be listening; then nobody misses the line.
+            // Standard output may be closed; then the line is not missed.
             let _ = writeln!(std::io::stdout().lock(), "{json}");
         }
         if last {

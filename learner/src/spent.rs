@@ -1,4 +1,4 @@
-//! What a run has cost: time by what it was spent on, and what was lost on the way.
+//! Costs of a run: time by stage, and losses by reason.
 
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -8,10 +8,10 @@ use skein_protocol::stages::Times;
 
 use crate::episodes::receiver::Shared;
 
-/// Time and losses, over all incarnations of the learner as far as checkpoints tell: what a death
-/// undid is not in it.
+/// Time and losses over all incarnations of the learner, as stored in checkpoints: work lost with a
+/// killed learner is not counted.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct Spent {
+pub struct RunCosts {
     /// Seconds from the learner's start to its end.
     pub wall_secs: f64,
     /// Time of the learner's threads and of the actors, by stage.
@@ -22,9 +22,9 @@ pub struct Spent {
     pub records_refused: BTreeMap<String, u64>,
 }
 
-impl Spent {
-    /// With what the present incarnation, begun at `started`, has come to: `training` is its
-    /// training thread's time, that of all others is in `shared`.
+impl RunCosts {
+    /// Adds the costs of the present incarnation, started at `started`. `training` is the time of
+    /// its training thread; `shared` has the time of all other threads.
     pub fn with_this_incarnation(
         &self,
         started: Instant,

@@ -1,8 +1,9 @@
-//! What is trained, and how much of it is due.
+//! The networks and the replay buffer, and how many updates are due.
 //!
-//! How many VAE steps and SAC updates an epoch brings follows from the steps flown so far alone,
-//! and every random draw is seeded by the version of the snapshot that the updates begin with,
-//! which no others do: a trainer restored from a checkpoint goes on bit for bit.
+//! The number of VAE steps and policy updates in an epoch follows from the steps flown so far
+//! alone. Every random draw is seeded by the version of the snapshot that its updates start from;
+//! no two series of updates start from the same one. So a trainer restored from a checkpoint
+//! continues bit for bit.
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
@@ -16,11 +17,11 @@ use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::Exploration;
 
 use crate::algorithm::{self, Algorithm, Columns};
-use crate::average::Average;
-use crate::checkpoint::Progress;
+use crate::average::PolicyAverage;
+use crate::checkpoint::TrainingProgress;
 use crate::device::{self, DeviceError};
 use crate::episode::CommittedEpisode;
-use crate::episodes::assembly::Keep;
+use crate::episodes::assembly::KeptData;
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::noise::Noise;
@@ -28,26 +29,26 @@ use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
 use crate::state::{self, NamedTensor, Stateful};
 use crate::vae::{Vae, VaeMetrics};
 
-/// Images encoded at once when stored codes are made anew.
+/// Images encoded at once when stored latent codes are computed again.
 const ENCODE_CHUNK: usize = 64;
 
-/// Why a stored state cannot be taken over.
+/// Reason why a stored state cannot be restored.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainerRestoreError {
-    /// Of the networks.
+    /// The networks' state does not fit.
     #[error(transparent)]
-    Networks(#[from] state::RestoreError),
-    /// Of the replay buffer.
+    Networks(#[from] state::TensorRestoreError),
+    /// The replay buffer's state does not fit.
     #[error(transparent)]
-    Replay(#[from] replay::RestoreError),
-    /// The tensors hold other counts than the counters.
+    Replay(#[from] replay::ReplayRestoreError),
+    /// The tensors contain another count than the counters.
     #[error("the stored {what} are {found}, but its counters say {expected}")]
     Count {
-        /// What is counted.
+        /// Name of the counter.
         what: &'static str,
-        /// In the tensors.
+        /// Count in the tensors.
         found: u64,
-        /// In the counters.
+        /// Count in the counters.
         expected: u64,
     },
 }
@@ -59,22 +60,22 @@ pub struct Trainer {
     layout: SnapshotLayout,
     /// Threads of the native engine.
     team: Team,
-    /// Where it trains the encoder; else the algorithm does.
+    /// The VAE; `None` where the algorithm trains the encoder.
     vae: Option<Vae>,
-    /// What actors see through, as it was made after so many of the VAE's updates.
+    /// The actors' encoder, and the number of VAE updates it was made after.
     encoder: Option<(u64, Encoder)>,
     algorithm: Box<dyn Algorithm>,
-    /// What flies in the policy's place, if it is averaged.
-    average: Option<Average>,
+    /// Average of the policy that flies in its place, if averaging is configured.
+    average: Option<PolicyAverage>,
     replay: Replay,
     steps: u64,
-    /// Times that stored codes should have been made anew since the run began.
-    renewals: u64,
+    /// Number of times that stored latent codes were due for re-encoding since the run began.
+    recodings: u64,
 }
 
 impl Trainer {
-    /// Untrained networks and an empty buffer. Starts the native engine's threads, and sets the
-    /// calling thread's tensor threads: training belongs on this thread.
+    /// Creates untrained networks and an empty buffer. Starts the native engine's threads and sets
+    /// the number of tensor threads of the calling thread, so training must stay on this thread.
     ///
     /// # Errors
     /// [`DeviceError`] when the configured device does not exist.
@@ -90,13 +91,13 @@ impl Trainer {
             device = %config.run.device,
             %isa,
             threads,
-            "networks are computed"
+            "engines chosen"
         );
         let algorithm = algorithm::new(config, device);
         let averaged = config.learning.average_updates;
         Ok(Self {
             layout: SnapshotLayout::of(config),
-            average: (averaged > 0).then(|| Average::new(averaged, algorithm.as_ref())),
+            average: (averaged > 0).then(|| PolicyAverage::new(averaged, algorithm.as_ref())),
             team: Team::new(match engine {
                 Engine::Native => threads,
                 Engine::Libtorch => 1,
@@ -106,19 +107,18 @@ impl Trainer {
             algorithm,
             replay: Replay::new(config),
             steps: 0,
-            renewals: 0,
+            recodings: 0,
             config: config.clone(),
         })
     }
 
-    /// Takes over the state in a checkpoint: what follows is then bit for bit what would have
-    /// followed.
+    /// Restores the state of a checkpoint; training then continues bit for bit.
     ///
     /// # Errors
-    /// [`TrainerRestoreError`] names what does not fit; the trainer is not to be used then.
+    /// [`TrainerRestoreError`] names what does not fit; do not use the trainer then.
     pub fn restore(
         &mut self,
-        progress: &Progress,
+        progress: &TrainingProgress,
         tensors: &[NamedTensor],
         replay: ReplayState,
     ) -> Result<(), TrainerRestoreError> {
@@ -132,7 +132,7 @@ impl Trainer {
         }
         self.replay = Replay::restore(&self.config, replay)?;
         self.steps = progress.environment_steps;
-        self.renewals = self.renewals_due();
+        self.recodings = self.recodings_due();
         for (what, found, expected) in [
             ("VAE steps", self.vae_updates(), progress.vae_steps),
             ("policy updates", self.updates(), progress.policy_updates),
@@ -148,22 +148,22 @@ impl Trainer {
         Ok(())
     }
 
-    /// Environment steps taken in.
+    /// Environment steps learned from so far.
     pub fn steps(&self) -> u64 {
         self.steps
     }
 
-    /// Policy updates done.
+    /// Policy updates done so far.
     pub fn updates(&self) -> u64 {
         self.algorithm.updates()
     }
 
-    /// Updates of either network done.
+    /// Policy updates and VAE steps done so far.
     pub fn all_updates(&self) -> u64 {
         self.updates() + self.vae_updates()
     }
 
-    /// VAE steps done.
+    /// VAE steps done so far.
     pub fn vae_updates(&self) -> u64 {
         self.vae.as_ref().map_or(0, Vae::updates)
     }
@@ -173,7 +173,7 @@ impl Trainer {
         &self.replay
     }
 
-    /// How the next episodes to be ordered choose their actions.
+    /// Exploration of the next episodes to be ordered.
     pub fn exploration(&self) -> Exploration {
         if self.steps < self.config.learning.warmup_steps as u64 {
             Exploration::Uniform
@@ -182,28 +182,29 @@ impl Trainer {
         }
     }
 
-    /// What is needed of the next episodes to be ordered.
-    pub fn keep(&self) -> Keep {
+    /// Data to keep of the next episodes to be ordered.
+    pub fn keep(&self) -> KeptData {
         match self.has_images() || self.config.learning.mirror {
-            true => Keep::Depth,
-            false => Keep::Latents,
+            true => KeptData::Depth,
+            false => KeptData::Latents,
         }
     }
 
-    /// Whether images are learned from: until the VAE is frozen, or to the end if there is none.
+    /// `true` while images are learned from: until the VAE is frozen, or to the end if there is
+    /// none.
     fn has_images(&self) -> bool {
         self.replay.image_count().is_some()
     }
 
-    /// Stores an episode's transitions, and if asked for those of its mirror image.
+    /// Stores an episode's transitions, and those of its mirror image if configured.
     ///
     /// # Errors
-    /// [`InsertError`] when its parts do not belong together.
+    /// [`InsertError`] when the episode's parts do not fit together.
     pub fn take_in(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
         let learning = &self.config.learning;
         let mirrored = learning.mirror.then(|| episode.mirrored());
-        // With policy lag, episodes still come in that were flown with an encoder older than the
-        // frozen one: their codes are made anew. Without, images come for the mirror alone.
+        // With policy lag, some episodes arrive after the freeze that were flown with an older
+        // encoder: encode them again. Without lag, images come only for the mirror.
         if !self.has_images() && (learning.policy_lag > 0 || !learning.mirror) {
             self.encode(&mut episode);
         }
@@ -223,8 +224,8 @@ impl Trainer {
         self.replay.insert(episode)
     }
 
-    /// Makes an episode's codes anew with the encoder as it is, if there are images to make them
-    /// from, and if it is learned from codes at all.
+    /// Encodes an episode's images with the present encoder. Does nothing without images or without
+    /// a VAE.
     fn encode(&mut self, episode: &mut CommittedEpisode) {
         let (Some(depth), Some(_)) = (&episode.depth, &self.vae) else {
             return;
@@ -236,12 +237,12 @@ impl Trainer {
         }
     }
 
-    /// Trains the VAE as far as the steps flown ask for, from what snapshot `version` holds on, and
-    /// freezes it when its time is over. `after_each` may do something between steps, and give up;
-    /// `timer` is told what the time went into.
+    /// Makes the VAE steps that are due by the steps flown, seeded by snapshot `version`; freezes
+    /// the VAE when its training ends. Calls `after_each` after every step and stops at its error.
+    /// Books the time in `timer`.
     ///
     /// # Errors
-    /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
+    /// [`UpdateError`] when a number is no longer finite; any error of `after_each`.
     pub fn train_vae<E: From<UpdateError>>(
         &mut self,
         version: PolicyVersion,
@@ -270,13 +271,13 @@ impl Trainer {
             after_each(&metrics)?;
             last = Some(metrics);
         }
-        let due = self.renewals_due();
+        let due = self.recodings_due();
         let is_over = self.steps >= self.config.vae.train_steps as u64;
-        if is_over || self.renewals < due {
-            self.renew_latents();
+        if is_over || self.recodings < due {
+            self.recode_latents();
             timer.lap(Stage::Recode, 1);
         }
-        self.renewals = due;
+        self.recodings = due;
         if is_over {
             tracing::info!(
                 steps = self.steps,
@@ -288,22 +289,22 @@ impl Trainer {
         Ok(last)
     }
 
-    fn renewals_due(&self) -> u64 {
+    fn recodings_due(&self) -> u64 {
         self.steps
             .checked_div(self.config.vae.recode_steps as u64)
             .unwrap_or(0)
     }
 
-    /// Makes stored codes anew with the encoder as it is.
-    fn renew_latents(&mut self) {
+    /// Encodes all stored images again with the present encoder.
+    fn recode_latents(&mut self) {
         let (encoder, team, replay) = self.encoder();
         let renewed: Result<(), std::convert::Infallible> =
-            replay.renew_latents(ENCODE_CHUNK, |images| Ok(encoder.encode_all(team, images)));
+            replay.recode_latents(ENCODE_CHUNK, |images| Ok(encoder.encode_all(team, images)));
         let Ok(()) = renewed;
     }
 
-    /// The encoder as actors have it, so that codes made here are those that actors send, to the
-    /// last bit; and what it works with.
+    /// Returns the encoder as actors have it, so that codes computed here equal theirs to the last
+    /// bit. Also returns the team and the replay, which its callers need beside it.
     fn encoder(&mut self) -> (&Encoder, &mut Team, &mut Replay) {
         let updates = self.vae_updates();
         let made = self
@@ -322,17 +323,17 @@ impl Trainer {
         (encoder, &mut self.team, &mut self.replay)
     }
 
-    /// Does the policy updates that the steps flown since the warm-up ask for, from what snapshot
-    /// `version` holds on; their metrics go into `means`. `after_each` may do something between
-    /// updates, and give up; `timer` is told what the time went into.
+    /// Makes the policy updates that are due by the steps flown since the warm-up, seeded by
+    /// snapshot `version`. Adds their metrics to `means`. Calls `after_each` after every update and
+    /// stops at its error. Books the time in `timer`.
     ///
     /// # Errors
-    /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
+    /// [`UpdateError`] when a number is no longer finite; any error of `after_each`.
     pub fn train_policy<E: From<UpdateError>>(
         &mut self,
         version: PolicyVersion,
         timer: &mut LapTimer,
-        means: &mut Means,
+        means: &mut MetricMeans,
         mut after_each: impl FnMut(&[(Scalar, f32)]) -> Result<(), E>,
     ) -> Result<(), E> {
         let learning = &self.config.learning;
@@ -362,7 +363,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// The parameters that actors fly with, as they are now.
+    /// Returns the parameters that actors fly with, as they are now.
     pub fn snapshot(&self, version: PolicyVersion) -> Snapshot {
         let mut values = vec![0.0; self.layout.values()];
         let encoder = &mut values[self.layout.encoder()];
@@ -378,7 +379,7 @@ impl Trainer {
         Snapshot { version, values }
     }
 
-    /// `images` as the VAE sees them, if there is one: `[n, 72, 128]` u8, both ways.
+    /// Returns the VAE's reconstruction of `images`, both `[n, 72, 128]` u8; `None` without a VAE.
     pub fn reconstruct(&mut self, images: &[u8]) -> Option<Vec<u8>> {
         let depth = self.vae.as_mut()?.reconstruct(images).into_iter();
         Some(
@@ -388,7 +389,7 @@ impl Trainer {
         )
     }
 
-    /// Copies of all tensors that updates change.
+    /// Copies all tensors that updates change.
     pub fn tensors(&mut self) -> Vec<NamedTensor> {
         let mut all = self
             .vae
@@ -399,7 +400,7 @@ impl Trainer {
         all.extend(
             self.average
                 .as_mut()
-                .map(Average::named_tensors)
+                .map(PolicyAverage::named_tensors)
                 .unwrap_or_default(),
         );
         all
@@ -428,14 +429,14 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
     }
 }
 
-/// Means of the metrics of an epoch's updates.
+/// MetricMeans of the metrics of an epoch's updates.
 #[derive(Debug, Default)]
-pub struct Means {
+pub struct MetricMeans {
     sums: Vec<(Scalar, f64)>,
     count: usize,
 }
 
-impl Means {
+impl MetricMeans {
     fn add(&mut self, metrics: &[(Scalar, f32)]) {
         if self.sums.is_empty() {
             self.sums = metrics.iter().map(|(scalar, _)| (*scalar, 0.0)).collect();
@@ -446,7 +447,7 @@ impl Means {
         self.count += 1;
     }
 
-    /// The means; nothing if there was no update.
+    /// Returns the means; empty if there was no update.
     pub fn finish(self) -> Vec<(Scalar, f64)> {
         let mean = |(scalar, sum)| (scalar, sum / self.count as f64);
         self.sums.into_iter().map(mean).collect()

@@ -2,10 +2,11 @@
 //!
 //! An epoch is a fixed number of episodes, all flown with one frozen snapshot. When the last of
 //! them is committed, the learner takes them in, in episode order, updates the networks and
-//! publishes the next snapshot. With direct updates an epoch is one episode, flown in segments, and
-//! the same is done after each of them. Everything it does follows from configuration, seed and
-//! committed episodes; a learner that died goes on from a checkpoint as if nothing had been
-//! (`saving`).
+//! publishes the next snapshot. With direct updates, an epoch is one episode, flown in segments,
+//! and the same happens after each segment.
+//!
+//! Everything follows from configuration, seed and committed episodes. A learner that was killed
+//! resumes from a checkpoint with identical results (`saving`).
 
 mod candidates;
 mod curves;
@@ -27,26 +28,26 @@ use skein_protocol::summary::{Ending, Summary};
 use skein_run::fault::{FaultPoint, pass};
 use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity};
 
-use crate::checkpoint::{CheckpointWriter, EpochOrder, Progress};
+use crate::checkpoint::{CheckpointWriter, EpochOrder, TrainingProgress};
 use crate::curriculum;
 use crate::disk::Disk;
 use crate::episode::CommittedEpisode;
-use crate::episodes::receiver::{Batch, EpisodeReceiver, ReceiverError};
+use crate::episodes::receiver::{EpisodeBatch, EpisodeReceiver, ReceiverError};
 use crate::metrics::{Metrics, Scalar};
 use crate::report::Reporter;
 use crate::trainer::Trainer;
 
 use curves::EpochCurves;
 pub use error::TrainingError;
-use stop::StopWatch;
+use stop::StopMonitor;
 
-/// A run under way.
+/// A run in progress.
 struct Training<'a> {
     config: &'a Config,
     identity: &'a RunIdentity,
     directory: &'a RunDirectory,
     stop: &'a AtomicBool,
-    stop_watch: StopWatch<'a>,
+    stop_monitor: StopMonitor<'a>,
     disk: Disk,
     layout: SnapshotLayout,
     trainer: Trainer,
@@ -57,38 +58,38 @@ struct Training<'a> {
     started: Instant,
     epoch_started: Instant,
     curves: EpochCurves,
-    /// What this thread's time goes into: what it does between two laps is in the later one.
+    /// Time of this thread by stage. Work between two laps counts to the later one.
     timer: LapTimer,
-    /// What is counted of the run. What trainer and metrics count themselves is filled in for a
+    /// Counters of the run. Those that trainer and metrics keep themselves are filled in for a
     /// checkpoint.
-    progress: Progress,
-    /// The newest checkpoint's.
-    saved: Progress,
-    /// Times the learner was started before.
+    progress: TrainingProgress,
+    /// Progress in the newest checkpoint.
+    saved: TrainingProgress,
+    /// Number of earlier incarnations of the learner.
     resumes: u64,
-    /// Ordered and not learned from.
-    in_the_air: VecDeque<InTheAir>,
-    /// The episode whose first segments are learned from, and whose next segment is not, as far as
-    /// it was flown; without images.
-    under_way: Option<CommittedEpisode>,
-    /// The newest snapshot, those of the episodes in the air, and the best.
+    /// Epochs or segments that are ordered but not learned from.
+    in_flight: VecDeque<OrderInFlight>,
+    /// Episode of which some segments are learned from and others are not flown yet, without
+    /// images.
+    open_episode: Option<CommittedEpisode>,
+    /// The newest snapshot, those of the orders in flight, and the best.
     snapshots: BTreeMap<PolicyVersion, Snapshot>,
 }
 
-/// Episodes of an epoch that are under way, or the segment of one.
-struct InTheAir {
+/// One order in flight: the episodes of an epoch, or a segment of one.
+struct OrderInFlight {
     order: EpochOrder,
-    batch: Batch,
-    /// Those that have come in.
+    batch: EpisodeBatch,
+    /// Episodes that have arrived.
     episodes: Vec<CommittedEpisode>,
 }
 
-/// Trains the run in `directory` to its end, in this `incarnation` of its learner, or until `stop`
-/// is set; writes and returns what it came to. It goes on from the newest undamaged checkpoint, if
-/// there is one.
+/// Trains the run in `directory` to its end or until `stop` is set, in this `incarnation` of its
+/// learner. Resumes from the newest undamaged checkpoint, if there is one. Writes and returns the
+/// summary.
 ///
 /// # Errors
-/// [`TrainingError`]; what was learned until the last checkpoint is on disk.
+/// [`TrainingError`]; the last checkpoint stays on disk.
 pub fn run(
     directory: &RunDirectory,
     identity: &RunIdentity,
@@ -105,7 +106,7 @@ pub fn run(
             .save()
             .map(|progress| (Ending::Interrupted, progress)),
         Err(TrainingError::Abandoned) => training
-            .go_back()
+            .roll_back()
             .map(|progress| (Ending::Interrupted, progress)),
         Err(error) => Err(error),
     };
@@ -115,24 +116,24 @@ pub fn run(
 impl Training<'_> {
     fn train(&mut self) -> Result<(), TrainingError> {
         self.learn()?;
-        // Whoever dies in the final evaluation has lost the evaluation alone.
+        // If the learner is killed in the final evaluation, only the evaluation is lost.
         self.checkpoint()?;
         self.evaluate_best()
     }
 
-    /// All epochs, those that an earlier incarnation has learned from apart.
+    /// Learns from all epochs that earlier incarnations have not learned from.
     fn learn(&mut self) -> Result<(), TrainingError> {
         let epochs = curriculum::epochs(self.config);
-        // An earlier incarnation may have been stopped while it looked.
-        self.look_for_best()?;
+        // An earlier incarnation may have been stopped during a confirmation.
+        self.confirm_if_candidate()?;
         while self.progress.epochs < epochs {
             let epoch = self.progress.epochs;
-            // With policy lag 1, the next epoch is flown with the snapshot at hand while this one
+            // With policy lag 1, the next epoch is flown with the present snapshot while this one
             // is learned from.
             self.order_until(epochs.min(epoch + 1 + self.config.learning.policy_lag))?;
             self.learn_from_flown()?;
-            while self.under_way.is_some() {
-                // The rest of the episode is flown with what its last segment has taught.
+            while self.open_episode.is_some() {
+                // The rest of the episode is flown with what its last segment taught.
                 self.order(self.next_order(epoch))?;
                 self.learn_from_flown()?;
             }
@@ -142,30 +143,29 @@ impl Training<'_> {
                 episodes = self.progress.episodes,
                 "epoch learned from"
             );
-            self.draw_curves()?;
-            self.look_for_best()?;
+            self.write_curves()?;
+            self.confirm_if_candidate()?;
             self.checkpoint_if_due()?;
         }
         Ok(())
     }
 
-    /// Waits for the episodes or the segment ordered first, learns from them, and publishes what
-    /// was learned.
+    /// Waits for the oldest order, learns from it, and publishes the result.
     fn learn_from_flown(&mut self) -> Result<(), TrainingError> {
         let flown = self.collect()?;
         self.take_in(flown)?;
         let before = self.trainer.all_updates();
         self.train_vae()?;
         self.train_policy()?;
-        // A segment that brings no update goes on with the snapshot there is.
-        if self.under_way.is_none() || self.trainer.all_updates() > before {
+        // After a segment without updates, the present snapshot stays in use.
+        if self.open_episode.is_none() || self.trainer.all_updates() > before {
             self.progress.version += 1;
             self.publish()?;
         }
         Ok(())
     }
 
-    /// Publishes the parameters as they are now.
+    /// Publishes the present parameters.
     fn publish(&mut self) -> Result<(), TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         let snapshot = self.trainer.snapshot(self.progress.version());
@@ -176,11 +176,11 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Forgets snapshots that nobody will fly any more.
+    /// Drops snapshots that no later episode needs.
     fn forget_snapshots(&mut self) {
         let mut needed = vec![self.progress.version().0];
         needed.extend(
-            self.in_the_air
+            self.in_flight
                 .iter()
                 .map(|epoch| epoch.order.policy_version),
         );
@@ -189,11 +189,11 @@ impl Training<'_> {
             .retain(|version, _| needed.contains(&version.0));
     }
 
-    /// Orders the episodes of all epochs before `end` that are not ordered yet, to be flown with
-    /// the newest snapshot.
+    /// Orders the episodes of all epochs before `end` that are not ordered yet, with the newest
+    /// snapshot.
     fn order_until(&mut self, end: u64) -> Result<(), TrainingError> {
         let first = self
-            .in_the_air
+            .in_flight
             .back()
             .map_or(self.progress.epochs, |last| last.order.epoch + 1);
         for epoch in first..end {
@@ -202,7 +202,7 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// How what is ordered now of `epoch` is flown.
+    /// Returns an order for `epoch` with the present snapshot.
     fn next_order(&self, epoch: u64) -> EpochOrder {
         EpochOrder {
             epoch,
@@ -212,10 +212,10 @@ impl Training<'_> {
         }
     }
 
-    /// Orders the episodes of an epoch, or the next segment of the one that is under way.
+    /// Orders the episodes of an epoch, or the next segment of the open episode.
     fn order(&mut self, order: EpochOrder) -> Result<(), TrainingError> {
         let flown = self
-            .under_way
+            .open_episode
             .as_ref()
             .map_or(&[][..], |episode| &episode.actions);
         let tickets = curriculum::training(
@@ -228,7 +228,7 @@ impl Training<'_> {
         );
         let batch = self.receiver.fly(Epoch(order.epoch), order.keep, tickets)?;
         let episodes = Vec::with_capacity(batch.remaining());
-        self.in_the_air.push_back(InTheAir {
+        self.in_flight.push_back(OrderInFlight {
             order,
             batch,
             episodes,
@@ -236,20 +236,20 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Waits for all episodes of the epoch that was ordered first, or for its segment. Until they
-    /// are there, it counts as in the air.
+    /// Waits for all episodes of the oldest order, or for its segment. Until they are complete, the
+    /// order stays in flight.
     fn collect(&mut self) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         self.reporter
             .update(|progress| progress.phase = Phase::Flying);
-        let (is_amid_episode, shared) = (self.under_way.is_some(), self.receiver.shared());
-        if let Some(InTheAir {
+        let (is_mid_episode, shared) = (self.open_episode.is_some(), self.receiver.shared());
+        if let Some(OrderInFlight {
             batch, episodes, ..
-        }) = self.in_the_air.front_mut()
+        }) = self.in_flight.front_mut()
         {
-            let watch = &mut self.stop_watch;
-            let mut next = || match is_amid_episode {
-                true => batch.next_unless(|| watch.amid_episode(&shared)),
+            let watch = &mut self.stop_monitor;
+            let mut next = || match is_mid_episode {
+                true => batch.next_unless(|| watch.during_episode(&shared)),
                 false => Ok(batch.next(self.stop)?),
             };
             while let Some(episode) = next()? {
@@ -263,18 +263,18 @@ impl Training<'_> {
         self.timer.lap(Stage::TrainingIdle, 1);
         pass(FaultPoint::LearnerEpochCollected);
         Ok(self
-            .in_the_air
+            .in_flight
             .pop_front()
             .map(|epoch| epoch.episodes)
             .unwrap_or_default())
     }
 
-    /// Takes what was flown into metrics and replay buffer, in episode order.
+    /// Adds what was flown to metrics and replay buffer, in episode order.
     fn take_in(&mut self, flown: Vec<CommittedEpisode>) -> Result<(), TrainingError> {
         let count = flown.len() as u64;
         for episode in flown {
             self.curves.steps += episode.steps();
-            self.tell(&episode)?;
+            self.record(&episode)?;
             self.trainer.take_in(episode)?;
         }
         let windows = self.metrics.windows();
@@ -287,14 +287,14 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Tells the metrics of an episode that has ended, and keeps one that goes on.
-    fn tell(&mut self, flown: &CommittedEpisode) -> Result<(), TrainingError> {
-        let joined = self.under_way.take().map(|mut episode| {
+    /// Records an episode that has ended in the metrics, and keeps one that continues.
+    fn record(&mut self, flown: &CommittedEpisode) -> Result<(), TrainingError> {
+        let joined = self.open_episode.take().map(|mut episode| {
             episode.extend(flown);
             episode
         });
         if flown.outcome.is_none() {
-            self.under_way = joined.or_else(|| Some(flown.without_images()));
+            self.open_episode = joined.or_else(|| Some(flown.without_images()));
             return Ok(());
         }
         self.metrics.episode(joined.as_ref().unwrap_or(flown))?;
@@ -302,8 +302,8 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Tells what the epoch that has just been learned from brought.
-    fn draw_curves(&mut self) -> Result<(), TrainingError> {
+    /// Writes the curves' points of the epoch just learned from.
+    fn write_curves(&mut self) -> Result<(), TrainingError> {
         let curves = std::mem::take(&mut self.curves);
         let shared = self.receiver.shared();
         let points = curves.points(self.epoch_started.elapsed(), self.trainer.replay(), &shared);
@@ -312,14 +312,14 @@ impl Training<'_> {
         Ok(self.metrics.flush()?)
     }
 
-    /// The number of the newest episode: what curves are keyed by.
+    /// Number of the newest episode, the curves' x-axis.
     fn last_episode(&self) -> u64 {
         self.progress.episodes.saturating_sub(1)
     }
 
     fn train_vae(&mut self) -> Result<(), TrainingError> {
         let version = self.progress.version();
-        let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
+        let (reporter, watch) = (&self.reporter, &mut self.stop_monitor);
         let trained = self
             .trainer
             .train_vae(version, &mut self.timer, |metrics| {
@@ -338,7 +338,7 @@ impl Training<'_> {
         self.timer.lap(Stage::OtherTraining, 0);
         let version = self.progress.version();
         let started = Instant::now();
-        let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
+        let (reporter, watch) = (&self.reporter, &mut self.stop_monitor);
         let updates_before = self.trainer.updates();
         let means = &mut self.curves.policy;
         self.trainer

@@ -1,4 +1,4 @@
-//! Notices that nothing moves, and says who waits for whom.
+//! Notices a stall and reports which thread or actor is waited for.
 
 use std::time::{Duration, Instant};
 
@@ -6,26 +6,26 @@ use skein_protocol::progress::{Phase, Progress};
 
 use crate::episodes::situation::Situation;
 
-/// Time without any progress after which it is told why.
+/// Time without progress after which the reason is reported.
 const PATIENCE: Duration = Duration::from_secs(20);
 /// Time between two warnings about one stall.
 const WARN_INTERVAL: Duration = Duration::from_secs(60);
-/// Time without a heartbeat of the receiving thread after which it is the one that is waited for.
+/// Age of the receiving thread's heartbeat after which that thread counts as stuck.
 const RECEIVER_PATIENCE: Duration = Duration::from_secs(20);
 
-/// Looks at each report.
+/// Examines every progress report.
 #[derive(Debug)]
 pub struct Watchdog {
-    done: Option<Done>,
-    /// When that was first seen.
+    done: Option<WorkDone>,
+    /// Time at which this state was first seen.
     since: Instant,
-    /// When the present stall was last told.
-    told: Option<Instant>,
+    /// Time of the last warning about the present stall.
+    warned: Option<Instant>,
 }
 
-/// Everything that moves in a run that gets on.
+/// All counters that a healthy run advances.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Done {
+struct WorkDone {
     phase: Phase,
     episodes: u64,
     steps: u64,
@@ -35,18 +35,18 @@ struct Done {
 }
 
 impl Watchdog {
-    /// One that has seen nothing yet, at `now`.
+    /// Starts at `now`, with nothing seen yet.
     pub fn new(now: Instant) -> Self {
         Self {
             done: None,
             since: now,
-            told: None,
+            warned: None,
         }
     }
 
-    /// Who waits for whom, if nothing has moved for a while. `obstacle`: what is known to stop the
-    /// training thread. `receiver`: how long ago the receiving thread last told where the episodes
-    /// are, and what it told.
+    /// Returns what is waited for, if nothing has moved for a while. `obstacle`: a known obstacle
+    /// to the training thread. `receiver`: age and content of the receiving thread's last
+    /// heartbeat.
     pub fn look(
         &mut self,
         now: Instant,
@@ -54,7 +54,7 @@ impl Watchdog {
         obstacle: Option<String>,
         receiver: Option<(Duration, Situation)>,
     ) -> Option<String> {
-        let done = Done {
+        let done = WorkDone {
             phase: progress.phase,
             episodes: progress.episodes,
             steps: progress.steps,
@@ -65,7 +65,7 @@ impl Watchdog {
         if self.done != Some(done) {
             self.done = Some(done);
             self.since = now;
-            self.told = None;
+            self.warned = None;
         }
         let still = now.saturating_duration_since(self.since);
         // A full disk is known at once, and nothing moves until there is room.
@@ -75,10 +75,10 @@ impl Watchdog {
         let waits = obstacle.unwrap_or_else(|| who_waits(progress.phase, still, receiver));
         if still >= PATIENCE
             && self
-                .told
-                .is_none_or(|told| now.saturating_duration_since(told) >= WARN_INTERVAL)
+                .warned
+                .is_none_or(|warned| now.saturating_duration_since(warned) >= WARN_INTERVAL)
         {
-            self.told = Some(now);
+            self.warned = Some(now);
             tracing::warn!(still_secs = still.as_secs(), waits, "nothing moves");
         }
         Some(waits)
@@ -96,15 +96,15 @@ fn who_waits(phase: Phase, still: Duration, receiver: Option<(Duration, Situatio
             );
         }
         Phase::Finishing => {
-            return format!("the training thread has been writing what remains for {still} s");
+            return format!("the training thread has been writing the last files for {still} s");
         }
     };
     let waits = format!("the training thread has waited for {episodes} for {still} s");
     match receiver {
-        None => format!("{waits}; the receiving thread has not begun"),
+        None => format!("{waits}; the receiving thread has not started"),
         Some((ago, _)) if ago > RECEIVER_PATIENCE => {
             format!(
-                "{waits}; the receiving thread has not come round for {} s",
+                "{waits}; the receiving thread has not responded for {} s",
                 ago.as_secs()
             )
         }
@@ -116,7 +116,7 @@ fn who_waits(phase: Phase, still: Duration, receiver: Option<(Duration, Situatio
 mod tests {
     use super::*;
 
-    fn nobody() -> Option<(Duration, Situation)> {
+    fn no_actor() -> Option<(Duration, Situation)> {
         let situation = Situation {
             waiting: 3,
             ..Situation::default()
@@ -125,51 +125,52 @@ mod tests {
     }
 
     #[test]
-    fn a_stall_is_told_after_a_while_and_until_something_moves() {
+    fn a_stall_is_reported_after_a_while_and_until_something_moves() {
         let start = Instant::now();
         let at = |secs| start + Duration::from_secs(secs);
         let mut watchdog = Watchdog::new(start);
         let mut progress = Progress::start(40);
-        assert_eq!(watchdog.look(at(1), &progress, None, nobody()), None);
-        assert_eq!(watchdog.look(at(20), &progress, None, nobody()), None);
-        let told = watchdog.look(at(22), &progress, None, nobody()).unwrap();
+        assert_eq!(watchdog.look(at(1), &progress, None, no_actor()), None);
+        assert_eq!(watchdog.look(at(20), &progress, None, no_actor()), None);
+        let stalled = watchdog.look(at(22), &progress, None, no_actor()).unwrap();
         assert_eq!(
-            told,
-            "the training thread has waited for episodes for 21 s; no actor is attached; episodes that wait for one: 3"
+            stalled,
+            "the training thread has waited for episodes for 21 s; no actor is attached; \
+             episodes that wait for one: 3"
         );
         progress.steps += 1;
-        assert_eq!(watchdog.look(at(23), &progress, None, nobody()), None);
+        assert_eq!(watchdog.look(at(23), &progress, None, no_actor()), None);
         progress.phase = Phase::Learning;
-        watchdog.look(at(24), &progress, None, nobody());
-        let told = watchdog.look(at(50), &progress, None, nobody()).unwrap();
+        watchdog.look(at(24), &progress, None, no_actor());
+        let stalled = watchdog.look(at(50), &progress, None, no_actor()).unwrap();
         assert!(
-            told.contains("at one step of its updates for 26 s"),
-            "{told}"
+            stalled.contains("at one step of its updates for 26 s"),
+            "{stalled}"
         );
     }
 
     #[test]
-    fn a_receiving_thread_that_does_not_come_round_is_named() {
+    fn a_receiving_thread_that_does_not_respond_is_named() {
         let start = Instant::now();
         let mut watchdog = Watchdog::new(start);
         let progress = Progress::start(40);
         watchdog.look(start, &progress, None, None);
-        let stale = nobody().map(|(_, situation)| (Duration::from_secs(33), situation));
-        let told = watchdog
+        let stale = no_actor().map(|(_, situation)| (Duration::from_secs(33), situation));
+        let stalled = watchdog
             .look(start + PATIENCE, &progress, None, stale)
             .unwrap();
         assert!(
-            told.ends_with("the receiving thread has not come round for 33 s"),
-            "{told}"
+            stalled.ends_with("the receiving thread has not responded for 33 s"),
+            "{stalled}"
         );
     }
 
     #[test]
-    fn a_full_disk_is_told_at_once() {
+    fn a_full_disk_is_reported_at_once() {
         let start = Instant::now();
         let mut watchdog = Watchdog::new(start);
         let full = "no room for the checkpoint".to_owned();
-        let told = watchdog.look(start, &Progress::start(40), Some(full.clone()), nobody());
-        assert_eq!(told, Some(full));
+        let stalled = watchdog.look(start, &Progress::start(40), Some(full.clone()), no_actor());
+        assert_eq!(stalled, Some(full));
     }
 }

@@ -90,7 +90,7 @@ fn after_a_power_cut_a_damaged_checkpoint_is_named_and_the_one_before_it_used() 
         told([name, "damaged"]),
         "nobody was warned of {name}:\n{terminal}"
     );
-    assert!(told(["going on after episode", ""]), "{terminal}");
+    assert!(told(["resuming after episode", ""]), "{terminal}");
 }
 
 /// The checkpoints that are in their place, oldest first.

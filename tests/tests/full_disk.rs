@@ -56,7 +56,7 @@ fn waits_for_room_and_comes_to_the_same(size: &str) {
     let mut run = Recipe::small().within(disk.folder()).start();
     run.until("it was told that the disk is full", |run| {
         run.stderr()
-            .contains("nothing moves: waits for room on the disk")
+            .contains("nothing moves: waiting for room on the disk")
             .then_some(())
     });
     disk.resize("1g");

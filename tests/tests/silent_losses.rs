@@ -15,8 +15,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use skein_launch::inspection::footprint;
 use skein_learner::episode::CommittedEpisode;
-use skein_learner::episodes::assembly::Keep;
-use skein_learner::episodes::dispatcher::{Dispatcher, Order, Place};
+use skein_learner::episodes::assembly::KeptData;
+use skein_learner::episodes::dispatcher::{BatchPlace, Dispatcher, EpisodeOrder};
 use skein_learner::episodes::receiver::EpisodeReceiver;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, Epoch, PolicyVersion};
@@ -87,11 +87,11 @@ impl Run {
             &self.config.transport,
             self.config.vae.latent,
         );
-        dispatcher.order(Order {
+        dispatcher.order(EpisodeOrder {
             ticket: self.ticket(0),
             epoch: Epoch(0),
-            keep: Keep::Latents,
-            place: Place { batch: 0, index: 0 },
+            keep: KeptData::Latents,
+            place: BatchPlace { batch: 0, index: 0 },
         });
         dispatcher
     }
@@ -402,7 +402,7 @@ fn many_actors_killed_in_the_middle_of_anything_cost_no_slot_no_file_and_no_epis
     let files = run.files();
     let mut peer = run.peer("actor_that_flies");
     let tickets = (0..EPISODES).map(|episode| run.ticket(episode)).collect();
-    let mut batch = receiver.fly(Epoch(0), Keep::Latents, tickets).unwrap();
+    let mut batch = receiver.fly(Epoch(0), KeptData::Latents, tickets).unwrap();
     for kill in 0..40 {
         sleep(Duration::from_millis(kill * 7 % 60));
         peer.kill();

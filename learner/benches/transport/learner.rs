@@ -8,8 +8,8 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use skein_learner::episode::CommittedEpisode;
-use skein_learner::episodes::assembly::Keep;
-use skein_learner::episodes::receiver::{Batch, EpisodeReceiver};
+use skein_learner::episodes::assembly::KeptData;
+use skein_learner::episodes::receiver::{EpisodeBatch, EpisodeReceiver};
 use skein_learner::threads::cpu_secs;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{Attempt, EpisodeId, Epoch, PolicyVersion};
@@ -21,25 +21,25 @@ use tempfile::TempDir;
 use crate::SYNTHETIC_ACTOR;
 use crate::synthetic::STEPS;
 
-/// How long actors may take to come, and to leave.
+/// Longest time for actors to attach, and to leave.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Batches that are ordered ahead, so that nobody waits for orders.
+/// Batches ordered ahead, so that no actor waits for orders.
 const BATCHES_AHEAD: usize = 3;
 
-/// What the learner is put under.
+/// Settings of one measurement.
 pub(crate) struct Load {
-    pub(crate) keep: Keep,
+    pub(crate) keep: KeptData,
     pub(crate) warm_up: Duration,
     pub(crate) measured: Duration,
 }
 
-/// What came of it.
+/// Results of one measurement.
 pub(crate) struct Throughput {
-    /// Records of episodes that were taken out of their batches, whole and in order.
+    /// Rate of records in episodes that were taken out of their batches, whole and in order.
     pub(crate) records_per_second: f64,
-    /// Processor time of the receiving thread.
+    /// Processor time per record of the receiving thread.
     pub(crate) thread_micros: f64,
-    /// Processor time of all of the learner.
+    /// Processor time per record of the whole learner.
     pub(crate) process_micros: f64,
     /// Time to copy a record's bytes in this process.
     pub(crate) copy_micros: f64,
@@ -51,15 +51,15 @@ pub(crate) struct Learner {
     directory: RunDirectory,
     receiver: EpisodeReceiver,
     actors: Vec<Child>,
-    batches: VecDeque<Batch>,
+    batches: VecDeque<EpisodeBatch>,
     next_episode: u64,
-    // Last, for the others lie in it.
+    // Last, because the others use it.
     _lock: LearnerLock,
     _folder: TempDir,
 }
 
 impl Learner {
-    /// A learner of a run of its own, without actors.
+    /// Starts a learner with a new run, without actors.
     pub(crate) fn start() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let directory = RunDirectory::new(folder.path().canonicalize().unwrap().join("run"));
@@ -81,7 +81,7 @@ impl Learner {
         }
     }
 
-    /// Starts synthetic actors until there are so many.
+    /// Starts synthetic actors until there are `count`.
     pub(crate) fn start_actors(&mut self, count: u32) {
         for number in self.actors.len()..count as usize {
             let actor = Command::new(std::env::current_exe().unwrap())
@@ -104,7 +104,7 @@ impl Learner {
         }
     }
 
-    /// What the learner's part in `load` costs.
+    /// Measures the learner's costs under `load`.
     pub(crate) fn throughput(&mut self, load: &Load) -> Throughput {
         let copy_micros = copy_micros(load.measured / 4);
         self.take_episodes(load.keep, load.warm_up);
@@ -138,14 +138,14 @@ impl Learner {
         }
     }
 
-    /// Sends the actors home, and ends.
+    /// Tells the actors to leave, and ends.
     pub(crate) fn finish(mut self) {
         self.receiver.finish();
         await_ends(&mut self.actors);
     }
 
-    /// Orders episodes and takes them out for so long; returns the number of their records.
-    fn take_episodes(&mut self, keep: Keep, time: Duration) -> usize {
+    /// Orders episodes and takes them out for `time`; returns the number of their records.
+    fn take_episodes(&mut self, keep: KeptData, time: Duration) -> usize {
         let end = Instant::now() + time;
         let mut records = 0;
         while Instant::now() < end {
@@ -160,14 +160,14 @@ impl Learner {
         records
     }
 
-    /// Takes out what is ordered.
+    /// Takes out what is still ordered.
     fn take_rest(&mut self) {
         for mut batch in self.batches.drain(..) {
             while batch.next(&AtomicBool::new(false)).unwrap().is_some() {}
         }
     }
 
-    fn order(&mut self, keep: Keep) {
+    fn order(&mut self, keep: KeptData) {
         let episodes = (4 * self.actors.len() as u64).max(16);
         let numbers = self.next_episode..self.next_episode + episodes;
         let ticket = |episode| Ticket {
@@ -188,11 +188,11 @@ impl Learner {
     }
 }
 
-/// Makes sure that all of an episode is there; returns the number of its records.
-fn look_at(episode: &CommittedEpisode, keep: Keep) -> usize {
+/// Checks that an episode is complete; returns the number of its records.
+fn look_at(episode: &CommittedEpisode, keep: KeptData) -> usize {
     episode.check().unwrap();
     assert_eq!(episode.steps(), STEPS as usize);
-    assert_eq!(episode.depth.is_some(), keep == Keep::Depth);
+    assert_eq!(episode.depth.is_some(), keep == KeptData::Depth);
     if let Some(depth) = &episode.depth {
         assert_eq!(
             (depth[0], depth[depth.len() - 1]),
@@ -202,7 +202,7 @@ fn look_at(episode: &CommittedEpisode, keep: Keep) -> usize {
     episode.observations.len()
 }
 
-/// Waits for the actors' ends; whoever does not end is killed.
+/// Waits for the actors to end; kills those that do not.
 fn await_ends(actors: &mut [Child]) {
     let deadline = Instant::now() + PATIENCE;
     for actor in actors {
@@ -217,8 +217,8 @@ fn await_ends(actors: &mut [Child]) {
     }
 }
 
-/// Time to copy a record out of memory as large as an actor's into an episode, as [`Keep::Depth`]
-/// asks for.
+/// Time to copy a record from memory as large as an actor's into an episode, as [`KeptData::Depth`]
+/// does.
 fn copy_micros(time: Duration) -> f64 {
     let record = size_of::<TransitionRecord>();
     let (of_actor, of_episode) = (512, STEPS as usize + 1);

@@ -1,9 +1,9 @@
-//! The folder of checkpoints: writing into place, finding, loading, removing old ones.
+//! The folder of checkpoints: writing, finding, loading, and removing old ones.
 //!
-//! Names that begin with a dot are work in progress and never read: a checkpoint is written under
-//! such a name, all of it brought to disk, and renamed; to be removed, it is renamed back to one
-//! first. One that is written again, for the same episode, keeps its predecessor beside it until it
-//! is in place: there is no moment without a sound checkpoint, once there is one.
+//! Names that begin with a dot are work in progress and never read. A checkpoint is written under
+//! such a name, synced to disk, and renamed. For removal it is first renamed back to such a name. A
+//! checkpoint that replaces one of the same episode leaves the old one beside it until it is in
+//! place. So there is always a sound checkpoint, once there is one.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -17,7 +17,7 @@ use tracing::warn;
 use super::manifest::{self, Manifest};
 use super::{CheckpointError, CheckpointState, files};
 
-/// Ends the name of a checkpoint that is about to be replaced by one of the same episode.
+/// Suffix of a checkpoint that is about to be replaced by one of the same episode.
 const REPLACED: &str = ".replaced";
 
 /// The checkpoints of a run.
@@ -30,19 +30,19 @@ pub struct CheckpointStore {
 
 /// A checkpoint in the folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Place {
+struct StoredCheckpoint {
     episodes: u64,
     path: PathBuf,
 }
 
-/// Where in `checkpoints` the state after `episodes` committed episodes lies.
+/// Path in `checkpoints` of the state after `episodes` committed episodes.
 pub fn checkpoint_directory(checkpoints: &Path, episodes: u64) -> PathBuf {
     checkpoints.join(format!("episode-{episodes}"))
 }
 
 impl CheckpointStore {
-    /// The checkpoints in `directory` of the run configured by `config`; the newest few that are
-    /// sound are kept, as many as `config` says.
+    /// Opens the checkpoints in `directory` of the run that `config` describes. As many of the
+    /// newest sound ones are kept as `config` says.
     pub fn new(directory: &Path, config: &Config) -> Self {
         Self {
             directory: directory.to_owned(),
@@ -51,27 +51,26 @@ impl CheckpointStore {
         }
     }
 
-    /// Where they lie.
+    /// Path of the folder.
     pub fn directory(&self) -> &Path {
         &self.directory
     }
 
-    /// Writes `state`, and removes those beyond the newest few. Returns where it lies.
+    /// Writes `state`, and removes checkpoints beyond the newest few. Returns the new checkpoint's
+    /// path.
     ///
-    /// `relied_on` are files outside whose content up to now the state counts on: they are brought
-    /// to disk before the checkpoint is in place.
+    /// `relied_on`: other files on whose present content the state relies. They are synced to disk
+    /// before the checkpoint is in place.
     ///
     /// # Errors
-    /// [`CheckpointError`]; what was there before still is, and what was half written takes no
-    /// room.
+    /// [`CheckpointError`]; earlier checkpoints stay, and nothing half-written remains.
     pub fn save(
         &self,
         state: &CheckpointState,
         relied_on: &[PathBuf],
     ) -> Result<PathBuf, CheckpointError> {
         let episodes = state.progress.episodes;
-        // One name for all: whatever an interrupted write left, of this episode or another, makes
-        // room for the next.
+        // A single name, so that the leftovers of any interrupted write are removed by the next.
         let aside = self.directory.join(".writing");
         remove(&aside)?;
         if let Err(error) = self.write_aside(&aside, state, relied_on) {
@@ -103,13 +102,13 @@ impl CheckpointStore {
             sync(&aside.join(name))?;
         }
         sync(aside)?;
-        // A new file's name is in its folder, which has to be brought to disk as well.
+        // A new file's name lies in its folder, so the folder is synced too.
         let folders: BTreeSet<&Path> = relied_on.iter().filter_map(|path| path.parent()).collect();
         let mut all = relied_on.iter().map(PathBuf::as_path).chain(folders);
         all.try_for_each(sync_once)
     }
 
-    /// Writes the manifest of the files in `directory` as they are now, and so makes them a
+    /// Writes the manifest of the files in `directory` as they are now, which makes them a
     /// checkpoint after `episodes` episodes.
     ///
     /// # Errors
@@ -122,11 +121,11 @@ impl CheckpointStore {
         )
     }
 
-    /// Gives the checkpoint at `place`, if there is a sound one, the name under which it is still
-    /// found until the new one is in its place.
+    /// Renames a sound checkpoint at `place` to the name under which it is still found until the
+    /// new one is in place.
     fn make_way(&self, place: &Path) -> Result<(), CheckpointError> {
         if !is_sound(place) {
-            // Perhaps its predecessor still lies beside it: that one stays.
+            // The predecessor may still lie beside it; then that one stays.
             return self.retire(place);
         }
         let replaced = replaced(place);
@@ -134,19 +133,20 @@ impl CheckpointStore {
         fs::rename(place, replaced).map_err(CheckpointError::io("rename", place))
     }
 
-    /// The episodes of which there is a checkpoint, the newest first.
+    /// Lists the episodes with a checkpoint, the newest first. A folder that does not exist has
+    /// none.
     ///
     /// # Errors
-    /// [`CheckpointError::Io`] when the folder cannot be read; a folder that does not exist has
-    /// none.
+    /// [`CheckpointError::Io`] when the folder cannot be read.
     pub fn list(&self) -> Result<Vec<u64>, CheckpointError> {
         let mut episodes: Vec<u64> = self.places()?.iter().map(|place| place.episodes).collect();
         episodes.dedup();
         Ok(episodes)
     }
 
-    /// All checkpoints, the newest first; of two of one episode, the one that replaces the other.
-    fn places(&self) -> Result<Vec<Place>, CheckpointError> {
+    /// Lists all checkpoints, the newest first. Of two with one episode, the replacing one comes
+    /// first.
+    fn places(&self) -> Result<Vec<StoredCheckpoint>, CheckpointError> {
         if !self.directory.exists() {
             return Ok(Vec::new());
         }
@@ -154,7 +154,7 @@ impl CheckpointStore {
         let mut found = Vec::new();
         for entry in fs::read_dir(&self.directory).map_err(io())? {
             let entry = entry.map_err(io())?;
-            // A checkpoint is a directory; whatever else lies here is nobody's business.
+            // A checkpoint is a directory; other entries are ignored.
             if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
                 continue;
             }
@@ -167,12 +167,12 @@ impl CheckpointStore {
                     .parse::<u64>()
                     .ok()
             });
-            found.extend(episodes.map(|episodes| Place {
+            found.extend(episodes.map(|episodes| StoredCheckpoint {
                 episodes,
                 path: self.directory.join(&name),
             }));
         }
-        // The shorter of two names is that of the newer one.
+        // The shorter of two names belongs to the newer one.
         found.sort_by_key(|place| {
             (
                 std::cmp::Reverse(place.episodes),
@@ -188,13 +188,13 @@ impl CheckpointStore {
     /// [`CheckpointError`] names the file that is missing, damaged, or of another version or
     /// configuration.
     pub fn load(&self, episodes: u64) -> Result<CheckpointState, CheckpointError> {
-        self.load_from(&Place {
+        self.load_from(&StoredCheckpoint {
             episodes,
             path: checkpoint_directory(&self.directory, episodes),
         })
     }
 
-    fn load_from(&self, place: &Place) -> Result<CheckpointState, CheckpointError> {
+    fn load_from(&self, place: &StoredCheckpoint) -> Result<CheckpointState, CheckpointError> {
         let manifest = Manifest::read(&place.path)?;
         let config = manifest.read_file(&place.path, files::CONFIG)?;
         if !manifest.is_of(self.config.digest()) {
@@ -233,19 +233,20 @@ impl CheckpointStore {
             path: path.to_owned(),
             differences: match differences {
                 Ok(differences) if !differences.is_empty() => differences.join(", "),
-                _ => "its config.toml says which".to_owned(),
+                _ => "see its config.toml".to_owned(),
             },
         }
     }
 
-    /// Loads the newest checkpoint that is undamaged; `None` when there is none at all. Resuming
-    /// from an older one costs time, never the result. Each damaged one that is newer is given to
-    /// `passed_over`, and so is one that does not fit what lies beside it, of which `check` tells.
+    /// Loads the newest undamaged checkpoint; `None` if there is no checkpoint at all. Resuming
+    /// from an older one costs time but does not change the result. `check` may refuse a checkpoint
+    /// that does not fit the files beside it. Every newer checkpoint that is damaged or refused is
+    /// reported to `passed_over`.
     ///
     /// # Errors
-    /// [`CheckpointError::NoneUsable`] when all are damaged: a run is not begun anew without a
-    /// word. [`CheckpointError::Format`] or [`CheckpointError::Configuration`] when the newest
-    /// undamaged one is of another version or configuration.
+    /// [`CheckpointError::NoneUsable`] when none is usable: a run is not silently started again.
+    /// [`CheckpointError::Format`] or [`CheckpointError::Configuration`] when the newest undamaged
+    /// one is of another version or configuration.
     pub fn load_newest(
         &self,
         check: impl Fn(&CheckpointState) -> Result<(), CheckpointError>,
@@ -274,8 +275,8 @@ impl CheckpointStore {
         })
     }
 
-    /// Keeps the checkpoint just written and the newest sound ones before it. Later ones are of a
-    /// future that this run has left by resuming from an earlier one.
+    /// Keeps the checkpoint just written and the newest sound ones before it. Later ones belong to
+    /// a future that this run left by resuming from an earlier one.
     fn remove_others(&self, newest: u64) -> Result<(), CheckpointError> {
         let mut sound = BTreeSet::from([newest]);
         for place in self.places()? {
@@ -296,7 +297,7 @@ impl CheckpointStore {
         Ok(())
     }
 
-    /// Removes a checkpoint, if it is there; half removed, it is not taken for one.
+    /// Removes a checkpoint, if it exists. A half-removed one cannot be mistaken for a checkpoint.
     fn retire(&self, place: &Path) -> Result<(), CheckpointError> {
         if !place.exists() {
             return Ok(());
@@ -309,7 +310,7 @@ impl CheckpointStore {
     }
 }
 
-/// Whether there is a checkpoint at `place` all of whose files are what was written.
+/// `true` if there is a checkpoint at `place` whose files are all as they were written.
 fn is_sound(place: &Path) -> bool {
     match Manifest::read(place).and_then(|manifest| manifest.verify(place)) {
         Ok(()) => true,
@@ -322,7 +323,7 @@ fn is_sound(place: &Path) -> bool {
     }
 }
 
-/// The name of the checkpoint at `place` while it is replaced.
+/// Name of the checkpoint at `place` while it is being replaced.
 fn replaced(place: &Path) -> PathBuf {
     let mut name = place.as_os_str().to_owned();
     name.push(REPLACED);
@@ -331,7 +332,7 @@ fn replaced(place: &Path) -> PathBuf {
 
 fn remove(path: &Path) -> Result<(), CheckpointError> {
     let removed = match fs::remove_dir_all(path) {
-        // Somebody put a file where only directories of ours are.
+        // A foreign file under one of our names is removed too.
         Err(error) if error.kind() == std::io::ErrorKind::NotADirectory => fs::remove_file(path),
         removed => removed,
     };
@@ -343,15 +344,15 @@ fn remove(path: &Path) -> Result<(), CheckpointError> {
     }
 }
 
-/// Brings to disk what others wrote. Whatever this fails of may be lost, and trying again may
-/// succeed without bringing it back: so not even a full disk is waited for.
+/// Syncs to disk a file that others wrote. After a failure the content may be lost, and a second
+/// attempt may succeed without writing it. So this does not wait even for a full disk.
 fn sync_once(path: &Path) -> Result<(), CheckpointError> {
     durable::sync(path).map_err(|error| {
         CheckpointError::io("write to disk", path)(std::io::Error::other(error.to_string()))
     })
 }
 
-/// Brings a file or directory to disk.
+/// Syncs a file or directory to disk.
 fn sync(path: &Path) -> Result<(), CheckpointError> {
     durable::sync(path).map_err(CheckpointError::io("write to disk", path))
 }

@@ -1,4 +1,4 @@
-//! What is saved is what is loaded, bit for bit, or it is refused.
+//! A loaded checkpoint equals the saved one bit for bit, or it is refused.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -12,12 +12,12 @@ use skein_protocol::transition::Outcome;
 use super::*;
 use crate::disk::Disk;
 use crate::episode::samples::{episode, with_images};
-use crate::metrics::{EventFile, Windows};
+use crate::metrics::{EpisodeWindows, EventFile};
 use crate::replay::Replay;
 use crate::state::TensorValues;
 
-/// With bit patterns that only survive a copy: a negative zero, the smallest number, a NaN with a
-/// payload.
+/// A state with bit patterns that only a copy preserves: negative zero, the smallest number, a NaN
+/// with a payload.
 fn state(episodes: u64) -> CheckpointState {
     let mut replay = Replay::new(&Config::default());
     for number in 0..4 {
@@ -25,7 +25,7 @@ fn state(episodes: u64) -> CheckpointState {
         episode.level_up[1] = true;
         replay.insert(episode).unwrap();
     }
-    let mut windows = Windows::new(50);
+    let mut windows = EpisodeWindows::new(50);
     windows.walls_passed.push(3.0);
     let odd = vec![
         -0.0,
@@ -41,7 +41,7 @@ fn state(episodes: u64) -> CheckpointState {
         values,
     };
     CheckpointState {
-        progress: Progress {
+        progress: TrainingProgress {
             episodes,
             epochs: 7,
             version: 9,
@@ -49,11 +49,11 @@ fn state(episodes: u64) -> CheckpointState {
             environment_steps: 12,
             vae_steps: 3,
             policy_updates: u64::MAX,
-            in_the_air: vec![EpochOrder {
+            in_flight: vec![EpochOrder {
                 epoch: 7,
                 policy_version: 6,
                 exploration: Exploration::Sample,
-                keep: Keep::Depth,
+                keep: KeptData::Depth,
             }],
             evaluations: 1,
             evaluation_episodes: 5,
@@ -80,7 +80,7 @@ fn state(episodes: u64) -> CheckpointState {
                 }],
                 windows,
             },
-            spent: Spent::default(),
+            spent: RunCosts::default(),
         },
         snapshots: vec![
             Snapshot {
@@ -105,7 +105,7 @@ fn state(episodes: u64) -> CheckpointState {
     }
 }
 
-/// Bits instead of numbers, because a NaN equals nothing.
+/// Compares bits instead of numbers, because NaN equals nothing.
 fn bits(state: &CheckpointState) -> Vec<(String, Vec<u64>)> {
     let bits = |values: &TensorValues| match values {
         TensorValues::F32(values) => values.iter().map(|value| value.to_bits().into()).collect(),
@@ -151,7 +151,7 @@ fn writer(store: CheckpointStore) -> CheckpointWriter {
     CheckpointWriter::start(store, Disk::new(Arc::default())).unwrap()
 }
 
-/// Every file of a checkpoint.
+/// Names of all files of a checkpoint.
 fn all_files() -> impl Iterator<Item = &'static str> {
     files::NAMES.into_iter().chain([manifest::NAME])
 }
@@ -166,7 +166,7 @@ fn names(directory: &std::path::Path) -> Vec<String> {
 }
 
 #[test]
-fn what_is_saved_is_what_is_loaded() {
+fn a_loaded_checkpoint_equals_the_saved_one() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
@@ -231,7 +231,7 @@ fn a_damaged_byte_anywhere_is_refused_and_its_file_named() {
                 "{name}, {what}: {error}"
             );
         };
-        // A thousand and more positions, of a file that has so many bits.
+        // At a thousand positions or more, if the file has so many bits.
         for bit in (0..8 * sound.len()).step_by((8 * sound.len() / 1000).max(1)) {
             let mut damaged = sound.clone();
             damaged[bit / 8] ^= 1 << (bit % 8);
@@ -286,17 +286,20 @@ fn another_format_is_refused_before_anything_else_is_believed() {
         format!("{body},\n  \"xxh3\": \"{checksum:016x}\"\n}}\n"),
     )
     .unwrap();
-    // It is no damage that an older checkpoint could make good.
+    // An older checkpoint could not help: nothing is damaged.
     let error = store.load_newest(|_| Ok(()), |_| {}).unwrap_err();
     let expected = manifest::FORMAT;
     assert!(
-        matches!(error, CheckpointError::Format { found: 9, expected: ours, .. } if ours == expected),
+        matches!(
+            error,
+            CheckpointError::Format { found: 9, expected: ours, .. } if ours == expected
+        ),
         "{error}"
     );
 }
 
 #[test]
-fn a_run_whose_checkpoints_are_all_damaged_is_not_begun_anew() {
+fn a_run_whose_checkpoints_are_all_damaged_is_not_started_again() {
     let (_directory, store) = store(2);
     for episodes in [500, 1000] {
         let place = store.save(&state(episodes), &[]).unwrap();
@@ -356,7 +359,7 @@ fn a_damaged_checkpoint_does_not_count_among_those_kept() {
 fn a_checkpoint_that_is_written_again_is_never_missed() {
     let (_directory, store) = store(1);
     let place = store.save(&state(500), &[]).unwrap();
-    // The first half of the exchange, then a death.
+    // The first half of the exchange, then the process is killed.
     let replaced = store.directory().join("episode-500.replaced");
     fs::rename(&place, &replaced).unwrap();
     assert_same(
@@ -410,7 +413,7 @@ fn checkpoints_of_an_abandoned_future_do_not_push_out_the_present() {
 }
 
 #[test]
-fn what_an_interrupted_write_left_is_never_read_and_then_cleared() {
+fn leftovers_of_an_interrupted_write_are_never_read_and_then_removed() {
     let (_directory, store) = store(2);
     let interrupted = store.save(&state(437), &[]).unwrap();
     fs::write(interrupted.join("tensors.safetensors.part"), "half").unwrap();
@@ -451,7 +454,7 @@ fn the_writing_thread_has_everything_on_disk_when_it_is_finished() {
 }
 
 #[test]
-fn a_failed_write_is_told_by_the_next_save_or_the_end() {
+fn a_failed_write_is_returned_by_the_next_save_or_the_end() {
     let directory = tempfile::tempdir().unwrap();
     let in_the_way = directory.path().join("checkpoints");
     fs::write(&in_the_way, "a file, not a folder").unwrap();
@@ -471,7 +474,7 @@ fn a_failed_write_is_told_by_the_next_save_or_the_end() {
 }
 
 #[test]
-fn what_a_checkpoint_relies_on_must_be_there() {
+fn files_that_a_checkpoint_relies_on_must_exist() {
     let (directory, store) = store(2);
     let rows = directory.path().join("episodes.csv");
     store
@@ -510,7 +513,7 @@ impl Drop for SmallDisk {
 }
 
 #[test]
-fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop() {
+fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_stopped() {
     let Some(small) = SmallDisk::mount() else {
         println!("skipped: no file system can be mounted here");
         return;
@@ -564,7 +567,7 @@ fn wait_for(condition: impl Fn() -> bool) {
 }
 
 #[test]
-fn one_that_does_not_fit_what_lies_beside_it_is_passed_over_and_told() {
+fn a_checkpoint_that_does_not_fit_the_files_beside_it_is_passed_over_and_reported() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     store.save(&state(1000), &[]).unwrap();
@@ -575,19 +578,19 @@ fn one_that_does_not_fit_what_lies_beside_it_is_passed_over_and_told() {
         }),
         _ => Ok(()),
     };
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     let newest = store
-        .load_newest(check, |error| told.push(error.to_string()))
+        .load_newest(check, |error| reported.push(error.to_string()))
         .unwrap();
     assert_same(&newest.unwrap(), &state(500));
     assert_eq!(
-        told,
+        reported,
         ["the checkpoint of episode 1000 does not fit: episodes.csv ends after 3 bytes"]
     );
 }
 
 #[test]
-fn files_among_the_checkpoints_are_in_nobodys_way() {
+fn other_files_among_the_checkpoints_do_no_harm() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     for name in ["episode-9999", ".writing", ".removing", "notes.txt"] {

@@ -1,45 +1,45 @@
 //! Assembles streamed records into a whole episode, or into a whole segment of one.
 //!
-//! An episode is committed once, complete and in order, or not at all; nothing downstream ever sees
-//! half of one, or one flown with two policies. Of an episode in segments the same holds for each
-//! segment, and each begins where the one before it ended.
+//! An episode is committed once, complete and in order, or not at all. Nothing downstream ever sees
+//! half an episode, or one flown with two policies. For an episode in segments, the same holds for
+//! each segment, and each begins where the one before it ended.
 
 use skein_protocol::ids::{ActorId, ActorIncarnation, EpisodeId};
 use skein_protocol::transition::{Outcome, RecordFault, RecordKind, TransitionRecord};
 use skein_protocol::{ACTION, IMAGE_PIXELS};
 
-use super::order::Order;
+use super::order::EpisodeOrder;
 use crate::episode::{CommittedEpisode, StepObservation};
 
-pub use super::order::Keep;
+pub use super::order::KeptData;
 
-/// An episode under way.
+/// An episode or segment whose records are arriving.
 #[derive(Debug)]
 pub struct Assembly {
-    order: Order,
+    order: EpisodeOrder,
     actor: ActorId,
     incarnation: ActorIncarnation,
     episode: CommittedEpisode,
-    /// Of a later segment: where it is to begin.
+    /// Required start of a later segment: the end of the one before it.
     begins: Option<SegmentEnd>,
     longest_records: usize,
     latent: usize,
-    /// How the last step left the episode; its walls passed are in `episode`.
+    /// State of the episode after the last step; its walls passed are in `episode`.
     last_step: StepEnd,
 }
 
-/// Where a segment ended whose episode goes on.
+/// End of a segment whose episode continues.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SegmentEnd {
     episode: EpisodeId,
-    /// Steps flown since reset.
+    /// Steps flown since the reset.
     steps: usize,
     walls_passed: u8,
     seen: StepObservation,
 }
 
 impl SegmentEnd {
-    /// Where `segment` ended; `None` if its episode did, too.
+    /// Returns the end of `segment`; `None` if its episode ended too.
     pub fn of(segment: &CommittedEpisode) -> Option<Self> {
         let seen = *segment.observations.last()?;
         segment.outcome.is_none().then_some(Self {
@@ -50,12 +50,13 @@ impl SegmentEnd {
         })
     }
 
-    /// Whether what `order` asks for is what comes next.
-    pub fn is_before(&self, order: &Order) -> bool {
+    /// `true` if `order` asks for the segment that comes next.
+    pub fn is_before(&self, order: &EpisodeOrder) -> bool {
         (self.episode, self.steps) == (order.ticket.episode, order.ticket.first_step() as usize)
     }
 
-    /// Whether the vehicle is where it was, to the last bit. The image may have been encoded anew.
+    /// `true` if the vehicle is at the same place, to the last bit. A newer encoder may have
+    /// encoded the image, so codes are not compared.
     fn is_at(&self, record: &TransitionRecord) -> bool {
         self.seen.position_m == record.position_m
             && self.seen.velocity_mps == record.velocity_mps
@@ -63,33 +64,33 @@ impl SegmentEnd {
     }
 }
 
-/// How a step left its episode.
+/// State of an episode after a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum StepEnd {
-    /// It goes on.
+    /// The episode continues.
     Onward,
-    /// It ended in a state without a future.
+    /// The episode ended in a state without a future.
     Terminated { level_up: bool },
-    /// It was cut off.
+    /// The episode was cut off.
     Truncated,
 }
 
-/// What a record did to its episode.
+/// Effect of a record on its episode.
 #[derive(Debug)]
 pub enum Assembled {
-    /// It is one more step.
+    /// One more step.
     Step,
-    /// It was the last, of the episode or of the segment.
+    /// The last record of the episode or segment.
     Whole(Box<CommittedEpisode>),
     /// The simulator failed; the episode is void.
     Failed,
 }
 
 impl Assembly {
-    /// Nothing yet of what `order` asks for, of an episode of at most `longest_records` with codes
-    /// of `latent` numbers. A later segment `begins` where the one before it ended.
+    /// Starts empty, for `order`. An episode has at most `longest_records` records, with codes of
+    /// `latent` numbers. A later segment `begins` at the end of the one before it.
     pub fn new(
-        order: Order,
+        order: EpisodeOrder,
         begins: Option<SegmentEnd>,
         longest_records: usize,
         latent: usize,
@@ -111,31 +112,31 @@ impl Assembly {
         }
     }
 
-    /// What was ordered.
-    pub fn order(&self) -> &Order {
+    /// The order that is being flown.
+    pub fn order(&self) -> &EpisodeOrder {
         &self.order
     }
 
-    /// Gives the order back; what was assembled is dropped.
-    pub fn into_order(self) -> Order {
+    /// Returns the order; drops what was assembled.
+    pub fn into_order(self) -> EpisodeOrder {
         self.order
     }
 
-    /// Whether nothing has arrived yet.
+    /// `true` if no record has arrived yet.
     pub fn is_empty(&self) -> bool {
         self.episode.observations.is_empty()
     }
 
-    /// Records that have arrived.
+    /// Number of records that have arrived.
     pub fn records(&self) -> usize {
         self.episode.observations.len()
     }
 
-    /// Takes the next record in.
+    /// Adds the next record.
     ///
     /// # Errors
-    /// [`RecordFault`] when it is not the next record of this episode, or makes no sense; the
-    /// episode is void then.
+    /// [`RecordFault`] when it is not the next record of this episode, or is invalid; the episode
+    /// is void then.
     pub fn push(&mut self, record: &TransitionRecord) -> Result<Assembled, RecordFault> {
         let step = self.order.ticket.first_step() + self.episode.observations.len() as u32;
         let kind = record.check(&self.order.ticket, self.actor, self.incarnation, step)?;
@@ -187,9 +188,9 @@ impl Assembly {
         self.last_step = StepEnd::of(record);
     }
 
-    /// Makes room for the images of the longest episode at once. The system gives memory as it is
-    /// written to, so what is not needed costs nothing; images that grew would be moved again and
-    /// again, with as much fresh memory each time.
+    /// Reserves memory for the images of the longest episode at once. The system provides pages
+    /// only when written, so unused memory costs nothing. Growing buffers would be moved again and
+    /// again, into fresh memory each time.
     fn make_room(&mut self) {
         let longest = self
             .segment_steps()
@@ -208,8 +209,8 @@ impl Assembly {
             .map(|segment| segment.steps as usize)
     }
 
-    /// Whether a later segment begins where the one before it ended: a record of a machine whose
-    /// physics come to something else must not go on with the episode.
+    /// Checks that a later segment begins where the one before it ended. A machine whose physics
+    /// differ must not continue the episode.
     fn check_begin(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
         let is_elsewhere = self.begins.is_some_and(|begins| !begins.is_at(record));
         refuse_contradictions([(
@@ -218,7 +219,7 @@ impl Assembly {
         )])
     }
 
-    /// Whether the episode goes on, and walls are passed as the step says.
+    /// Checks that the episode continues, and that its walls and level-ups agree.
     fn check_step(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
         let passed_before = self.episode.walls_passed;
         let passes = record.walls_passed > passed_before;
@@ -244,10 +245,10 @@ impl Assembly {
         ])
     }
 
-    /// Whether the last step ended the episode as the closing record says.
+    /// Checks that the closing record's outcome fits the last step.
     fn check_ending(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
         if self.is_empty() {
-            // It is told from one that is out of its place.
+            // `close` refuses this with a fitting message.
             return Ok(());
         }
         let outcome = Outcome::from_code(record.outcome);
@@ -269,7 +270,7 @@ impl Assembly {
         ])
     }
 
-    /// Whether the segment is over, and its episode is not.
+    /// Checks that the segment is over, and its episode is not.
     fn check_segment_end(&self, record: &TransitionRecord) -> Result<(), RecordFault> {
         let steps = self.segment_steps();
         refuse_contradictions([
@@ -292,7 +293,7 @@ impl Assembly {
         ])
     }
 
-    /// Ends the episode as the closing record says.
+    /// Takes the outcome from the closing record.
     fn close(&mut self, record: &TransitionRecord) -> Result<(), RecordFault> {
         let outcome = Outcome::from_code(record.outcome).ok_or(RecordFault::Code {
             name: "outcome",
@@ -305,7 +306,7 @@ impl Assembly {
         Ok(())
     }
 
-    /// Hands out what was assembled.
+    /// Returns what was assembled.
     fn finish(&mut self) -> Result<CommittedEpisode, RecordFault> {
         if self.episode.actions.is_empty() {
             let step = self.order.ticket.first_step().into();
@@ -324,7 +325,7 @@ impl Assembly {
 }
 
 /// The episode or segment that `order` asks for, before its first record.
-fn nothing_of(order: &Order, actor: ActorId) -> CommittedEpisode {
+fn nothing_of(order: &EpisodeOrder, actor: ActorId) -> CommittedEpisode {
     let ticket = &order.ticket;
     let flown: &[[f32; ACTION]] = ticket
         .segment
@@ -347,7 +348,7 @@ fn nothing_of(order: &Order, actor: ActorId) -> CommittedEpisode {
         walls_passed: 0,
         course_walls: 0,
         hit_wall: None,
-        depth: (order.keep == Keep::Depth).then(Vec::new),
+        depth: (order.keep == KeptData::Depth).then(Vec::new),
     }
 }
 
@@ -363,7 +364,7 @@ impl StepEnd {
     }
 }
 
-/// Refuses the first of the contradictions that is there.
+/// Returns the first contradiction that holds as an error.
 fn refuse_contradictions<const N: usize>(
     contradictions: [(&'static str, bool); N],
 ) -> Result<(), RecordFault> {

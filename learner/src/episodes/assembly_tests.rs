@@ -1,19 +1,18 @@
-//! An episode is whole, in order and makes sense, and so is a segment, or it is refused by what is
-//! wrong with it.
+//! An episode or a segment is whole, in order and consistent, or it is refused with the reason.
 
 use bytemuck::Zeroable;
 use skein_protocol::ids::{Attempt, Epoch, PolicyVersion, RunId};
 use skein_protocol::segment::Segment;
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 
-use super::super::order::Place;
+use super::super::order::BatchPlace;
 use super::*;
 
 const ACTOR: ActorId = ActorId(2);
 const INCARNATION: ActorIncarnation = ActorIncarnation(11);
 /// Length of the latent codes.
 const LATENT: usize = 16;
-/// Steps of the episode here.
+/// Steps of the test episode.
 const STEPS: u32 = 3;
 
 fn ticket() -> Ticket {
@@ -30,16 +29,16 @@ fn ticket() -> Ticket {
     }
 }
 
-fn order(ticket: Ticket, keep: Keep) -> Order {
-    Order {
+fn order(ticket: Ticket, keep: KeptData) -> EpisodeOrder {
+    EpisodeOrder {
         ticket,
         epoch: Epoch(0),
         keep,
-        place: Place { batch: 0, index: 0 },
+        place: BatchPlace { batch: 0, index: 0 },
     }
 }
 
-fn assembly(keep: Keep) -> Assembly {
+fn assembly(keep: KeptData) -> Assembly {
     Assembly::new(
         order(ticket(), keep),
         None,
@@ -50,7 +49,7 @@ fn assembly(keep: Keep) -> Assembly {
     )
 }
 
-/// Record `step`, its image filled with its number.
+/// Record `step`, its image filled with the step number.
 fn record(step: u32) -> TransitionRecord {
     let mut record = TransitionRecord::zeroed();
     record.begin(&ticket(), ACTOR, INCARNATION, step);
@@ -63,7 +62,7 @@ fn record(step: u32) -> TransitionRecord {
     record
 }
 
-fn assemble(keep: Keep) -> CommittedEpisode {
+fn assemble(keep: KeptData) -> CommittedEpisode {
     let mut assembly = assembly(keep);
     for step in 0..STEPS {
         assert!(matches!(assembly.push(&record(step)), Ok(Assembled::Step)));
@@ -77,7 +76,7 @@ fn assemble(keep: Keep) -> CommittedEpisode {
 #[test]
 fn no_episode_mixes_policy_versions() {
     for strange in 1..=STEPS {
-        let mut assembly = assembly(Keep::Latents);
+        let mut assembly = assembly(KeptData::Latents);
         for step in 0..strange {
             assembly.push(&record(step)).unwrap();
         }
@@ -94,12 +93,12 @@ fn no_episode_mixes_policy_versions() {
             }
         );
     }
-    assert_eq!(assemble(Keep::Latents).policy_version, PolicyVersion(3));
+    assert_eq!(assemble(KeptData::Latents).policy_version, PolicyVersion(3));
 }
 
 #[test]
 fn a_code_that_is_longer_than_configured_is_refused() {
-    let mut assembly = assembly(Keep::Latents);
+    let mut assembly = assembly(KeptData::Latents);
     let mut longer = record(0);
     longer.latent[..LATENT].fill(0.5);
     assembly.push(&longer).unwrap();
@@ -111,7 +110,7 @@ fn a_code_that_is_longer_than_configured_is_refused() {
 
 #[test]
 fn an_episode_that_never_ends_is_refused_at_its_limit() {
-    let mut assembly = assembly(Keep::Depth);
+    let mut assembly = assembly(KeptData::Depth);
     let onward = |step| {
         let mut record = record(step);
         record.kind = RecordKind::Step.code();
@@ -131,7 +130,7 @@ fn an_episode_that_never_ends_is_refused_at_its_limit() {
     );
 }
 
-/// The assembly of two steps that follow one that led to `seen`.
+/// The assembly of a segment of two steps, after one step of its episode.
 fn segment(begins: Option<SegmentEnd>) -> Assembly {
     let segment = Segment {
         steps: 2,
@@ -142,7 +141,7 @@ fn segment(begins: Option<SegmentEnd>) -> Assembly {
         ..ticket()
     };
     Assembly::new(
-        order(ticket, Keep::Depth),
+        order(ticket, KeptData::Depth),
         begins,
         100,
         LATENT,
@@ -165,7 +164,7 @@ fn segment_end(step: u32) -> TransitionRecord {
     })
 }
 
-/// A step after which the episode goes on.
+/// A step after which the episode continues.
 fn onward(step: u32) -> TransitionRecord {
     changed(record(step), |record| {
         (record.kind, record.truncated, record.outcome) = (RecordKind::Step.code(), 0, 0);
@@ -173,7 +172,7 @@ fn onward(step: u32) -> TransitionRecord {
 }
 
 #[test]
-fn a_segment_is_its_steps_and_what_they_led_to_and_knows_what_came_before() {
+fn a_segment_holds_its_steps_and_the_action_before_them() {
     let mut assembly = segment(None);
     assert!(matches!(assembly.push(&onward(1)), Ok(Assembled::Step)));
     assert!(matches!(assembly.push(&onward(2)), Ok(Assembled::Step)));
@@ -191,7 +190,7 @@ fn a_segment_is_its_steps_and_what_they_led_to_and_knows_what_came_before() {
     assert!(!segment.terminated());
     let end = SegmentEnd::of(&segment).unwrap();
     assert_eq!((end.episode, end.steps), (EpisodeId(5), 3));
-    // The episode may end in a segment, of which no other begins then.
+    // An episode may end in a segment; then no other segment follows.
     let mut last = self::segment(None);
     last.push(&changed(onward(1), |record| record.terminated = 1))
         .unwrap();
@@ -213,7 +212,7 @@ fn a_segment_that_is_too_short_or_too_long_or_of_a_whole_episode_is_refused() {
         let fault = records
             .iter()
             .find_map(|record| assembly.push(record).err());
-        fault.expect("it makes no sense").to_string()
+        fault.expect("one record is invalid").to_string()
     };
     assert!(refusal(&[onward(1), segment_end(2)], segment(None)).contains("before its last step"));
     assert!(
@@ -222,7 +221,9 @@ fn a_segment_that_is_too_short_or_too_long_or_of_a_whole_episode_is_refused() {
     );
     assert!(refusal(&[onward(0)], segment(None)).contains("step is 0 where 1"));
     assert!(refusal(&[segment_end(1)], segment(None)).contains("before its last step"));
-    assert!(refusal(&[onward(0), segment_end(1)], assembly(Keep::Latents)).contains("flown whole"));
+    assert!(
+        refusal(&[onward(0), segment_end(1)], assembly(KeptData::Latents)).contains("flown whole")
+    );
     let end = |change: fn(&mut TransitionRecord)| {
         refusal(
             &[onward(1), changed(onward(2), change), segment_end(3)],
@@ -253,7 +254,7 @@ fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passe
         (record.position_m, record.velocity_mps) = (seen.position_m, seen.velocity_mps);
         (record.orientation, record.walls_passed) = (seen.orientation, 2);
     });
-    // An encoder that has learned since sees it otherwise.
+    // A newer encoder encodes the same image differently.
     assert_ne!(there.latent, seen.latent);
     assert!(matches!(
         segment(Some(begins)).push(&there),
@@ -277,9 +278,9 @@ fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passe
 }
 
 #[test]
-fn depth_images_are_copied_only_for_who_wants_them() {
-    assert_eq!(assemble(Keep::Latents).depth, None);
-    let kept = assemble(Keep::Depth).depth.unwrap();
+fn depth_images_are_copied_only_if_ordered() {
+    assert_eq!(assemble(KeptData::Latents).depth, None);
+    let kept = assemble(KeptData::Depth).depth.unwrap();
     let images: Vec<_> = kept
         .chunks_exact(IMAGE_PIXELS)
         .map(|image| image.to_vec())
@@ -294,8 +295,8 @@ fn depth_images_are_copied_only_for_who_wants_them() {
 
 #[test]
 fn an_episode_that_contradicts_itself_is_refused() {
-    // A change of one record, by its step, and what is said of it or of the first one that shows
-    // it.
+    // A change to one record, by its step, and the resulting error, here or at the first record
+    // that reveals it.
     type Case = (u32, fn(&mut TransitionRecord), &'static str);
     let cases: [Case; 9] = [
         (0, |r| r.truncated = 1, "a step after the episode's end"),
@@ -333,7 +334,7 @@ fn an_episode_that_contradicts_itself_is_refused() {
         ),
     ];
     for (step, change, expected) in cases {
-        let mut assembly = assembly(Keep::Latents);
+        let mut assembly = assembly(KeptData::Latents);
         let fault = (0..=STEPS).find_map(|at| {
             let mut record = record(at);
             record.course_walls = 5;
@@ -351,9 +352,9 @@ fn an_episode_that_contradicts_itself_is_refused() {
 }
 
 #[test]
-fn what_was_hit_is_known_of_the_committed_episode() {
+fn a_committed_episode_names_the_wall_that_was_hit() {
     for (hit_wall, expected) in [(0, None), (1, Some(1))] {
-        let mut assembly = assembly(Keep::Latents);
+        let mut assembly = assembly(KeptData::Latents);
         let mut last = record(0);
         last.terminated = 1;
         assembly.push(&last).unwrap();
@@ -371,7 +372,7 @@ fn what_was_hit_is_known_of_the_committed_episode() {
 #[test]
 fn the_end_wall_is_reached_by_a_level_up_that_passes_no_wall() {
     for (level_up, is_refused) in [(1, false), (0, true)] {
-        let mut assembly = assembly(Keep::Latents);
+        let mut assembly = assembly(KeptData::Latents);
         let mut last = record(0);
         (last.terminated, last.level_up) = (1, level_up);
         assembly.push(&last).unwrap();

@@ -1,13 +1,13 @@
-//! The ticket dispatcher: who flies what, what has come of it, what must be flown again.
+//! The ticket dispatcher: which actor flies what, what has arrived, and what must be flown again.
 //!
-//! Actors fly only against tickets and get another one only as an episode is taken in, so what is
-//! outstanding is bounded and no buffer can overflow. An episode that arrives with a hole, from a
-//! dead actor, or too late is discarded whole and its ticket issued again, with the next attempt
-//! number: exactly-once commit from at-least-once flying. Which actor flies a ticket, and how
-//! often, changes nothing in the episode.
+//! Actors fly only against tickets, and get a new one only when an episode is taken in. So the
+//! number of outstanding tickets is bounded and no buffer can overflow. An episode is discarded
+//! whole if it has a hole, comes from a dead actor, or is too late; its ticket is issued again,
+//! with the next attempt number. So episodes are flown at least once but committed exactly once.
+//! Neither the actor nor the number of attempts changes an episode.
 //!
-//! Deliberately absent: clocks and transport. Time is passed in, messages are passed in and out, so
-//! that every path can be tested.
+//! Deliberately absent: clocks and transport. Time and messages are passed in and out, so that
+//! every path can be tested.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -20,58 +20,58 @@ use skein_protocol::ticket::{ControlRecord, Message, Ticket};
 use skein_protocol::transition::{RecordFault, TransitionRecord};
 
 use super::assembly::{Assembled, Assembly, SegmentEnd};
-use super::failures::Failures;
+use super::failures::EpisodeFailures;
 use super::faults::{Faults, Refusal, Reissue};
 use super::situation::{EpisodeOut, Situation};
 use crate::episode::CommittedEpisode;
 
 pub use super::failures::HopelessEpisode;
-pub use super::order::{Order, Place};
+pub use super::order::{BatchPlace, EpisodeOrder};
 
-/// Episodes that an actor may spoil one after the other before others are preferred to it.
+/// Number of episodes an actor may spoil in a row before other actors are preferred to it.
 const MOST_SPOILED: u32 = 3;
 
-/// The book-keeping.
+/// State of all tickets and actors.
 #[derive(Debug)]
 pub struct Dispatcher {
     run: RunId,
     limits: TransportSection,
     /// Length of the latent codes that actors send.
     latent: usize,
-    /// Orders without an actor, first to be flown first.
-    waiting: VecDeque<Order>,
-    actors: BTreeMap<ActorId, Actor>,
-    failures: Failures,
+    /// Orders without an actor, in the order to fly them.
+    waiting: VecDeque<EpisodeOrder>,
+    actors: BTreeMap<ActorId, AttachedActor>,
+    failures: EpisodeFailures,
     faults: Faults,
-    /// What the time of actors that are gone went into.
-    times_of_the_gone: Times,
-    /// What is to be said to actors besides their tickets.
-    letters: Vec<Message>,
-    /// Whether something was said to an actor that may not look by itself.
+    /// Time by stage of actors that are gone.
+    times_of_departed: Times,
+    /// Messages to actors other than tickets.
+    control_messages: Vec<Message>,
+    /// `true` if a message was sent to an actor that may be waiting to be woken.
     is_wake_due: bool,
-    /// Where the last segment ended, if its episode goes on.
+    /// End of the last segment, if its episode continues.
     segment_end: Option<SegmentEnd>,
 }
 
 #[derive(Debug)]
-struct Actor {
+struct AttachedActor {
     incarnation: ActorIncarnation,
     last_sign: Instant,
-    /// Tickets it holds, in the order it flies them.
-    tickets: VecDeque<Issued>,
-    /// Episodes it has spoiled since the last one that was committed.
+    /// Tickets that it holds, in the order it flies them.
+    tickets: VecDeque<IssuedTicket>,
+    /// Number of episodes it has spoiled since the last one committed.
     spoiled: u32,
-    /// What its time had gone into when it was first heard of: an actor that was taken for dead and
-    /// is not is not counted twice.
+    /// Its time by stage when first heard. An actor taken for dead by mistake is thus not counted
+    /// twice.
     first_times: Times,
     times: Times,
-    /// It has spoken since, and nothing shows that it has seen a ticket that it was given after: it
-    /// may have found nothing to fly and be waiting.
+    /// `true` if it may be waiting for a ticket: no record for a ticket issued after its last
+    /// heartbeat has arrived.
     may_wait: bool,
 }
 
-impl Actor {
-    fn times_since_it_came(&self) -> Times {
+impl AttachedActor {
+    fn times_since_first_heard(&self) -> Times {
         self.times.since(&self.first_times)
     }
 
@@ -81,21 +81,22 @@ impl Actor {
 }
 
 #[derive(Debug)]
-struct Issued {
+struct IssuedTicket {
     since: Instant,
     assembly: Assembly,
-    /// Whether its actor has not spoken since: one that flies it does not wait.
-    is_newest_word: bool,
+    /// `true` if no heartbeat has come since the ticket was issued. A record for such a ticket
+    /// shows that its actor is not waiting.
+    no_heartbeat_since: bool,
 }
 
-impl Issued {
+impl IssuedTicket {
     fn ticket(&self) -> &Ticket {
         &self.assembly.order().ticket
     }
 }
 
 impl Dispatcher {
-    /// A dispatcher of `run` without orders and actors; records hold codes of `latent` numbers.
+    /// Starts without orders and actors of `run`; records hold codes of `latent` numbers.
     pub fn new(run: RunId, limits: &TransportSection, latent: usize) -> Self {
         Self {
             run,
@@ -103,37 +104,40 @@ impl Dispatcher {
             latent,
             waiting: VecDeque::new(),
             actors: BTreeMap::new(),
-            failures: Failures::default(),
+            failures: EpisodeFailures::default(),
             faults: Faults::default(),
-            times_of_the_gone: Times::default(),
-            letters: Vec::new(),
+            times_of_departed: Times::default(),
+            control_messages: Vec::new(),
             is_wake_due: false,
             segment_end: None,
         }
     }
 
-    /// Actors that live, in ascending order.
+    /// Attached actors, in ascending order.
     pub fn actors(&self) -> impl Iterator<Item = ActorId> {
         self.actors.keys().copied()
     }
 
-    /// What went wrong so far.
+    /// Faults so far.
     pub fn faults(&self) -> Faults {
         self.faults
     }
 
-    /// What the time of all actors went into, as far as they have told.
+    /// Time by stage of all actors, as last reported.
     pub fn actor_times(&self) -> Times {
-        let living = self.actors.values().map(Actor::times_since_it_came);
-        living.fold(self.times_of_the_gone, |sum, times| sum.plus(&times))
+        let living = self
+            .actors
+            .values()
+            .map(AttachedActor::times_since_first_heard);
+        living.fold(self.times_of_departed, |sum, times| sum.plus(&times))
     }
 
-    /// Counts a heartbeat that makes no sense.
+    /// Counts an invalid heartbeat.
     pub fn refuse_status(&mut self) {
         self.faults.refuse(Refusal::Status);
     }
 
-    /// Who waits for whom at `now`.
+    /// Situation at `now`: what is being waited for.
     pub fn situation(&self, now: Instant) -> Situation {
         let since = |then| now.saturating_duration_since(then);
         let out = self.actors.iter().flat_map(|(id, actor)| {
@@ -154,7 +158,7 @@ impl Dispatcher {
         }
     }
 
-    /// Orders that are not committed yet.
+    /// Number of orders that are not committed yet.
     pub fn open_orders(&self) -> usize {
         self.waiting.len()
             + self
@@ -165,12 +169,12 @@ impl Dispatcher {
     }
 
     /// Takes an order; it is flown after those taken before.
-    pub fn order(&mut self, order: Order) {
+    pub fn order(&mut self, order: EpisodeOrder) {
         self.waiting.push_back(order);
     }
 
-    /// Takes an actor's heartbeat: a new actor, or a new incarnation of a known one, can be given
-    /// tickets from now on.
+    /// Takes an actor's heartbeat. From now on, a new actor, or a new incarnation of a known one,
+    /// can be given tickets.
     pub fn on_status(&mut self, status: &ActorStatus, now: Instant) {
         let known = self
             .actors
@@ -185,24 +189,28 @@ impl Dispatcher {
                     self.dismiss(status.actor, Reissue::Left);
                 }
             }
-            // An older incarnation's late word is not believed: incarnations grow.
+            // Incarnations grow: a late heartbeat of an older one is ignored.
             ActorState::Serving if known.is_some_and(|known| known > status.incarnation) => {}
             ActorState::Serving => {
                 if known.is_some_and(|known| known != status.incarnation) {
                     self.dismiss(status.actor, Reissue::Restarted);
                 }
-                // A bound, whatever actors say that there be: each would be given tickets.
+                // A hard limit, because each claimed actor would be given tickets.
                 if !self.actors.contains_key(&status.actor)
                     && self.actors.len() >= self.limits.max_actors
                 {
                     self.faults.refuse(Refusal::Status);
-                    tracing::debug!(actor = %status.actor, limit = self.limits.max_actors, "more actors than transport.max_actors");
+                    tracing::debug!(
+                        actor = %status.actor,
+                        limit = self.limits.max_actors,
+                        "more actors than transport.max_actors"
+                    );
                     return;
                 }
                 self.failures.heard(status.actor, now);
                 let actor = self.actors.entry(status.actor).or_insert_with(|| {
                     tracing::info!(actor = %status.actor, pid = status.pid, "actor attached");
-                    Actor {
+                    AttachedActor {
                         incarnation: status.incarnation,
                         last_sign: now,
                         tickets: VecDeque::new(),
@@ -214,17 +222,17 @@ impl Dispatcher {
                 });
                 actor.last_sign = now;
                 actor.times = status.times;
-                // It speaks when it finds nothing to fly. What was on its way to it then, it finds
-                // when it is woken.
+                // An actor without a ticket sends a heartbeat and waits. A ticket on its way at
+                // that time is found only when the actor is woken.
                 actor.may_wait = true;
                 for issued in &mut actor.tickets {
-                    self.is_wake_due |= std::mem::take(&mut issued.is_newest_word);
+                    self.is_wake_due |= std::mem::take(&mut issued.no_heartbeat_since);
                 }
             }
         }
     }
 
-    /// Takes a record; returns the episode it completes.
+    /// Takes a record; returns the episode that it completes.
     ///
     /// # Errors
     /// [`HopelessEpisode`] when an episode has failed too often.
@@ -232,7 +240,7 @@ impl Dispatcher {
         &mut self,
         record: &TransitionRecord,
         now: Instant,
-    ) -> Result<Option<(Place, CommittedEpisode)>, HopelessEpisode> {
+    ) -> Result<Option<(BatchPlace, CommittedEpisode)>, HopelessEpisode> {
         let id = ActorId(record.actor);
         let Some(actor) = self
             .actors
@@ -243,33 +251,33 @@ impl Dispatcher {
             return Ok(None);
         };
         actor.last_sign = now;
-        let is_of = |issued: &Issued| {
+        let is_of = |issued: &IssuedTicket| {
             issued.ticket().episode.0 == record.episode
                 && issued.ticket().attempt.0 == record.attempt
         };
         let Some(position) = actor.tickets.iter().position(is_of) else {
-            // The rest of an episode that was given up.
+            // A record of an episode that was given up.
             self.faults.refuse(Refusal::NoTicket);
             return Ok(None);
         };
-        if actor.tickets[position].is_newest_word {
+        if actor.tickets[position].no_heartbeat_since {
             actor.may_wait = false;
         }
-        // Tickets are flown in order: those before this one never reached the actor, or their
-        // records never reached us.
+        // Tickets are flown in order. Those before this one were lost on the way to the actor, or
+        // their records were lost on the way here.
         for _ in 0..position {
             self.reissue_first(id, Reissue::Skipped);
         }
         self.advance(id, record, now)
     }
 
-    /// Takes the record into the first episode of actor `id`.
+    /// Adds the record to the first episode of actor `id`.
     fn advance(
         &mut self,
         id: ActorId,
         record: &TransitionRecord,
         now: Instant,
-    ) -> Result<Option<(Place, CommittedEpisode)>, HopelessEpisode> {
+    ) -> Result<Option<(BatchPlace, CommittedEpisode)>, HopelessEpisode> {
         let Some(issued) = self
             .actors
             .get_mut(&id)
@@ -306,45 +314,56 @@ impl Dispatcher {
         fault: &RecordFault,
     ) -> Result<(), HopelessEpisode> {
         self.faults.refuse(fault.into());
-        if self.is_worth_telling(id) {
-            tracing::warn!(actor = %id, %episode, step = record.step, %fault, "record refused");
+        if self.is_worth_logging(id) {
+            tracing::warn!(
+                actor = %id,
+                %episode,
+                step = record.step,
+                %fault,
+                "record refused"
+            );
         }
         match fault {
-            // Something got lost on the way, which need not happen again.
+            // A record was lost on the way, which need not happen again.
             RecordFault::Mismatch { .. } => {
                 self.spoil_first(id, Reissue::Hole);
                 Ok(())
             }
-            // What an actor computed makes no sense.
+            // The actor computed something invalid.
             fault => self.fail(id, episode, &fault.to_string()),
         }
     }
 
-    /// Has the first episode of actor `id` flown again, but not for ever.
+    /// Has the first episode of actor `id` flown again, a limited number of times.
     fn fail(&mut self, id: ActorId, episode: EpisodeId, why: &str) -> Result<(), HopelessEpisode> {
         self.failures.failed(episode, id, why)?;
         self.spoil_first(id, Reissue::Failed);
         Ok(())
     }
 
-    /// Has the first episode of actor `id` flown again, and remembers it of the actor.
+    /// Has the first episode of actor `id` flown again, and counts it against the actor.
     fn spoil_first(&mut self, id: ActorId, why: Reissue) {
         self.reissue_first(id, why);
         if let Some(actor) = self.actors.get_mut(&id) {
             actor.spoiled += 1;
             if actor.spoiled == MOST_SPOILED {
-                tracing::warn!(actor = %id, episodes = actor.spoiled, "actor spoils every episode; others are preferred to it");
+                tracing::warn!(
+                    actor = %id,
+                    episodes = actor.spoiled,
+                    "actor spoils every episode; other actors are preferred"
+                );
             }
         }
     }
 
-    /// An actor that spoils episodes for ever must not fill the log: every doubling is told.
-    fn is_worth_telling(&self, id: ActorId) -> bool {
+    /// `true` at every doubling, so that an actor that always spoils episodes does not fill the
+    /// log.
+    fn is_worth_logging(&self, id: ActorId) -> bool {
         let spoiled = self.actors.get(&id).map_or(0, |actor| actor.spoiled);
         spoiled == 0 || spoiled.is_power_of_two()
     }
 
-    /// Gives up actors that are silent and tickets that take too long.
+    /// Gives up silent actors and late tickets.
     pub fn on_time(&mut self, now: Instant) {
         let silence = Duration::from_secs_f64(self.limits.actor_silence_secs);
         let deadline = Duration::from_secs_f64(self.limits.episode_deadline_secs);
@@ -356,11 +375,11 @@ impl Dispatcher {
             } else if let Some(issued) = actor.tickets.front()
                 && now.saturating_duration_since(issued.since) > deadline
             {
-                // Of an actor that speaks, not one record came: its line may be broken in one
-                // direction. A new one is not.
+                // The actor sends heartbeats but no record: its connection may be broken in one
+                // direction. A new connection is not.
                 if issued.assembly.is_empty() {
-                    let letter = ControlRecord::rejoin(self.run, id, actor.incarnation);
-                    self.letters.push(Message::Control(letter));
+                    let rejoin = ControlRecord::rejoin(self.run, id, actor.incarnation);
+                    self.control_messages.push(Message::Control(rejoin));
                 }
                 self.spoil_first(id, Reissue::Late);
                 self.restart_clock(id, now);
@@ -369,14 +388,14 @@ impl Dispatcher {
         self.failures.on_time(now);
     }
 
-    /// Hands out tickets as far as there are orders and actors with credit: each actor its first
-    /// before any its second, and none to an actor that spoils every episode while there are
-    /// others. Returns what to send.
+    /// Issues tickets while there are orders, and actors with credit. Every actor gets its first
+    /// ticket before any gets a second. An actor that spoils every episode gets none while there
+    /// are others. Returns the messages to send.
     pub fn issue(&mut self, now: Instant) -> Vec<Message> {
-        let mut messages = std::mem::take(&mut self.letters);
+        let mut messages = std::mem::take(&mut self.control_messages);
         self.is_wake_due |= !messages.is_empty();
         let credit = self.limits.tickets_per_actor;
-        let any_trusted = self.actors.values().any(Actor::is_trusted);
+        let any_trusted = self.actors.values().any(AttachedActor::is_trusted);
         while !self.waiting.is_empty() {
             let with_credit = self.actors.iter_mut().filter(|(_, actor)| {
                 actor.tickets.len() < credit && (actor.is_trusted() || !any_trusted)
@@ -394,23 +413,23 @@ impl Dispatcher {
             let assembly =
                 Assembly::new(order, begins, longest, self.latent, id, actor.incarnation);
             self.is_wake_due |= actor.may_wait || actor.tickets.is_empty();
-            actor.tickets.push_back(Issued {
+            actor.tickets.push_back(IssuedTicket {
                 since: now,
                 assembly,
-                is_newest_word: true,
+                no_heartbeat_since: true,
             });
         }
         messages
     }
 
-    /// Whether an actor may wait that was given something since this was last asked. One that flies
-    /// looks by itself before each step, and to wake all actors for every episode costs the more,
-    /// the more of them there are.
+    /// `true` if, since the last call, something was sent to an actor that may be waiting. A flying
+    /// actor checks for messages before each step. Waking all actors for every episode would cost
+    /// more with every actor.
     pub fn take_wake(&mut self) -> bool {
         std::mem::take(&mut self.is_wake_due)
     }
 
-    /// Forgets an actor; its tickets are issued again.
+    /// Removes an actor; its tickets are issued again.
     fn dismiss(&mut self, id: ActorId, why: Reissue) {
         while self
             .actors
@@ -420,7 +439,9 @@ impl Dispatcher {
             self.reissue_last(id, why);
         }
         if let Some(actor) = self.actors.remove(&id) {
-            self.times_of_the_gone = self.times_of_the_gone.plus(&actor.times_since_it_came());
+            self.times_of_departed = self
+                .times_of_departed
+                .plus(&actor.times_since_first_heard());
             tracing::info!(actor = %id, "actor {}", why.name());
         }
     }
@@ -433,7 +454,7 @@ impl Dispatcher {
         self.restart_clock(id, now);
     }
 
-    /// A ticket's time runs from when the actor could begin it.
+    /// Starts a ticket's time when its actor can begin to fly it.
     fn restart_clock(&mut self, id: ActorId, now: Instant) {
         if let Some(next) = self
             .actors
@@ -464,14 +485,20 @@ impl Dispatcher {
         }
     }
 
-    fn reissue(&mut self, issued: Issued, id: ActorId, why: Reissue) {
+    fn reissue(&mut self, issued: IssuedTicket, id: ActorId, why: Reissue) {
         let mut order = issued.assembly.into_order();
-        if self.is_worth_telling(id) {
-            tracing::warn!(actor = %id, episode = %order.ticket.episode, attempt = %order.ticket.attempt, "ticket issued again: it or its actor {}", why.name());
+        if self.is_worth_logging(id) {
+            tracing::warn!(
+                actor = %id,
+                episode = %order.ticket.episode,
+                attempt = %order.ticket.attempt,
+                "ticket issued again: it or its actor {}",
+                why.name()
+            );
         }
         order.ticket.attempt = Attempt(order.ticket.attempt.0.wrapping_add(1));
         self.faults.reissue(why);
-        // Others wait for the oldest episodes: back to the front.
+        // The oldest episodes are waited for: back to the front.
         self.waiting.push_front(order);
     }
 }

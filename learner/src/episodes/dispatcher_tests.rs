@@ -10,7 +10,7 @@ use skein_protocol::stages::Stage;
 use skein_protocol::ticket::{Control, CourseChoice, Exploration};
 use skein_protocol::transition::{Outcome, RecordKind};
 
-use super::super::assembly::Keep;
+use super::super::assembly::KeptData;
 use super::super::failures;
 use super::*;
 
@@ -26,7 +26,7 @@ pub(super) fn limits() -> TransportSection {
     }
 }
 
-pub(super) fn order(episode: u64) -> Order {
+pub(super) fn order(episode: u64) -> EpisodeOrder {
     let ticket = Ticket {
         run: RUN,
         episode: EpisodeId(episode),
@@ -38,11 +38,11 @@ pub(super) fn order(episode: u64) -> Order {
         seed: episode,
         segment: None,
     };
-    Order {
+    EpisodeOrder {
         ticket,
         epoch: Epoch(0),
-        keep: Keep::Latents,
-        place: Place {
+        keep: KeptData::Latents,
+        place: BatchPlace {
             batch: 0,
             index: episode as usize,
         },
@@ -70,7 +70,7 @@ fn status(actor: u32, incarnation: ActorIncarnation) -> ActorStatus {
     }
 }
 
-/// A heartbeat of an actor that has flown for so many seconds in this incarnation.
+/// Sends a heartbeat of an actor that has flown for `secs` seconds in this incarnation.
 fn flown(
     dispatcher: &mut Dispatcher,
     actor: u32,
@@ -89,7 +89,7 @@ fn flown(
     dispatcher.on_status(&status, now);
 }
 
-/// Tickets handed out to `actor`.
+/// Tickets issued to `actor`.
 pub(super) fn tickets_for(
     messages: &[Message],
     actor: u32,
@@ -132,14 +132,14 @@ pub(super) fn feed(
     dispatcher: &mut Dispatcher,
     records: &[TransitionRecord],
     now: Instant,
-) -> Vec<(Place, CommittedEpisode)> {
+) -> Vec<(BatchPlace, CommittedEpisode)> {
     records
         .iter()
         .filter_map(|record| dispatcher.on_record(record, now).unwrap())
         .collect()
 }
 
-/// A dispatcher with one actor that holds tickets 0 and 1 of three orders.
+/// Returns a dispatcher with one actor that holds tickets 0 and 1 of three orders.
 pub(super) fn dispatcher(now: Instant) -> (Dispatcher, Vec<Ticket>) {
     let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
     (0..3).for_each(|episode| dispatcher.order(order(episode)));
@@ -156,7 +156,7 @@ pub(super) fn dispatcher(now: Instant) -> (Dispatcher, Vec<Ticket>) {
 }
 
 #[test]
-fn credit_bounds_what_is_in_the_air_and_returns_with_each_episode() {
+fn credit_bounds_outstanding_tickets_and_returns_with_each_episode() {
     let now = Instant::now();
     let (mut dispatcher, tickets) = dispatcher(now);
     assert!(dispatcher.issue(now).is_empty());
@@ -195,7 +195,7 @@ fn an_episode_with_a_hole_is_discarded_whole_and_flown_again() {
     assert_eq!(dispatcher.faults().reissued(), 1);
     let again = tickets_for(&dispatcher.issue(now), 0, INCARNATION).remove(0);
     assert_eq!((again.episode, again.attempt), (EpisodeId(0), Attempt(1)));
-    // The actor flies on with what it holds: episode 1, then episode 0 again.
+    // The actor continues with what it holds: episode 1, then episode 0 again.
     assert_eq!(
         feed(&mut dispatcher, &records(&tickets[1], 0, INCARNATION), now)[0]
             .1
@@ -240,7 +240,7 @@ fn a_restarted_actor_owes_nothing_of_its_former_incarnation() {
     let (mut dispatcher, tickets) = dispatcher(now);
     let next = ActorIncarnation(101);
     attach(&mut dispatcher, 0, next, now);
-    attach(&mut dispatcher, 0, INCARNATION, now); // a late word of the former incarnation
+    attach(&mut dispatcher, 0, INCARNATION, now); // a late heartbeat of the former incarnation
     let again = tickets_for(&dispatcher.issue(now), 0, next);
     assert_eq!(
         again
@@ -257,7 +257,7 @@ fn a_restarted_actor_owes_nothing_of_its_former_incarnation() {
 }
 
 #[test]
-fn a_ticket_that_got_lost_is_issued_again_when_the_next_one_is_flown() {
+fn a_lost_ticket_is_issued_again_when_the_next_one_is_flown() {
     let now = Instant::now();
     let (mut dispatcher, tickets) = dispatcher(now);
     assert_eq!(
@@ -282,20 +282,20 @@ fn a_ticket_that_takes_too_long_is_issued_again_though_its_actor_lives() {
         attach(&mut dispatcher, 0, INCARNATION, now);
         dispatcher.on_time(now);
     }
-    let letters = dispatcher.issue(now);
+    let messages = dispatcher.issue(now);
     assert!(
-        letters
+        messages
             .iter()
-            .any(|letter| letter.is_for(ActorId(0), INCARNATION)
-                && letter.read(RUN) == Ok(Control::Rejoin)),
-        "nothing at all came of it: its line is broken"
+            .any(|message| message.is_for(ActorId(0), INCARNATION)
+                && message.read(RUN) == Ok(Control::Rejoin)),
+        "no record arrived: its connection is broken"
     );
     assert_eq!(dispatcher.faults().reissued(), 1);
     assert!(feed(&mut dispatcher, &records(&tickets[0], 0, INCARNATION), now).is_empty());
 }
 
-/// Has an actor fail what is its first episode, again and again, by `damage` to its first record,
-/// until the dispatcher gives up; at most `most` times.
+/// Lets an actor fail its first episode again and again, with `damage` to its first record, until
+/// the dispatcher gives up; at most `most` times.
 fn fail_for_ever(
     dispatcher: &mut Dispatcher,
     actor: u32,
@@ -409,9 +409,9 @@ fn actors_beyond_the_limit_get_no_tickets_until_there_is_room() {
     );
 }
 
-/// What may happen next to one of three actors.
+/// Possible next mishaps of one of three actors.
 #[derive(Debug, Clone, Copy)]
-enum Event {
+enum Mishap {
     FlyNext,
     LoseRecord(usize),
     RepeatRecord(usize),
@@ -422,24 +422,26 @@ enum Event {
     Silence,
 }
 
-fn event() -> impl Strategy<Value = (u32, Event)> {
+fn mishap() -> impl Strategy<Value = (u32, Mishap)> {
     let kind = prop_oneof![
-        8 => Just(Event::FlyNext),
-        1 => (0..4_usize).prop_map(Event::LoseRecord),
-        1 => (0..4_usize).prop_map(Event::RepeatRecord),
-        1 => (0..4_usize).prop_map(Event::Poison),
-        1 => Just(Event::DieMidway),
-        1 => Just(Event::SkipTicket),
-        1 => Just(Event::Restart),
-        1 => Just(Event::Silence),
+        8 => Just(Mishap::FlyNext),
+        1 => (0..4_usize).prop_map(Mishap::LoseRecord),
+        1 => (0..4_usize).prop_map(Mishap::RepeatRecord),
+        1 => (0..4_usize).prop_map(Mishap::Poison),
+        1 => Just(Mishap::DieMidway),
+        1 => Just(Mishap::SkipTicket),
+        1 => Just(Mishap::Restart),
+        1 => Just(Mishap::Silence),
     ];
     (0..3_u32, kind)
 }
 
 proptest! {
-    /// The whole promise, under arbitrary mishaps followed by quiet.
+    /// Arbitrary mishaps followed by quiet: the promise still holds.
     #[test]
-    fn every_order_is_committed_exactly_once_and_whole(events in prop::collection::vec(event(), 0..60)) {
+    fn every_order_is_committed_exactly_once_and_whole(
+        mishaps in prop::collection::vec(mishap(), 0..60),
+    ) {
         const ORDERS: u64 = 12;
         let mut now = Instant::now();
         let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
@@ -447,11 +449,11 @@ proptest! {
         let mut incarnations = [INCARNATION; 3];
         let mut held: [VecDeque<Ticket>; 3] = Default::default();
         let mut committed: BTreeMap<u64, CommittedEpisode> = BTreeMap::new();
-        // More than that, and the episode is given up: another test.
+        // At `MOST_FAILURES` the episode would be given up, which another test covers.
         let mut poisonings: BTreeMap<EpisodeId, usize> = BTreeMap::new();
-        let calm = (0..3 * ORDERS as usize).map(|turn| ((turn % 3) as u32, Event::FlyNext));
-        let quiet = calm.clone().chain([(0, Event::Silence)]).chain(calm);
-        for (actor, event) in events.into_iter().chain(quiet) {
+        let calm = (0..3 * ORDERS as usize).map(|turn| ((turn % 3) as u32, Mishap::FlyNext));
+        let quiet = calm.clone().chain([(0, Mishap::Silence)]).chain(calm);
+        for (actor, mishap) in mishaps.into_iter().chain(quiet) {
             now += Duration::from_millis(100);
             let index = actor as usize;
             for (other, incarnation) in (0..3).zip(incarnations) {
@@ -462,29 +464,31 @@ proptest! {
                 held[other].extend(tickets_for(&messages, other as u32, incarnations[other]));
             }
             let next = held[index].front().cloned();
-            let mut sent = next.map(|ticket| records(&ticket, actor, incarnations[index])).unwrap_or_default();
+            let mut sent = next
+                .map(|ticket| records(&ticket, actor, incarnations[index]))
+                .unwrap_or_default();
             let (mut forget, mut restart) = (true, false);
-            match event {
-                Event::FlyNext => {}
-                Event::LoseRecord(at) if at < sent.len() => drop(sent.remove(at)),
-                Event::RepeatRecord(at) if at < sent.len() => sent.insert(at, sent[at]),
-                Event::Poison(at) if at < sent.len() => {
+            match mishap {
+                Mishap::FlyNext => {}
+                Mishap::LoseRecord(at) if at < sent.len() => drop(sent.remove(at)),
+                Mishap::RepeatRecord(at) if at < sent.len() => sent.insert(at, sent[at]),
+                Mishap::Poison(at) if at < sent.len() => {
                     let poisoned = poisonings.entry(EpisodeId(sent[at].episode)).or_default();
                     *poisoned += 1;
                     if *poisoned < failures::MOST_FAILURES {
                         sent[at].reward = f32::NAN;
                     }
                 }
-                Event::DieMidway => {
+                Mishap::DieMidway => {
                     sent.truncate(1);
                     restart = true;
                 }
-                Event::SkipTicket => sent.clear(),
-                Event::Restart => {
+                Mishap::SkipTicket => sent.clear(),
+                Mishap::Restart => {
                     sent.clear();
                     restart = true;
                 }
-                Event::Silence => {
+                Mishap::Silence => {
                     sent.clear();
                     forget = false;
                     now += Duration::from_secs(6);
@@ -497,7 +501,8 @@ proptest! {
                 prop_assert_eq!(place.index as u64, episode.episode.0);
                 prop_assert!(episode.check().is_ok());
                 prop_assert_eq!(episode.steps() as u64, 2 + episode.episode.0 % 3);
-                prop_assert!(committed.insert(episode.episode.0, episode).is_none(), "committed twice");
+                let earlier = committed.insert(episode.episode.0, episode);
+                prop_assert!(earlier.is_none(), "committed twice");
             }
             if forget {
                 held[index].pop_front();
@@ -513,7 +518,7 @@ proptest! {
 }
 
 #[test]
-fn the_times_of_all_incarnations_of_all_actors_are_summed_up_and_none_twice() {
+fn the_times_of_all_incarnations_of_all_actors_are_summed_without_counting_twice() {
     let now = Instant::now();
     let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
     let flies = |dispatcher: &mut Dispatcher, actor, incarnation, secs| {
@@ -534,12 +539,12 @@ fn the_times_of_all_incarnations_of_all_actors_are_summed_up_and_none_twice() {
     flies(&mut dispatcher, 0, INCARNATION, 5);
     flies(&mut dispatcher, 1, INCARNATION, 20);
     assert_eq!(physics(&dispatcher).count, 25);
-    // The next incarnation counts from nothing; an older one's late word is not believed.
+    // The next incarnation counts from zero; a late heartbeat of an older one is ignored.
     attach(&mut dispatcher, 0, next_incarnation, now);
     flies(&mut dispatcher, 0, next_incarnation, 100);
     flies(&mut dispatcher, 0, INCARNATION, 7000);
     assert_eq!(physics(&dispatcher).count, 125);
-    // What it says as it leaves is in.
+    // The last heartbeat before leaving is included.
     flown(
         &mut dispatcher,
         0,

@@ -1,41 +1,41 @@
-//! Which episodes failed, by whose doing, and which of them nobody can fly.
+//! Failed episodes, the actors that failed them, and which episodes no actor can fly.
 //!
-//! An episode is a function of its ticket, so one that fails because of what it is fails with every
-//! actor. But an actor may be broken, or lie: what it alone makes of an episode says nothing about
-//! the episode. So an episode is given up, and the run with it, only when two actors have failed
-//! it, or when the one that fails it is the only one there is and nobody is left who could tell
-//! otherwise.
+//! An episode is a function of its ticket, so one that is itself at fault fails with every actor.
+//! But a single actor may be broken, or lie. So an episode is given up, and the run with it, only
+//! in two cases: two actors have failed it, or the only one that failed it has no other actor
+//! beside it that could try.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use skein_protocol::ids::{ActorId, EpisodeId};
 
-/// Times an episode may fail, in the simulator or by records that make no sense.
+/// Number of times an episode may fail, in the simulator or by invalid records.
 pub(super) const MOST_FAILURES: usize = 3;
-/// An actor that was heard within this time may come back, and fly what another has failed. Longer
-/// than any pause before a dead actor is started again.
+/// Time after its last heartbeat in which an actor may come back and fly what another has failed.
+/// It is longer than any pause before a dead actor is started again.
 const OTHERS_RETURN: Duration = Duration::from_secs(30);
 
 /// An episode that no actor can fly.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "episode {episode} failed {failures} times, at last because {why}; the logs of learner and actors say more"
+    "episode {episode} failed {failures} times, at last because {why}; \
+     see the logs of learner and actors"
 )]
 pub struct HopelessEpisode {
-    /// The episode.
+    /// Number of the episode.
     pub episode: EpisodeId,
-    /// Its failures.
+    /// Number of its failures.
     pub failures: usize,
-    /// What went wrong the last time.
+    /// Reason of the last failure.
     pub why: String,
 }
 
-/// Episodes that failed, and actors that could fly them.
+/// Failed episodes, and actors that could fly them.
 #[derive(Debug, Default)]
-pub(super) struct Failures {
+pub(super) struct EpisodeFailures {
     by_episode: BTreeMap<EpisodeId, Failure>,
-    /// When each actor was last heard, of those that may come back.
+    /// Time of the last heartbeat, for actors that may come back.
     heard: BTreeMap<ActorId, Instant>,
 }
 
@@ -46,8 +46,8 @@ struct Failure {
     by_others: bool,
 }
 
-impl Failures {
-    /// Takes note that an actor incarnations.
+impl EpisodeFailures {
+    /// Records an actor's heartbeat.
     pub(super) fn heard(&mut self, actor: ActorId, now: Instant) {
         self.heard.insert(actor, now);
     }
@@ -58,15 +58,15 @@ impl Failures {
             .retain(|_, heard| now.saturating_duration_since(*heard) < OTHERS_RETURN);
     }
 
-    /// Forgets what went wrong with an episode that was flown after all.
+    /// Forgets the failures of an episode that was flown after all.
     pub(super) fn flown(&mut self, episode: EpisodeId) {
         self.by_episode.remove(&episode);
     }
 
-    /// Takes note that `actor` failed `episode`.
+    /// Records that `actor` failed `episode`.
     ///
     /// # Errors
-    /// [`HopelessEpisode`] when there is nobody left to try.
+    /// [`HopelessEpisode`] when no other actor can try.
     pub(super) fn failed(
         &mut self,
         episode: EpisodeId,

@@ -1,5 +1,4 @@
-//! What went wrong on the way from ticket to committed episode and was made good, counted by
-//! reason.
+//! Faults between ticket and committed episode that were repaired, counted by reason.
 
 use std::collections::BTreeMap;
 
@@ -8,21 +7,23 @@ use skein_protocol::transition::RecordFault;
 use crate::metrics::Scalar;
 
 macro_rules! reasons {
-    ($(#[$doc:meta])* $name:ident { $($(#[$variant_doc:meta])* $variant:ident => $text:literal, $scalar:ident),* $(,)? }) => {
+    ($(#[$doc:meta])* $name:ident {
+        $($(#[$variant_doc:meta])* $variant:ident => $text:literal, $scalar:ident),* $(,)?
+    }) => {
         $(#[$doc])*
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
         pub enum $name { $($(#[$variant_doc])* $variant),* }
 
         impl $name {
-            /// All of them.
+            /// All reasons.
             pub const ALL: &[Self] = &[$(Self::$variant),*];
 
-            /// In logs, reports and the summary.
+            /// Text in logs, reports and the summary.
             pub const fn name(self) -> &'static str {
                 match self { $(Self::$variant => $text),* }
             }
 
-            /// Its curve.
+            /// Curve of this reason.
             pub const fn scalar(self) -> Scalar {
                 match self { $(Self::$variant => Scalar::$scalar),* }
             }
@@ -31,19 +32,20 @@ macro_rules! reasons {
 }
 
 reasons! {
-    /// Why a ticket was issued again.
+    /// Reason why a ticket was issued again.
     Reissue {
-        /// Records of a later ticket of the same actor came first: it, or its records, got lost.
+        /// Records of a later ticket of the same actor came first: the ticket or its records were
+        /// lost.
         Skipped => "was skipped", ReissuedSkipped,
-        /// A record of it got lost.
+        /// One of its records was lost.
         Hole => "has a hole", ReissuedHole,
-        /// What came of it makes no sense, or the simulator broke down.
+        /// Its records are invalid, or the simulator failed.
         Failed => "failed", ReissuedFailed,
         /// It took longer than `transport.episode_deadline_secs`.
         Late => "took too long", ReissuedLate,
         /// Its actor gave no heartbeat for `transport.actor_silence_secs`.
         Silent => "is silent", ReissuedSilent,
-        /// Its actor began another incarnation.
+        /// Its actor started another incarnation.
         Restarted => "restarted", ReissuedRestarted,
         /// Its actor left.
         Left => "left", ReissuedLeft,
@@ -51,23 +53,23 @@ reasons! {
 }
 
 reasons! {
-    /// Why a record was refused.
+    /// Reason why a record was refused.
     Refusal {
-        /// It is of no actor that lives, or of a former incarnation of one.
+        /// Its sender is not attached, or a former incarnation.
         Stranger => "of no living actor", RefusedStranger,
-        /// It belongs to no ticket that its actor holds: the rest of an episode that was given up.
+        /// It belongs to no ticket that its actor holds: a record of an episode that was given up.
         NoTicket => "of no ticket", RefusedNoTicket,
         /// It does not follow the one before, or belongs to something else.
         OutOfOrder => "out of order", RefusedOutOfOrder,
-        /// A field has a value that no episode gives it.
+        /// A field has a value that no episode produces.
         Impossible => "impossible value", RefusedImpossible,
-        /// A number is infinite or none.
+        /// A number is infinite or NaN.
         NotFinite => "not finite", RefusedNotFinite,
-        /// A number, an action or the episode is larger than any can be.
+        /// A number, an action or the episode is larger than possible.
         TooLarge => "too large", RefusedTooLarge,
         /// It contradicts itself or the records before it.
         Contradiction => "contradiction", RefusedContradiction,
-        /// A heartbeat that makes no sense.
+        /// A heartbeat is invalid.
         Status => "status", RefusedStatus,
     }
 }
@@ -86,7 +88,7 @@ impl From<&RecordFault> for Refusal {
     }
 }
 
-/// Counts of what went wrong and was made good.
+/// Counts of faults that were repaired.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Faults {
     reissued: [u64; Reissue::ALL.len()],
@@ -104,27 +106,27 @@ impl Faults {
         self.refused[why as usize] += 1;
     }
 
-    /// Tickets issued again, for whatever reason.
+    /// Number of tickets issued again, for any reason.
     pub fn reissued(&self) -> u64 {
         self.reissued.iter().sum()
     }
 
-    /// Records refused, for whatever reason.
+    /// Number of records refused, for any reason.
     pub fn refused(&self) -> u64 {
         self.refused.iter().sum()
     }
 
-    /// Tickets issued again by reason; without reasons that did not occur.
+    /// Number of tickets issued again by reason; reasons that did not occur are left out.
     pub fn reissued_by_reason(&self) -> BTreeMap<String, u64> {
         occurred(Reissue::ALL.iter().map(|why| why.name()).zip(self.reissued))
     }
 
-    /// Records refused by reason; without reasons that did not occur.
+    /// Number of records refused by reason; reasons that did not occur are left out.
     pub fn refused_by_reason(&self) -> BTreeMap<String, u64> {
         occurred(Refusal::ALL.iter().map(|why| why.name()).zip(self.refused))
     }
 
-    /// A point of each curve.
+    /// Returns a point for each curve.
     pub fn scalars(&self) -> Vec<(Scalar, f64)> {
         let reissued = Reissue::ALL
             .iter()
@@ -153,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_reason_is_counted_in_its_own_place_and_has_a_curve_of_its_own() {
+    fn every_reason_has_its_own_count_and_curve() {
         let mut faults = Faults::default();
         for (count, why) in (1..).zip(Reissue::ALL) {
             (0..count).for_each(|_| faults.reissue(*why));

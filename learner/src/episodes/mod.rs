@@ -1,11 +1,11 @@
-//! From tickets to committed episodes: orders go out, whole episodes come back, in the order they
-//! were ordered.
+//! From tickets to committed episodes: orders go out, whole episodes come back, in the order of the
+//! orders.
 //!
-//! [`dispatcher`] is the book-keeping, a state machine without clock or transport: who holds which
-//! ticket, what has arrived of it, what must be issued again. [`assembly`] puts the records of one
-//! episode together, [`order`] says what was ordered. [`receiver`] is the thread that owns the
-//! transport and feeds the dispatcher. [`faults`] counts what went wrong and was made good,
-//! [`situation`] says who waits for whom.
+//! [`dispatcher`] keeps the books: which actor holds which ticket, what has arrived for it, and
+//! what must be issued again. It is a state machine without clock or transport. [`assembly`] joins
+//! the records of one episode; [`order`] describes what was ordered. [`receiver`] is the thread
+//! that owns the transport and feeds the dispatcher. [`faults`] counts faults that were repaired;
+//! [`situation`] says what is being waited for.
 
 pub mod assembly;
 pub mod dispatcher;

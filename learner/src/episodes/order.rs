@@ -1,36 +1,36 @@
-//! What is ordered of the actors.
+//! Orders to the actors.
 
 use serde::{Deserialize, Serialize};
 use skein_protocol::ids::Epoch;
 use skein_protocol::ticket::Ticket;
 
-/// An episode to be flown, or a segment of one.
+/// An episode to fly, or a segment of one.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Order {
-    /// What to fly.
+pub struct EpisodeOrder {
+    /// Ticket to fly.
     pub ticket: Ticket,
-    /// The epoch it belongs to.
+    /// Epoch that the episode belongs to.
     pub epoch: Epoch,
-    /// What is kept of it.
-    pub keep: Keep,
-    /// Who waits for it, and at which place among the episodes ordered together.
-    pub place: Place,
+    /// Data to keep of the episode.
+    pub keep: KeptData,
+    /// Batch that waits for the episode, and its position there.
+    pub place: BatchPlace,
 }
 
-/// What the learner wants of an episode, besides that it is flown.
+/// Data that the learner keeps of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Keep {
+pub enum KeptData {
     /// Latent codes and telemetry only.
     Latents,
-    /// The depth images too: they are copied out of shared memory, once.
+    /// Depth images too, copied once out of shared memory.
     Depth,
 }
 
-/// A place in a batch of episodes that were ordered together.
+/// Position in a batch of episodes ordered together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Place {
-    /// The batch.
+pub struct BatchPlace {
+    /// Number of the batch.
     pub batch: u64,
-    /// The episode's position in it.
+    /// Index of the episode in the batch.
     pub index: usize,
 }

@@ -1,9 +1,10 @@
-//! The receiving thread: owns the transport's ports, feeds the dispatcher, delivers episodes in the
-//! order they were ordered.
+//! The receiving thread: owns the transport's ports, feeds the dispatcher, and delivers episodes in
+//! the order of the orders.
 //!
-//! The training thread speaks to it through [`EpisodeReceiver`]: it orders batches of episodes,
-//! publishes snapshots, and takes episodes out of a [`Batch`] one by one. While the training thread
-//! updates the networks, records are taken in, tickets handed out and heartbeats given here.
+//! The training thread uses it through [`EpisodeReceiver`]: it orders batches of episodes,
+//! publishes snapshots, and takes episodes out of an [`EpisodeBatch`] one by one. While the
+//! training thread updates the networks, this thread takes in records, issues tickets and sends
+//! heartbeats.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
@@ -20,21 +21,21 @@ use skein_run::failure::with_causes;
 use skein_run::{LearnerIncarnation, RunIdentity};
 use skein_transport::{LearnerPorts, LearnerWaker};
 
-use super::assembly::Keep;
+use super::assembly::KeptData;
 use super::dispatcher::{Dispatcher, HopelessEpisode};
 use super::faults::Faults;
 use super::server::Server;
 use super::situation::Situation;
 use crate::episode::CommittedEpisode;
 
-/// How long the services may take to be opened.
+/// Longest time to open the services.
 const OPENING_PATIENCE: Duration = Duration::from_secs(30);
-/// How long the receiving thread may take to end once it is told to.
+/// Longest time for the receiving thread to end after the finish command.
 const ENDING_PATIENCE: Duration = Duration::from_secs(5);
-/// How long a waiting training thread waits before it looks whether it should stop.
+/// Interval at which a waiting training thread checks whether to stop.
 const STOP_CHECK: Duration = Duration::from_millis(100);
 
-/// The training thread's end.
+/// The training thread's handle of the receiving thread.
 #[derive(Debug)]
 pub struct EpisodeReceiver {
     commands: Sender<Command>,
@@ -44,37 +45,37 @@ pub struct EpisodeReceiver {
     next_batch: u64,
 }
 
-/// What the receiving thread tells at any time.
+/// State that the receiving thread shares at any time.
 #[derive(Debug, Default)]
 pub struct Shared {
-    /// Actors that live, in ascending order.
+    /// Attached actors, in ascending order.
     live_actors: RwLock<Vec<u32>>,
     faults: RwLock<Faults>,
     times: RwLock<Times>,
     situation: RwLock<Option<(Instant, Situation)>>,
-    /// Why the receiving thread ended before it was told to.
+    /// Reason why the receiving thread ended early.
     failure: RwLock<Option<ReceiverError>>,
 }
 
-/// Episodes ordered together, to be taken out in order.
+/// Episodes ordered together, taken out in order.
 #[derive(Debug)]
-pub struct Batch {
+pub struct EpisodeBatch {
     episodes: Receiver<CommittedEpisode>,
     remaining: usize,
     shared: Arc<Shared>,
 }
 
-/// Why no episode comes.
+/// Reason why no episode arrives.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ReceiverError {
-    /// The run was told to stop.
-    #[error("told to stop")]
+    /// The run was stopped.
+    #[error("stopped while waiting for episodes")]
     Stopped,
-    /// An episode cannot be flown, by whomever and however often.
+    /// No actor can fly an episode, however often it is issued.
     #[error(transparent)]
     Hopeless(#[from] HopelessEpisode),
-    /// The transport does not work any more. Nothing that was computed is at fault: a new
-    /// incarnation of the learner has a new transport.
+    /// The transport failed; nothing that was computed is at fault. A new incarnation of the
+    /// learner has a new transport.
     #[error("the transport failed: {0}")]
     Transport(String),
 }
@@ -85,14 +86,14 @@ impl ReceiverError {
     }
 }
 
-/// What the training thread wants.
+/// Commands of the training thread.
 #[derive(Debug)]
 pub(super) enum Command {
     Publish(Snapshot),
     Fly {
         batch: u64,
         epoch: Epoch,
-        keep: Keep,
+        keep: KeptData,
         tickets: Vec<Ticket>,
         deliver: Sender<CommittedEpisode>,
     },
@@ -100,7 +101,7 @@ pub(super) enum Command {
 }
 
 impl EpisodeReceiver {
-    /// Starts the receiving thread and returns once actors can attach to this `incarnation` of the
+    /// Starts the receiving thread; returns once actors can attach to this `incarnation` of the
     /// learner.
     ///
     /// # Errors
@@ -143,12 +144,12 @@ impl EpisodeReceiver {
         })
     }
 
-    /// What the receiving thread tells at any time.
+    /// State that the receiving thread shares at any time.
     pub fn shared(&self) -> Arc<Shared> {
         self.shared.clone()
     }
 
-    /// Publishes `snapshot` to all actors, those still to come included.
+    /// Publishes `snapshot` to all actors, including those that attach later.
     ///
     /// # Errors
     /// [`ReceiverError`] when the receiving thread has ended.
@@ -156,7 +157,7 @@ impl EpisodeReceiver {
         self.send(Command::Publish(snapshot))
     }
 
-    /// Orders episodes; they are flown after those ordered before, and delivered in the order of
+    /// Orders episodes. They are flown after those ordered before, and delivered in the order of
     /// `tickets`.
     ///
     /// # Errors
@@ -164,9 +165,9 @@ impl EpisodeReceiver {
     pub fn fly(
         &mut self,
         epoch: Epoch,
-        keep: Keep,
+        keep: KeptData,
         tickets: Vec<Ticket>,
-    ) -> Result<Batch, ReceiverError> {
+    ) -> Result<EpisodeBatch, ReceiverError> {
         let (deliver, episodes) = mpsc::channel();
         let remaining = tickets.len();
         let batch = self.next_batch;
@@ -178,7 +179,7 @@ impl EpisodeReceiver {
             tickets,
             deliver,
         })?;
-        Ok(Batch {
+        Ok(EpisodeBatch {
             episodes,
             remaining,
             shared: self.shared.clone(),
@@ -210,7 +211,7 @@ impl EpisodeReceiver {
             .send(command)
             .map_err(|_| self.shared.failed())?;
         if let Err(error) = self.waker.wake() {
-            // It looks by itself at every heartbeat.
+            // The thread also looks for commands at every heartbeat.
             tracing::debug!(%error, "receiving thread not woken");
         }
         Ok(())
@@ -218,7 +219,7 @@ impl EpisodeReceiver {
 }
 
 impl Shared {
-    /// The numbers of the actors that live, in ascending order.
+    /// Numbers of the attached actors, in ascending order.
     pub fn live_actors(&self) -> Vec<u32> {
         self.live_actors
             .read()
@@ -226,19 +227,19 @@ impl Shared {
             .clone()
     }
 
-    /// What went wrong since the learner's start, and was made good.
+    /// Faults repaired since the learner's start.
     pub fn faults(&self) -> Faults {
         *self.faults.read().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What the time of the receiving thread and of all actors since the learner's start went into,
-    /// as of the last word of any of them.
+    /// Time by stage of the receiving thread and all actors since the learner's start, as last
+    /// reported by each.
     pub fn times(&self) -> Times {
         *self.times.read().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Where the episodes are, as of the receiving thread's last heartbeat, and how long ago that
-    /// was; `None` before the first.
+    /// Situation at the receiving thread's last heartbeat, and its age; `None` before the first
+    /// heartbeat.
     pub fn situation(&self) -> Option<(Duration, Situation)> {
         let situation = self
             .situation
@@ -249,8 +250,8 @@ impl Shared {
             .map(|(at, situation)| (at.elapsed(), situation.clone()))
     }
 
-    /// Why the receiving thread has ended. A panic leaves no word, and comes from a transport that
-    /// is out of order: nothing else there may panic.
+    /// Reason why the receiving thread has ended. A panic leaves no reason; only a broken transport
+    /// can cause one there.
     fn failed(&self) -> ReceiverError {
         let failure = self.failure.read().unwrap_or_else(PoisonError::into_inner);
         failure.clone().unwrap_or_else(|| {
@@ -290,8 +291,8 @@ impl Shared {
     }
 }
 
-impl Batch {
-    /// Episodes that were not taken out yet.
+impl EpisodeBatch {
+    /// Number of episodes that were not taken out yet.
     pub fn remaining(&self) -> usize {
         self.remaining
     }
@@ -307,10 +308,11 @@ impl Batch {
         })
     }
 
-    /// The same, until `look` has a reason not to wait any longer; it is asked ten times a second.
+    /// Like [`EpisodeBatch::next`], but waits until `look` returns an error. Calls `look` ten times
+    /// a second.
     ///
     /// # Errors
-    /// [`ReceiverError`] when the receiving thread has ended, or what `look` returns.
+    /// [`ReceiverError`] when the receiving thread has ended; any error of `look`.
     pub fn next_unless<E: From<ReceiverError>>(
         &mut self,
         mut look: impl FnMut() -> Result<(), E>,
@@ -330,7 +332,7 @@ impl Batch {
     }
 }
 
-/// The receiving thread.
+/// Body of the receiving thread.
 fn serve(
     identity: &RunIdentity,
     incarnation: LearnerIncarnation,
@@ -342,7 +344,7 @@ fn serve(
     let ports = match LearnerPorts::open(identity, incarnation, config) {
         Ok(ports) => ports,
         Err(error) => {
-            // The starter waits for exactly this word; if it is gone, nobody needs it.
+            // If the starting thread is gone, no other thread waits for this.
             let _ = ready.send(Err(ReceiverError::transport(&error)));
             return;
         }
@@ -351,5 +353,5 @@ fn serve(
     if let Err(error) = Server::new(identity, config, ports).run(inbox, shared) {
         shared.fail(error);
     }
-    // Whoever waits is told by its channel's end.
+    // Waiting threads notice the end of their channel.
 }

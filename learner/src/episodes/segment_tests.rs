@@ -1,5 +1,5 @@
-//! An episode in segments goes on where it was, whoever flies the next one, or that segment is
-//! flown again.
+//! An episode in segments continues where it was, whichever actor flies the next segment, or that
+//! segment is flown again.
 
 use std::time::{Duration, Instant};
 
@@ -9,8 +9,8 @@ use skein_protocol::transition::RecordKind;
 use super::tests::{INCARNATION, RUN, attach, feed, limits, order, records, tickets_for};
 use super::*;
 
-/// The order of the segment of episode 0 that follows `flown` steps, one step long.
-fn segment(flown: usize) -> Order {
+/// Order of the one-step segment of episode 0 that follows `flown` steps.
+fn segment(flown: usize) -> EpisodeOrder {
     let mut order = order(0);
     order.ticket.segment = Some(Segment {
         steps: 1,
@@ -20,8 +20,7 @@ fn segment(flown: usize) -> Order {
     order
 }
 
-/// What an actor sends of `ticket`: a step from where the vehicle is at `x_m` to a metre behind,
-/// and the segment's end.
+/// Records of `ticket`: a step from `x_m` to one metre further, and the segment's end.
 fn flown(ticket: &Ticket, actor: u32, x_m: f32) -> [TransitionRecord; 2] {
     let first = ticket.first_step();
     [0, 1].map(|offset| {
@@ -35,8 +34,8 @@ fn flown(ticket: &Ticket, actor: u32, x_m: f32) -> [TransitionRecord; 2] {
     })
 }
 
-/// A dispatcher whose first segment was flown by actor 0 of two, from 0 m to 1 m, and whose second
-/// is given to it.
+/// Returns a dispatcher whose first segment actor 0 of two has flown, from 0 m to 1 m. The ticket
+/// of the second is issued to it.
 fn dispatcher(now: Instant) -> (Dispatcher, Ticket) {
     let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
     attach(&mut dispatcher, 0, INCARNATION, now);
@@ -51,7 +50,7 @@ fn dispatcher(now: Instant) -> (Dispatcher, Ticket) {
 }
 
 #[test]
-fn a_segment_of_an_actor_that_died_is_flown_by_another_with_all_that_was_flown_before() {
+fn a_segment_of_a_dead_actor_is_flown_by_another_with_all_earlier_actions() {
     let start = Instant::now();
     let (mut dispatcher, _) = dispatcher(start);
     let later = start + Duration::from_secs(6);
@@ -78,7 +77,7 @@ fn a_segment_that_begins_elsewhere_than_the_one_before_ended_is_refused() {
 }
 
 #[test]
-fn a_segment_that_no_actor_begins_where_it_must_is_given_up_with_the_reason() {
+fn a_segment_that_no_actor_begins_at_the_right_place_is_given_up_with_the_reason() {
     let now = Instant::now();
     let (mut dispatcher, second) = dispatcher(now);
     let mut issued = Some((0, second));

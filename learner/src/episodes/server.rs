@@ -1,10 +1,11 @@
-//! What the receiving thread does: round after round, it takes in what actors send and hands out
-//! what the training thread orders.
+//! The rounds of the receiving thread: each takes in what actors send and sends out what the
+//! training thread orders.
 //!
-//! Actors die at any moment, in the middle of whatever they do to shared memory. So no failure of a
-//! service ends a round, let alone the thread: what cannot be received is not there, what cannot be
-//! sent is tried again in the next round, and at every heartbeat the dead are cleaned up after.
-//! Only a transport that fails in every round for [`TRANSPORT_PATIENCE`] is given up.
+//! Actors may die at any moment, in the middle of an access to shared memory. So no failure of a
+//! service ends a round, let alone the thread. What cannot be received counts as absent. What
+//! cannot be sent is tried again in the next round. At every heartbeat, the remains of dead actors
+//! are cleaned up. Only a transport that fails in every round for [`TRANSPORT_PATIENCE`] is given
+//! up.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::mpsc::{Receiver, Sender, TryRecvError};
@@ -20,26 +21,26 @@ use skein_run::RunIdentity;
 use skein_run::fault::{FaultPoint, pass};
 use skein_transport::{LearnerPorts, ServiceError};
 
-use super::dispatcher::{Dispatcher, HopelessEpisode, Order, Place};
+use super::dispatcher::{BatchPlace, Dispatcher, EpisodeOrder, HopelessEpisode};
 use super::receiver::{Command, ReceiverError, Shared};
 use crate::episode::CommittedEpisode;
 
-/// How long every round may meet a failure before the transport is given up.
+/// Time of failures in every round after which the transport is given up.
 pub(super) const TRANSPORT_PATIENCE: Duration = Duration::from_secs(10);
-/// Records taken in before anything else gets its turn.
+/// Records taken in before other work gets its turn.
 const RECORDS_AT_ONCE: usize = 1024;
-/// Pause before what has failed is tried again.
+/// Pause before a failed operation is tried again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
-/// The receiving thread's state.
+/// State of the receiving thread.
 pub(super) struct Server {
     run: RunId,
     dispatcher: Dispatcher,
     deliveries: BTreeMap<u64, Delivery>,
     ports: LearnerPorts,
-    /// What is still to be sent, in this order.
+    /// Messages and snapshots still to be sent, in this order.
     outbox: VecDeque<Outgoing>,
-    /// Whether an actor that may wait has not been woken to what was sent.
+    /// `true` if something was sent and an actor that may be waiting was not woken yet.
     is_wake_due: bool,
     heartbeat: Duration,
     last_heartbeat: Option<Instant>,
@@ -47,7 +48,7 @@ pub(super) struct Server {
     timer: LapTimer,
 }
 
-/// Episodes of one batch that wait for an earlier one.
+/// Episodes of one batch, of which some may wait for an earlier one.
 struct Delivery {
     next: usize,
     count: usize,
@@ -60,24 +61,24 @@ enum Outgoing {
     Message(Message),
 }
 
-/// What the training thread wants of the receiving one, besides its commands.
+/// Request of the training thread, besides its commands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Wish {
-    /// That it goes on.
+enum Request {
+    /// Continue.
     Serve,
-    /// That it sends the actors home.
+    /// Tell the actors to leave, and end.
     Finish,
-    /// It is gone without a word: it panicked. The actors stay, for the learner's next incarnation
-    /// needs them.
+    /// End quietly: the training thread has panicked. The actors stay, because the learner's next
+    /// incarnation needs them.
     Vanish,
 }
 
-/// What a round leaves to do.
+/// Work left after a round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Next {
     /// There may be more to take in.
     AtOnce,
-    /// Nothing until somebody calls.
+    /// Nothing until the next wake-up.
     Wait,
 }
 
@@ -97,7 +98,7 @@ impl Server {
         }
     }
 
-    /// Serves until it is told to finish.
+    /// Serves until the finish command.
     ///
     /// # Errors
     /// [`ReceiverError::Hopeless`] and [`ReceiverError::Transport`].
@@ -108,12 +109,12 @@ impl Server {
     ) -> Result<(), ReceiverError> {
         loop {
             match self.take_commands(inbox) {
-                Wish::Serve => {}
-                Wish::Finish => {
+                Request::Serve => {}
+                Request::Finish => {
                     self.say_stop();
                     return Ok(());
                 }
-                Wish::Vanish => return Ok(()),
+                Request::Vanish => return Ok(()),
             }
             let now = Instant::now();
             self.take_status(now, shared);
@@ -135,8 +136,8 @@ impl Server {
         }
     }
 
-    /// Carries out the training thread's commands; returns what it wants in the end.
-    fn take_commands(&mut self, inbox: &Receiver<Command>) -> Wish {
+    /// Executes the training thread's commands; returns its final request.
+    fn take_commands(&mut self, inbox: &Receiver<Command>) -> Request {
         loop {
             match inbox.try_recv() {
                 Ok(Command::Publish(snapshot)) => {
@@ -157,17 +158,17 @@ impl Server {
                     };
                     self.deliveries.insert(batch, delivery);
                     for (index, ticket) in tickets.into_iter().enumerate() {
-                        self.dispatcher.order(Order {
+                        self.dispatcher.order(EpisodeOrder {
                             ticket,
                             epoch,
                             keep,
-                            place: Place { batch, index },
+                            place: BatchPlace { batch, index },
                         });
                     }
                 }
-                Ok(Command::Finish) => return Wish::Finish,
-                Err(TryRecvError::Disconnected) => return Wish::Vanish,
-                Err(TryRecvError::Empty) => return Wish::Serve,
+                Ok(Command::Finish) => return Request::Finish,
+                Err(TryRecvError::Disconnected) => return Request::Vanish,
+                Err(TryRecvError::Empty) => return Request::Serve,
             }
         }
     }
@@ -188,21 +189,20 @@ impl Server {
             }
         }
         if heard {
-            self.tell_times(shared);
+            self.share_times(shared);
         }
         if anyone_empty_handed {
-            // Not only at the next heartbeat: an actor that has come cannot fly before it has a
-            // snapshot.
+            // Not only at the next heartbeat: a new actor cannot fly before it has a snapshot.
             self.trouble.unless(self.ports.connect());
             self.is_wake_due = true;
         }
     }
 
-    fn tell_times(&self, shared: &Shared) {
+    fn share_times(&self, shared: &Shared) {
         shared.update_times(self.dispatcher.actor_times().plus(self.timer.times()));
     }
 
-    /// Takes records in.
+    /// Takes in records, and delivers the episodes that they complete.
     fn take_records(&mut self, now: Instant) -> Result<Next, HopelessEpisode> {
         let mut unbooked = 0;
         let mut next = Next::AtOnce;
@@ -229,8 +229,8 @@ impl Server {
         Ok(next)
     }
 
-    /// Passes on what is next in its batch, and keeps what is early.
-    fn deliver(&mut self, place: Place, episode: CommittedEpisode) {
+    /// Delivers the next episodes of the batch, and keeps early ones.
+    fn deliver(&mut self, place: BatchPlace, episode: CommittedEpisode) {
         let Some(delivery) = self.deliveries.get_mut(&place.batch) else {
             return;
         };
@@ -238,7 +238,7 @@ impl Server {
         while let Some(episode) = delivery.early.remove(&delivery.next) {
             delivery.next += 1;
             pass(FaultPoint::LearnerEpisodeCommitted);
-            // A training thread that no longer waits has been told to stop.
+            // A training thread that no longer waits has been stopped.
             let _ = delivery.to.send(episode);
         }
         if delivery.next == delivery.count {
@@ -255,7 +255,7 @@ impl Server {
         );
     }
 
-    /// Sends what is to be sent, as far as that works.
+    /// Sends the outbox, as far as that works.
     fn send_out(&mut self) {
         while let Some(outgoing) = self.outbox.front() {
             let sent = match outgoing {
@@ -270,10 +270,10 @@ impl Server {
         }
     }
 
-    /// Wakes the actors to what was sent in this round, if one of them may wait.
+    /// Wakes the actors if something was sent and one of them may be waiting.
     fn wake_actors(&mut self) {
         self.is_wake_due |= self.dispatcher.take_wake();
-        // What could not be sent yet is nothing to wake anybody for.
+        // Waking makes no sense before everything is sent.
         if self.is_wake_due && self.outbox.is_empty() {
             self.is_wake_due = self.trouble.unless(self.ports.wake_actors()).is_none();
         }
@@ -286,7 +286,7 @@ impl Server {
         }
         self.last_heartbeat = Some(now);
         shared.update_situation(self.dispatcher.situation(now), now);
-        self.tell_times(shared);
+        self.share_times(shared);
         self.trouble.unless(self.ports.maintain());
         let heartbeat = ControlRecord::heartbeat(self.run);
         self.trouble.unless(self.ports.send_control(heartbeat));
@@ -305,26 +305,26 @@ impl Server {
     }
 
     fn say_stop(&mut self) {
-        // Actors that miss it leave when this learner's end shows.
+        // Actors that miss it leave when this learner ends.
         self.trouble
             .unless(self.ports.send_control(ControlRecord::stop(self.run)));
         self.trouble.unless(self.ports.wake_actors());
     }
 }
 
-/// What goes wrong with the services, and for how long already.
+/// Failures of the services, and their duration.
 #[derive(Default)]
 struct Trouble {
-    /// When the first of the rounds began of which each has met a failure.
+    /// Start of the first round since which every round has met a failure.
     since: Option<Instant>,
-    /// The failure that was told last; the same one again is not told.
-    told: String,
-    /// The present round's last failure.
+    /// Failure that was logged last; a repetition is not logged.
+    logged: String,
+    /// Last failure of the present round.
     present: Option<ServiceError>,
 }
 
 impl Trouble {
-    /// The result, unless it is a failure, which is noted.
+    /// Returns the result; a failure is recorded instead.
     fn unless<T>(&mut self, result: Result<T, ServiceError>) -> Option<T> {
         match result {
             Ok(result) => Some(result),
@@ -335,17 +335,17 @@ impl Trouble {
         }
     }
 
-    /// Ends a round that began at `now`; what is wrong if it has been for too long.
+    /// Ends a round that began at `now`; returns the failure if it has lasted for too long.
     fn lasting(&mut self, now: Instant) -> Option<String> {
         let Some(error) = self.present.take() else {
             self.since = None;
-            self.told.clear();
+            self.logged.clear();
             return None;
         };
         let error = error.to_string();
-        if self.told != error {
-            tracing::warn!(error, "a service failed; going on");
-            self.told.clone_from(&error);
+        if self.logged != error {
+            tracing::warn!(error, "a service failed; continuing");
+            self.logged.clone_from(&error);
         }
         let since = *self.since.get_or_insert(now);
         (now.duration_since(since) > TRANSPORT_PATIENCE).then_some(error)

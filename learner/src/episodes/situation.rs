@@ -1,36 +1,36 @@
-//! Who waits for whom: what the watchdog says when nothing moves.
+//! Location of all ordered episodes, which the watchdog reports when nothing moves.
 
 use std::fmt;
 use std::time::Duration;
 
 use skein_protocol::ids::{ActorId, EpisodeId};
 
-/// Episodes that are named at most.
+/// Largest number of episodes that are listed.
 const NAMED: usize = 4;
 
-/// What of the episodes ordered is where.
+/// Distribution of the ordered episodes.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Situation {
-    /// Actors that live.
+    /// Number of attached actors.
     pub actors: usize,
-    /// Episodes that no actor holds a ticket for.
+    /// Number of episodes without a ticket holder.
     pub waiting: usize,
-    /// Episodes that an actor holds a ticket for, in order of their numbers.
+    /// Episodes whose tickets are out, in order of their numbers.
     pub out: Vec<EpisodeOut>,
 }
 
-/// An episode in an actor's hands.
+/// An episode whose ticket an actor holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct EpisodeOut {
-    /// The episode.
+    /// Number of the episode.
     pub episode: EpisodeId,
-    /// Who has the ticket.
+    /// Actor that holds the ticket.
     pub actor: ActorId,
-    /// Records that have arrived.
+    /// Number of records that have arrived.
     pub records: usize,
-    /// How long ago it could be begun.
+    /// Time since the actor could begin it.
     pub issued: Duration,
-    /// How long ago anything was heard of the actor.
+    /// Time since anything was heard of the actor.
     pub unheard: Duration,
 }
 
@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_names_the_first_episodes_out_and_who_has_them() {
+    fn it_names_the_first_episodes_out_and_their_actors() {
         let out = |episode| EpisodeOut {
             episode: EpisodeId(episode),
             actor: ActorId(3),
@@ -86,15 +86,18 @@ mod tests {
             waiting: 1,
             out: (7..12).map(out).collect(),
         };
-        let told = situation.to_string();
-        assert!(told.starts_with("actors: 2; episodes out: 5, waiting: 1; episode 7 with actor 3 for 31 s, 12 records, the actor heard 0.3 s ago"));
-        assert!(told.ends_with("; and 1 more"), "{told}");
-        let nobody = Situation {
+        let text = situation.to_string();
+        assert!(text.starts_with(
+            "actors: 2; episodes out: 5, waiting: 1; \
+             episode 7 with actor 3 for 31 s, 12 records, the actor heard 0.3 s ago"
+        ));
+        assert!(text.ends_with("; and 1 more"), "{text}");
+        let no_actor = Situation {
             waiting: 5,
             ..Situation::default()
         };
         assert_eq!(
-            nobody.to_string(),
+            no_actor.to_string(),
             "no actor is attached; episodes that wait for one: 5"
         );
     }

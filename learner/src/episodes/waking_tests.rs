@@ -1,4 +1,4 @@
-//! An actor that waits is woken to what it is given; one that flies is left alone.
+//! An actor that waits is woken for a new ticket; one that flies is not.
 
 use std::collections::VecDeque;
 use std::time::Instant;
@@ -11,18 +11,18 @@ use super::tests::{
 use super::*;
 
 #[test]
-fn an_actor_is_woken_to_a_ticket_unless_it_shows_that_it_flies() {
+fn an_actor_is_woken_for_a_ticket_unless_its_records_show_that_it_flies() {
     let now = Instant::now();
     let (mut dispatcher, tickets) = dispatcher(now);
     assert!(dispatcher.take_wake(), "it had nothing to fly");
     assert!(!dispatcher.take_wake(), "once is enough");
 
-    // It flies 0, and finds 2 before it flies 1 or after.
+    // It flies 0, and finds 2 before it flies 1 or afterwards.
     feed(&mut dispatcher, &records(&tickets[0], 0, INCARNATION), now);
     let second = tickets_for(&dispatcher.issue(now), 0, INCARNATION).remove(0);
     assert!(!dispatcher.take_wake(), "it flies");
 
-    // It may say this for want of 2, which was on its way.
+    // It may send this for lack of 2, which was on its way.
     attach(&mut dispatcher, 0, INCARNATION, now);
     assert!(dispatcher.take_wake());
     attach(&mut dispatcher, 0, INCARNATION, now);
@@ -31,14 +31,14 @@ fn an_actor_is_woken_to_a_ticket_unless_it_shows_that_it_flies() {
         "nothing is on its way that was not when it was woken"
     );
 
-    // Nothing that it was given before that word shows that it has heard the word's answer.
+    // A ticket from before that heartbeat does not show that the actor has seen the later one.
     (3..6).for_each(|episode| dispatcher.order(order(episode)));
     feed(&mut dispatcher, &records(&tickets[1], 0, INCARNATION), now);
     let third = tickets_for(&dispatcher.issue(now), 0, INCARNATION).remove(0);
-    assert!(dispatcher.take_wake(), "it may wait");
+    assert!(dispatcher.take_wake(), "it may be waiting");
     feed(&mut dispatcher, &records(&second, 0, INCARNATION), now);
     let fourth = tickets_for(&dispatcher.issue(now), 0, INCARNATION).remove(0);
-    assert!(dispatcher.take_wake(), "it may wait");
+    assert!(dispatcher.take_wake(), "it may be waiting");
     feed(&mut dispatcher, &records(&third, 0, INCARNATION), now);
     assert_eq!(tickets_for(&dispatcher.issue(now), 0, INCARNATION).len(), 1);
     assert!(!dispatcher.take_wake(), "it flies");
@@ -46,7 +46,7 @@ fn an_actor_is_woken_to_a_ticket_unless_it_shows_that_it_flies() {
 }
 
 #[test]
-fn an_actor_that_is_asked_to_join_anew_is_woken() {
+fn an_actor_that_is_asked_to_rejoin_is_woken() {
     let now = Instant::now();
     let (mut dispatcher, _) = dispatcher(now);
     dispatcher.take_wake();
@@ -58,39 +58,44 @@ fn an_actor_that_is_asked_to_join_anew_is_woken() {
     assert!(dispatcher.take_wake());
 }
 
-/// Where an actor is between two looks.
+/// State of an actor between two looks for tickets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-enum Stage {
+enum LookState {
     #[default]
     Looks,
     FoundNothing,
     Waits,
 }
 
-/// An actor that looks for tickets before each episode, and speaks and waits when there are none.
+/// An actor that looks for tickets before each episode. Without a ticket, it sends a heartbeat and
+/// waits.
 #[derive(Default)]
-struct Actor {
-    stage: Stage,
-    told: VecDeque<Ticket>,
-    /// A call stays until it is heard.
+struct SimulatedActor {
+    stage: LookState,
+    tickets: VecDeque<Ticket>,
+    /// Stays set until the actor looks.
     is_called: bool,
-    /// What the learner has not taken in: words and records go different ways.
-    words: usize,
+    /// Heartbeats that the learner has not taken in; they travel apart from records.
+    heartbeats: usize,
     sent: VecDeque<TransitionRecord>,
 }
 
-struct World {
+struct Simulation {
     dispatcher: Dispatcher,
-    actors: Vec<Actor>,
+    actors: Vec<SimulatedActor>,
     now: Instant,
 }
 
-impl World {
+impl Simulation {
     fn new(episodes: u64) -> Self {
         let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
         (0..episodes).for_each(|episode| dispatcher.order(order(episode)));
-        let mut actors = vec![Actor::default(), Actor::default(), Actor::default()];
-        actors.iter_mut().for_each(|actor| actor.words = 1);
+        let mut actors = vec![
+            SimulatedActor::default(),
+            SimulatedActor::default(),
+            SimulatedActor::default(),
+        ];
+        actors.iter_mut().for_each(|actor| actor.heartbeats = 1);
         Self {
             dispatcher,
             actors,
@@ -98,33 +103,33 @@ impl World {
         }
     }
 
-    /// Actor `id` does the next thing it does; whether there was anything.
-    fn actor_goes_on(&mut self, id: usize) -> bool {
+    /// Lets actor `id` do its next action; returns `true` if there was one.
+    fn actor_acts(&mut self, id: usize) -> bool {
         let actor = &mut self.actors[id];
         actor.stage = match actor.stage {
-            Stage::Looks => match actor.told.pop_front() {
+            LookState::Looks => match actor.tickets.pop_front() {
                 Some(ticket) => {
                     actor.sent.extend(records(&ticket, id as u32, INCARNATION));
-                    Stage::Looks
+                    LookState::Looks
                 }
-                None => Stage::FoundNothing,
+                None => LookState::FoundNothing,
             },
-            Stage::FoundNothing => {
-                actor.words += 1;
-                Stage::Waits
+            LookState::FoundNothing => {
+                actor.heartbeats += 1;
+                LookState::Waits
             }
-            Stage::Waits if std::mem::take(&mut actor.is_called) => Stage::Looks,
-            Stage::Waits => return false,
+            LookState::Waits if std::mem::take(&mut actor.is_called) => LookState::Looks,
+            LookState::Waits => return false,
         };
         true
     }
 
-    /// A round of the learner, which takes in at most `most` records of each actor; whether there
-    /// were any.
-    fn learner_goes_on(&mut self, most: usize) -> bool {
+    /// Lets the learner do a round, which takes in at most `most` records per actor; returns `true`
+    /// if anything arrived.
+    fn learner_acts(&mut self, most: usize) -> bool {
         let mut has_heard = false;
         for (id, actor) in self.actors.iter_mut().enumerate() {
-            for _ in 0..std::mem::take(&mut actor.words) {
+            for _ in 0..std::mem::take(&mut actor.heartbeats) {
                 attach(&mut self.dispatcher, id as u32, INCARNATION, self.now);
                 has_heard = true;
             }
@@ -152,7 +157,7 @@ impl World {
         let messages = self.dispatcher.issue(self.now);
         for (id, actor) in self.actors.iter_mut().enumerate() {
             actor
-                .told
+                .tickets
                 .extend(tickets_for(&messages, id as u32, INCARNATION));
         }
     }
@@ -160,22 +165,25 @@ impl World {
 
 proptest! {
     #[test]
-    fn nobody_sleeps_through_a_ticket(steps in prop::collection::vec((0..4_usize, 0..9_usize), 0..300)) {
-        let mut world = World::new(60);
+    fn no_actor_sleeps_through_a_ticket(
+        steps in prop::collection::vec((0..4_usize, 0..9_usize), 0..300),
+    ) {
+        let mut simulation = Simulation::new(60);
         for (who, most) in steps {
-            if who < world.actors.len() {
-                world.actor_goes_on(who);
+            if who < simulation.actors.len() {
+                simulation.actor_acts(who);
             } else {
-                world.learner_goes_on(most);
+                simulation.learner_acts(most);
             }
         }
-        // To the end; whoever waits uncalled stays where it is.
+        // To the end; an actor that waits without being woken stays where it is.
         loop {
-            let actors = (0..world.actors.len()).filter(|&id| world.actor_goes_on(id)).count();
-            if actors == 0 && !world.learner_goes_on(usize::MAX) {
+            let ids = 0..simulation.actors.len();
+            let actors = ids.filter(|&id| simulation.actor_acts(id)).count();
+            if actors == 0 && !simulation.learner_acts(usize::MAX) {
                 break;
             }
         }
-        prop_assert_eq!(world.dispatcher.open_orders(), 0);
+        prop_assert_eq!(simulation.dispatcher.open_orders(), 0);
     }
 }

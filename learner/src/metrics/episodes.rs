@@ -1,8 +1,8 @@
 //! `episodes.csv`: one row per committed training episode, in episode order.
 //!
-//! Row n is episode n, whoever flew it and whenever. A run that is resumed cuts the file back to
-//! the episodes its checkpoint knows of, so what is in the file never says more than what was
-//! learned from, and never twice.
+//! Row n is episode n, whichever actor flew it, and whenever. A resumed run cuts the file back to
+//! its checkpoint's episodes. So the file never contains more than what was learned from, and
+//! nothing twice.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use skein_protocol::transition::Outcome;
 use xxhash_rust::xxh3::Xxh3Default;
 
-use crate::disk::{Disk, Patient};
+use crate::disk::{Disk, PatientWriter};
 use crate::episode::CommittedEpisode;
 
 /// A row of `episodes.csv`; the fields are its columns.
@@ -20,26 +20,26 @@ use crate::episode::CommittedEpisode;
 pub struct EpisodeRow {
     /// Number of the episode, from 0 without a gap.
     pub episode: u64,
-    /// Epoch it belongs to.
+    /// Epoch that the episode belongs to.
     pub epoch: u64,
-    /// Snapshot it was flown with; in segments, the first of them.
+    /// Version of its snapshot; of several segments, the first one's.
     pub policy_version: u64,
-    /// Who flew it: the one column that may differ between two runs of one configuration.
+    /// Actor that flew it: the one column that may differ between two runs of one configuration.
     pub actor: u32,
-    /// Level it took off from, 1 is the first.
+    /// Level whose start it was reset to, from 1.
     pub level: u8,
-    /// Steps flown.
+    /// Number of steps.
     pub steps: usize,
-    /// Walls passed.
+    /// Number of walls passed.
     pub walls_passed: u8,
-    /// Sum of its rewards, in the shortest decimal notation that reads back as the same number.
+    /// Sum of the rewards, in the shortest decimal notation that reads back as the same number.
     #[serde(rename = "return")]
     pub total_reward: f32,
     /// `collided`, `reached_end` or `timed_out`.
     pub outcome: Outcome,
 }
 
-/// The columns in order: what is continued has the same.
+/// Columns in order, which a continued file must have.
 const COLUMNS: [&str; 9] = [
     "episode",
     "epoch",
@@ -52,7 +52,7 @@ const COLUMNS: [&str; 9] = [
     "outcome",
 ];
 
-/// Of an episode that has ended.
+/// Row of an episode that has ended.
 impl From<&CommittedEpisode> for EpisodeRow {
     fn from(episode: &CommittedEpisode) -> Self {
         Self {
@@ -69,18 +69,18 @@ impl From<&CommittedEpisode> for EpisodeRow {
     }
 }
 
-/// The first bytes of `episodes.csv`, by which it is recognised as what was written; part of a
+/// Length and checksum of the first bytes of `episodes.csv`, which identify its content; part of a
 /// checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EpisodesExtent {
-    /// How many.
+    /// Number of bytes.
     pub bytes: u64,
-    /// Their checksum.
+    /// Checksum of the bytes.
     pub xxh3: u64,
 }
 
 impl EpisodesExtent {
-    /// Of a file that is empty, or not there yet.
+    /// Extent of a file that is empty or does not exist.
     pub fn empty() -> Self {
         Self {
             bytes: 0,
@@ -88,21 +88,22 @@ impl EpisodesExtent {
         }
     }
 
-    /// Checks that the file at `path` begins with them; nothing is written. `episodes` is how many
-    /// rows they hold.
+    /// Checks that the file at `path` begins with these bytes; writes nothing. `episodes`: number
+    /// of rows in them.
     ///
     /// # Errors
-    /// [`EpisodesError::Damaged`]; [`EpisodesError::Io`] when it cannot be read.
+    /// [`EpisodesError::Damaged`]; [`EpisodesError::Io`] when the file cannot be read.
     pub fn check(&self, path: &Path, episodes: u64) -> Result<(), EpisodesError> {
         if self.bytes == 0 {
             return Ok(());
         }
-        let found = match File::open(path).and_then(|file| summed(file, self.bytes)) {
+        let found = match File::open(path).and_then(|file| checksum_of(file, self.bytes)) {
             Ok((bytes, _)) if bytes < self.bytes => {
                 Err(format!("ends after {bytes} bytes of {}", self.bytes))
             }
             Ok((_, sum)) if sum.digest() != self.xxh3 => Err(format!(
-                "was changed within its first {} bytes: their checksum is {:016x} where {:016x} is expected",
+                "was changed within its first {} bytes: \
+                 their checksum is {:016x} where {:016x} is expected",
                 self.bytes,
                 sum.digest(),
                 self.xxh3
@@ -124,22 +125,21 @@ impl EpisodesExtent {
     }
 }
 
-/// Reads at most `bytes` bytes of `file` from where it stands; how many there were, and their
-/// checksum.
-fn summed(file: impl Read, bytes: u64) -> io::Result<(u64, Xxh3Default)> {
+/// Reads at most `bytes` bytes of `file` from its position; returns their number and checksum.
+fn checksum_of(file: impl Read, bytes: u64) -> io::Result<(u64, Xxh3Default)> {
     let mut sum = Xxh3Default::new();
     let read = io::copy(&mut file.take(bytes), &mut sum)?;
     Ok((read, sum))
 }
 
-/// Writes to a file, and keeps a checksum of all that is in it.
-struct Summed<W> {
+/// A writer that keeps a checksum of everything in the file.
+struct Checksummed<W> {
     inner: W,
     bytes: u64,
     sum: Xxh3Default,
 }
 
-impl<W> Summed<W> {
+impl<W> Checksummed<W> {
     fn extent(&self) -> EpisodesExtent {
         EpisodesExtent {
             bytes: self.bytes,
@@ -148,7 +148,7 @@ impl<W> Summed<W> {
     }
 }
 
-impl<W: Write> Write for Summed<W> {
+impl<W: Write> Write for Checksummed<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let taken = self.inner.write(bytes)?;
         self.sum.update(&bytes[..taken]);
@@ -161,7 +161,7 @@ impl<W: Write> Write for Summed<W> {
     }
 }
 
-impl<W> std::fmt::Debug for Summed<W> {
+impl<W> std::fmt::Debug for Checksummed<W> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         self.extent().fmt(f)
     }
@@ -171,56 +171,57 @@ impl<W> std::fmt::Debug for Summed<W> {
 #[derive(Debug)]
 pub struct EpisodesCsv {
     path: PathBuf,
-    writer: csv::Writer<Summed<Patient<File>>>,
+    writer: csv::Writer<Checksummed<PatientWriter<File>>>,
 }
 
-/// Why `episodes.csv` cannot be written or continued.
+/// Reason why `episodes.csv` cannot be written or continued.
 #[derive(Debug, thiserror::Error)]
 pub enum EpisodesError {
     /// The file system refuses.
     #[error("cannot write {}: {source}", path.display())]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         #[source]
         source: io::Error,
     },
-    /// A row cannot be read back, or written.
+    /// A row cannot be read back or written.
     #[error("{}: {source}", path.display())]
     Row {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Which, and why.
+        /// Row and cause.
         #[source]
         source: csv::Error,
     },
-    /// It is not what was written before the checkpoint.
+    /// The file does not begin with the checkpoint's content.
     #[error(
-        "{} {problem}, but the checkpoint of episode {episodes} counts on it; put the file back", path.display()
+        "{} {problem}, but the checkpoint of episode {episodes} relies on it; put the file back",
+        path.display()
     )]
     Damaged {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// Episodes committed at the checkpoint.
         episodes: u64,
-        /// What is wrong with it.
+        /// Description of the damage.
         problem: String,
     },
-    /// The rows are not those of the episodes that the checkpoint knows of.
+    /// The rows do not match the checkpoint's episodes.
     #[error("{} cannot be continued after {expected} episodes: {problem}", path.display())]
     Content {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Episodes it should hold.
+        /// Number of episodes that the file should contain.
         expected: u64,
-        /// What it holds instead.
+        /// Description of what it contains instead.
         problem: String,
     },
 }
 
 impl EpisodesCsv {
-    /// Starts an empty file; one that is there is replaced.
+    /// Starts an empty file, in place of an existing one.
     ///
     /// # Errors
     /// [`EpisodesError::Io`].
@@ -231,7 +232,7 @@ impl EpisodesCsv {
         })?;
         Ok(Self {
             path: path.to_owned(),
-            writer: csv::Writer::from_writer(Summed {
+            writer: csv::Writer::from_writer(Checksummed {
                 inner: disk.patient(path, file),
                 bytes: 0,
                 sum: Xxh3Default::new(),
@@ -239,11 +240,11 @@ impl EpisodesCsv {
         })
     }
 
-    /// Continues after the first `episodes` rows; later rows, of episodes whose learning was lost,
-    /// are cut off.
+    /// Continues after the first `episodes` rows. Later rows belong to episodes whose learning was
+    /// lost, and are cut off.
     ///
     /// # Errors
-    /// [`EpisodesError`] when the file does not hold episodes 0 to `episodes` - 1 in order.
+    /// [`EpisodesError`] when the file does not contain episodes 0 to `episodes` - 1 in order.
     pub fn resume(path: &Path, episodes: u64, disk: &Disk) -> Result<Self, EpisodesError> {
         if episodes == 0 {
             return Self::create(path, disk);
@@ -261,11 +262,11 @@ impl EpisodesCsv {
         file.set_len(end).map_err(io)?;
         end_line(&mut file).map_err(io)?;
         file.rewind().map_err(io)?;
-        let (bytes, sum) = summed(&file, u64::MAX).map_err(io)?;
+        let (bytes, sum) = checksum_of(&file, u64::MAX).map_err(io)?;
         let inner = disk.patient(path, file);
         let writer = csv::WriterBuilder::new()
             .has_headers(false)
-            .from_writer(Summed { inner, bytes, sum });
+            .from_writer(Checksummed { inner, bytes, sum });
         Ok(Self {
             path: path.to_owned(),
             writer,
@@ -285,8 +286,8 @@ impl EpisodesCsv {
             })
     }
 
-    /// What is in the file: all that was written before it was last [flushed](EpisodesCsv::flush),
-    /// and perhaps some of what was written since.
+    /// Extent of the file: everything written before the last [flush](EpisodesCsv::flush), and
+    /// perhaps some later rows.
     pub fn extent(&self) -> EpisodesExtent {
         self.writer.get_ref().extent()
     }
@@ -303,8 +304,7 @@ impl EpisodesCsv {
     }
 }
 
-/// Goes to the end of the file, and of its last line: a file that was cut there by other hands
-/// would have the next row on the same line.
+/// Goes to the end of the file, and adds a missing line end, so that the next row starts a line.
 fn end_line(file: &mut File) -> io::Result<()> {
     let mut last = [0];
     file.seek(SeekFrom::End(-1))?;
@@ -315,7 +315,7 @@ fn end_line(file: &mut File) -> io::Result<()> {
     Ok(())
 }
 
-/// Byte after the first `episodes` rows, which must be episodes 0, 1, 2, …
+/// Position after the first `episodes` rows, which must be episodes 0, 1, 2, …
 fn end_of_rows(path: &Path, file: &File, episodes: u64) -> Result<u64, EpisodesError> {
     let content = |problem| EpisodesError::Content {
         path: path.to_owned(),
@@ -326,8 +326,7 @@ fn end_of_rows(path: &Path, file: &File, episodes: u64) -> Result<u64, EpisodesE
         path: path.to_owned(),
         source,
     };
-    // No row of ours is quoted, and a quote that is opened and never closed would swallow what is
-    // appended.
+    // No row of ours is quoted, and an unclosed quote would swallow what is appended.
     let mut reader = csv::ReaderBuilder::new().quoting(false).from_reader(file);
     let headers = reader.headers().map_err(row_error)?.clone();
     if headers != COLUMNS[..] {
@@ -378,7 +377,8 @@ mod tests {
         write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..1);
         assert_eq!(
             fs::read_to_string(&path).unwrap(),
-            "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n0,0,0,0,1,3,0,0.03,reached_end\n"
+            "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
+             0,0,0,0,1,3,0,0.03,reached_end\n"
         );
     }
 
@@ -392,7 +392,8 @@ mod tests {
             let mut csv = EpisodesCsv::create(&path, &disk()).unwrap();
             csv.write(&EpisodeRow { total_reward: value, ..row(0) }).unwrap();
             csv.flush().unwrap();
-            let read: EpisodeRow = csv::Reader::from_path(&path).unwrap().deserialize().next().unwrap().unwrap();
+            let mut reader = csv::Reader::from_path(&path).unwrap();
+            let read: EpisodeRow = reader.deserialize().next().unwrap().unwrap();
             prop_assert_eq!(read.total_reward.to_bits(), bits);
         }
     }
@@ -451,7 +452,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_cut_short_behind_the_checkpoint_does_not_matter() {
+    fn a_row_cut_short_after_the_checkpoint_does_not_matter() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("episodes.csv");
         write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..5);
@@ -482,7 +483,7 @@ mod tests {
         let mut csv = EpisodesCsv::create(&path, &disk()).unwrap();
         write(&mut csv, 0..3);
         drop(csv);
-        // Counted over two incarnations.
+        // Extent over two incarnations.
         let mut csv = EpisodesCsv::resume(&path, 2, &disk()).unwrap();
         write(&mut csv, 2..5);
         let extent = csv.extent();

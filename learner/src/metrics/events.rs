@@ -1,11 +1,12 @@
 //! TensorBoard event files.
 //!
 //! An event file is a sequence of framed protocol buffer messages. The two crates that write them
-//! are built on protocol buffer libraries long superseded, so the few messages we need stand here.
-//! Field numbers are those of TensorFlow's `event.proto` and `summary.proto`; the frame is `length
-//! u64 | masked CRC of length u32 | message | masked CRC of message u32`, little-endian, where the
-//! CRC is CRC-32C and masking rotates it and adds a constant, so that the checksum of data that
-//! itself holds checksums stays a good one (TensorFlow's `record_writer.h`).
+//! depend on superseded protocol buffer libraries, so the few messages needed are defined here.
+//! Field numbers are those of TensorFlow's `event.proto` and `summary.proto`.
+//!
+//! A frame is `length u64 | masked CRC of length u32 | message | masked CRC of message u32`,
+//! little-endian. The CRC is CRC-32C. Masking rotates it and adds a constant, so that the checksum
+//! of data that contains checksums stays a good one (TensorFlow's `record_writer.h`).
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
@@ -15,49 +16,49 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use prost::Message;
 use serde::{Deserialize, Serialize};
 
-use crate::disk::{Disk, Patient};
-use crate::report::tell;
+use crate::disk::{Disk, PatientWriter};
+use crate::report::notify_user;
 
-/// How the names of our files begin, before the second of their start. TensorBoard takes files
-/// whose name has `tfevents` in it.
+/// Start of our files' names, before the second of their creation. TensorBoard reads files whose
+/// name contains `tfevents`.
 const NAME: &str = "events.out.tfevents.";
 
-/// Appends scalars to an event file of its own.
+/// Appends scalars to a new event file.
 #[derive(Debug)]
 pub struct EventWriter {
     /// Files of earlier incarnations, then the present one.
     files: Vec<EventFile>,
     path: PathBuf,
-    file: BufWriter<Patient<File>>,
+    file: BufWriter<PatientWriter<File>>,
 }
 
 /// An event file, as far as it belongs to the run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EventFile {
-    /// Its name in the folder.
+    /// Name in the folder.
     pub name: String,
-    /// Its length.
+    /// Length in bytes.
     pub bytes: u64,
 }
 
-/// Why events cannot be written.
+/// Reason why events cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write TensorBoard events to {}: {source}", path.display())]
 pub struct EventError {
-    /// The file.
+    /// Path of the file.
     pub path: PathBuf,
-    /// Why.
+    /// Cause.
     #[source]
     pub source: io::Error,
 }
 
 impl EventWriter {
-    /// Starts a new event file in `directory`, after cutting back those there are to `files`: what
-    /// lies beyond is of episodes whose learning was lost. TensorBoard reads all files of a
-    /// directory as one; of earlier ones it drops what lies at `first_step` or later.
+    /// Starts a new event file in `directory`, after cutting existing ones back to `files`: later
+    /// content belongs to episodes whose learning was lost. TensorBoard reads all files of a
+    /// directory as one, and drops points of earlier files at `first_step` or later.
     ///
-    /// A file that has lost a part of `files`, or all of it, is named in a warning: its curves then
-    /// have a hole, which is no reason not to train.
+    /// A file that has lost a part of `files` causes a warning with its name. Its curves then have
+    /// a hole, but training continues.
     ///
     /// # Errors
     /// [`EventError`] when a file cannot be cut back or created.
@@ -71,10 +72,10 @@ impl EventWriter {
         fs::create_dir_all(directory).map_err(at(directory.to_owned()))?;
         let (files, others): (Vec<_>, Vec<_>) = files
             .into_iter()
-            .partition(|file| Begun::of(&file.name).is_some());
-        // Whatever a damaged list names elsewhere is not for us to cut.
+            .partition(|file| CreationStamp::of(&file.name).is_some());
+        // A damaged list may name other files; those are not cut.
         for EventFile { name, .. } in others {
-            tracing::warn!(name, "not the name of an event file of ours: left alone");
+            tracing::warn!(name, "not the name of one of our event files: left alone");
         }
         let (path, file) = begin(directory, cut_back(directory, &files)?);
         let file = BufWriter::new(disk.patient(&path, file.map_err(at(path.clone()))?));
@@ -101,13 +102,13 @@ impl EventWriter {
         Ok(writer)
     }
 
-    /// All files of the run, as far as they were written; what is not [flushed](EventWriter::flush)
-    /// yet is counted in.
+    /// All files of the run with their lengths, which include what is not
+    /// [flushed](EventWriter::flush) yet.
     pub fn files(&self) -> &[EventFile] {
         &self.files
     }
 
-    /// Appends one value for each tag at `step`.
+    /// Appends one value per tag at `step`.
     ///
     /// # Errors
     /// [`EventError`].
@@ -151,23 +152,23 @@ impl EventWriter {
     }
 }
 
-/// Creates a file in `directory` that comes after the one begun `latest`, even if the clock has
-/// gone back since: TensorBoard takes files in alphabetical order. A second start within one second
-/// is told apart by the number.
-fn begin(directory: &Path, latest: Option<Begun>) -> (PathBuf, io::Result<File>) {
+/// Creates a file in `directory` whose name sorts after the one created at `latest`, even if the
+/// clock has gone back. TensorBoard reads files in alphabetical order. The number distinguishes
+/// files created within one second.
+fn begin(directory: &Path, latest: Option<CreationStamp>) -> (PathBuf, io::Result<File>) {
     let now = now_secs() as u64;
     let first = match latest {
-        Some(latest) if latest.second >= now => Begun {
+        Some(latest) if latest.second >= now => CreationStamp {
             number: latest.number.saturating_add(1),
             ..latest
         },
-        _ => Begun {
+        _ => CreationStamp {
             second: now,
             number: 0,
         },
     };
     (first.number..first.number.saturating_add(1000))
-        .map(|number| directory.join(Begun { number, ..first }.name()))
+        .map(|number| directory.join(CreationStamp { number, ..first }.name()))
         .find_map(|path| match File::create_new(&path) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => None,
             result => Some((path, result)),
@@ -180,19 +181,19 @@ fn begin(directory: &Path, latest: Option<Begun>) -> (PathBuf, io::Result<File>)
         })
 }
 
-/// When an event file of ours was begun; what its name says.
+/// Creation time of one of our event files, as in its name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-struct Begun {
+struct CreationStamp {
     second: u64,
     number: u32,
 }
 
-impl Begun {
+impl CreationStamp {
     fn name(self) -> String {
         format!("{NAME}{}.skein.{:06}", self.second, self.number)
     }
 
-    /// `None` of a file that is not ours.
+    /// Parses a file name; `None` if the file is not ours.
     fn of(name: &str) -> Option<Self> {
         let (second, number) = name.strip_prefix(NAME)?.split_once(".skein.")?;
         Some(Self {
@@ -202,9 +203,9 @@ impl Begun {
     }
 }
 
-/// Cuts our files in `directory` back to `files` and removes all others of ours. Returns when the
-/// latest of `files` was begun.
-fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, EventError> {
+/// Cuts our files in `directory` back to `files` and removes all others of ours. Returns the
+/// creation time of the latest of `files`.
+fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<CreationStamp>, EventError> {
     let at = |path: &Path| {
         let path = path.to_owned();
         move |source| EventError { path, source }
@@ -212,7 +213,7 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, Even
     for entry in fs::read_dir(directory).map_err(at(directory))? {
         let name = entry.map_err(at(directory))?.file_name();
         let known = |file: &EventFile| name == file.name.as_str();
-        if name.to_str().and_then(Begun::of).is_some() && !files.iter().any(known) {
+        if name.to_str().and_then(CreationStamp::of).is_some() && !files.iter().any(known) {
             let path = directory.join(&name);
             fs::remove_file(&path).map_err(at(&path))?;
         }
@@ -222,7 +223,7 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, Even
         let found = fs::metadata(&path).map_or(0, |metadata| metadata.len());
         if found < *bytes {
             let path = path.display();
-            tell(&format!(
+            notify_user(&format!(
                 "{path} ends after {found} of {bytes} bytes: TensorBoard's curves have a hole"
             ));
         } else if found > *bytes {
@@ -233,7 +234,10 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, Even
             file.set_len(*bytes).map_err(at(&path))?;
         }
     }
-    Ok(files.iter().filter_map(|file| Begun::of(&file.name)).max())
+    Ok(files
+        .iter()
+        .filter_map(|file| CreationStamp::of(&file.name))
+        .max())
 }
 
 fn now_secs() -> f64 {
@@ -301,10 +305,10 @@ struct SessionLog {
     status: i32,
 }
 
-/// `SessionLog.SessionStatus.START`.
+/// Value of `SessionLog.SessionStatus.START`.
 const SESSION_START: i32 = 1;
 
-/// Reading back what was written.
+/// Reads back what was written.
 #[cfg(test)]
 pub(super) mod testing {
     use super::*;
@@ -387,7 +391,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_written_reads_back() {
+    fn written_events_read_back() {
         let events = read_records(&sample_file(5)).unwrap();
         let what: Vec<_> = events
             .iter()
@@ -447,7 +451,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_elsewhere_is_left_alone_whatever_a_list_says() {
+    fn a_file_elsewhere_is_left_alone_even_if_listed() {
         let directory = tempfile::tempdir().unwrap();
         let outside = directory.path().join("outside");
         fs::write(&outside, "untouched").unwrap();

@@ -1,8 +1,8 @@
-//! What a training run tells about itself: `episodes.csv`, TensorBoard curves, averages over the
-//! latest episodes.
+//! Metrics of a training run: `episodes.csv`, TensorBoard curves, and averages over the latest
+//! episodes.
 //!
-//! All three are keyed by committed episode, not by time: two runs of one configuration have the
-//! same curves whatever machines flew them, and a resumed run continues where its checkpoint was
+//! All three are keyed by committed episode, not by time. So two runs of one configuration have the
+//! same curves, whatever machines flew them, and a resumed run continues where its checkpoint was
 //! taken.
 
 mod episodes;
@@ -25,15 +25,15 @@ pub use window::MovingAverage;
 
 /// Averages over the latest training episodes; part of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Windows {
-    /// Of the return.
+pub struct EpisodeWindows {
+    /// Average return.
     pub total_reward: MovingAverage,
-    /// Of the walls passed; candidates for the best snapshot are chosen by it.
+    /// Average number of walls passed; decides which snapshots are candidates.
     pub walls_passed: MovingAverage,
 }
 
-impl Windows {
-    /// Empty ones over `episodes` episodes.
+impl EpisodeWindows {
+    /// Empty averages over `episodes` episodes.
     pub fn new(episodes: usize) -> Self {
         Self {
             total_reward: MovingAverage::new(episodes),
@@ -41,42 +41,43 @@ impl Windows {
         }
     }
 
-    /// Whether they are over `episodes` episodes, see [`MovingAverage::is_over`].
+    /// `true` if both averages are over `episodes` episodes, see [`MovingAverage::is_over`].
     pub fn are_over(&self, episodes: usize) -> bool {
         self.total_reward.is_over(episodes) && self.walls_passed.is_over(episodes)
     }
 }
 
-/// How far the metrics of a run are; part of a checkpoint.
+/// Extent of a run's metrics; part of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MetricsState {
-    /// Rows in `episodes.csv`.
+    /// Number of rows in `episodes.csv`.
     pub episodes: u64,
-    /// What those rows are.
+    /// Length and checksum of those rows.
     pub episodes_extent: EpisodesExtent,
     /// Event files with their lengths.
     pub events: Vec<EventFile>,
     /// Averages over the latest episodes.
-    pub windows: Windows,
+    pub windows: EpisodeWindows,
 }
 
 impl MetricsState {
-    /// Of a new run, averaged over `window_episodes` episodes.
+    /// State of a new run, with averages over `window_episodes` episodes.
     pub fn new(window_episodes: usize) -> Self {
         Self {
             episodes: 0,
             episodes_extent: EpisodesExtent::empty(),
             events: Vec::new(),
-            windows: Windows::new(window_episodes),
+            windows: EpisodeWindows::new(window_episodes),
         }
     }
 }
 
 impl MetricsState {
-    /// Checks that `episodes.csv` of `run` is what was written when this state was taken, or more.
+    /// Checks that `episodes.csv` of `run` begins with the content it had when this state was
+    /// taken.
     ///
     /// # Errors
-    /// [`MetricsError::Episodes`] says what is wrong with it.
+    /// [`MetricsError::Episodes`] says what is wrong with the file.
     pub fn check(&self, run: &RunDirectory) -> Result<(), MetricsError> {
         Ok(self
             .episodes_extent
@@ -91,27 +92,27 @@ pub struct Metrics {
     rows: u64,
     episodes: EpisodesCsv,
     events: EventWriter,
-    windows: Windows,
+    windows: EpisodeWindows,
 }
 
-/// Why metrics cannot be written.
+/// Reason why metrics cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum MetricsError {
-    /// `episodes.csv`.
+    /// Error of `episodes.csv`.
     #[error(transparent)]
     Episodes(#[from] EpisodesError),
-    /// The event file.
+    /// Error of the event file.
     #[error(transparent)]
     Events(#[from] EventError),
 }
 
 impl Metrics {
-    /// Continues where the metrics were in `state`. What was written since is dropped, so that
-    /// nothing is told twice; of a new run that is everything.
+    /// Continues from `state`. Everything written later is dropped, so that nothing is recorded
+    /// twice; for a new run, that is everything.
     ///
     /// # Errors
-    /// [`MetricsError`] names the file; `episodes.csv` must be what was written when `state` was
-    /// taken, or more.
+    /// [`MetricsError`] names the file. `episodes.csv` must begin with the content it had when
+    /// `state` was taken.
     pub fn resume(
         run: &RunDirectory,
         state: MetricsState,
@@ -133,7 +134,7 @@ impl Metrics {
         })
     }
 
-    /// How far the metrics are. It holds of the files once they are [flushed](Metrics::flush).
+    /// Returns the present extent. It holds for the files once they are [flushed](Metrics::flush).
     pub fn state(&self) -> MetricsState {
         MetricsState {
             episodes: self.rows,
@@ -143,7 +144,7 @@ impl Metrics {
         }
     }
 
-    /// The files whose content a checkpoint of the [state](Metrics::state) counts on.
+    /// Files on whose content a checkpoint of the [state](Metrics::state) relies.
     pub fn files(&self) -> Vec<PathBuf> {
         let folder = self.run.tensorboard();
         let events = self
@@ -151,14 +152,14 @@ impl Metrics {
             .files()
             .iter()
             .map(|file| folder.join(&file.name));
-        // One that was lost can no longer be counted on.
+        // A lost file cannot be relied on.
         let events = events.filter(|path| path.exists());
         std::iter::once(self.run.episodes_csv())
             .chain(events)
             .collect()
     }
 
-    /// Takes in a committed training episode; called in episode order.
+    /// Records a committed training episode. Call in episode order.
     ///
     /// # Errors
     /// [`MetricsError`] names the file.
@@ -197,7 +198,7 @@ impl Metrics {
         )
     }
 
-    /// Appends a point to each of some curves, at training episode `episode`.
+    /// Appends a point to some curves, at training episode `episode`.
     ///
     /// # Errors
     /// [`MetricsError`] names the file.
@@ -209,8 +210,8 @@ impl Metrics {
         Ok(self.events.scalars(episode, &values)?)
     }
 
-    /// Hands everything written to the operating system; called once an epoch, and before a
-    /// checkpoint that counts on it.
+    /// Hands everything written to the operating system. Called once per epoch, and before a
+    /// checkpoint that relies on it.
     ///
     /// # Errors
     /// [`MetricsError`] names the file.
@@ -220,7 +221,7 @@ impl Metrics {
     }
 
     /// Averages over the latest episodes.
-    pub fn windows(&self) -> &Windows {
+    pub fn windows(&self) -> &EpisodeWindows {
         &self.windows
     }
 }
@@ -255,7 +256,7 @@ mod tests {
         MetricsState::new(5)
     }
 
-    /// Every point of every curve, in order of tags and steps.
+    /// Every point of every curve, ordered by tag and step.
     fn points(run: &RunDirectory) -> Vec<(String, i64, u32)> {
         let mut points = Vec::new();
         for entry in std::fs::read_dir(run.tensorboard()).unwrap() {
@@ -295,22 +296,22 @@ mod tests {
     }
 
     #[test]
-    fn an_incarnation_that_died_before_its_first_checkpoint_leaves_nothing() {
+    fn an_incarnation_killed_before_its_first_checkpoint_leaves_nothing() {
         let (_directory, run) = run();
         feed(&mut metrics(&run, new()), 0..7);
         std::fs::write(run.tensorboard().join("notes.txt"), "not ours").unwrap();
-        let mut anew = metrics(&run, new());
-        anew.flush().unwrap();
+        let mut again = metrics(&run, new());
+        again.flush().unwrap();
         assert_eq!(std::fs::read_to_string(run.episodes_csv()).unwrap(), "");
         assert_eq!(
             std::fs::read_dir(run.tensorboard()).unwrap().count(),
             2,
-            "the new file, and what is not ours"
+            "the new file, and the foreign one"
         );
     }
 
     #[test]
-    fn a_lost_event_file_is_no_reason_not_to_train() {
+    fn a_lost_event_file_does_not_prevent_training() {
         let (_directory, run) = run();
         let mut first = metrics(&run, new());
         feed(&mut first, 0..3);

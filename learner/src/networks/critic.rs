@@ -1,13 +1,13 @@
-//! The critic: the value of an action in a state, twice.
+//! The critic: estimates the value of an action in a state, twice.
 
 use skein_protocol::ACTION;
 use tch::Tensor;
 
 use super::{Layout, Linear, Parameters};
 
-/// Three fully connected layers with ReLU between. One network whose last layer gives two estimates
-/// of Q, of which the smaller one is used (paper, section 3.4), or two networks with an estimate
-/// each (arXiv:1812.05905), whose errors have less in common.
+/// Three fully connected layers with ReLU between. Either one network whose last layer gives two
+/// estimates of Q (the paper, section 3.4), or two networks with one estimate each
+/// (arXiv:1812.05905), whose errors are less correlated. The smaller estimate is the one used.
 #[derive(Debug, Clone)]
 pub struct Critic {
     networks: Vec<[Linear; 3]>,
@@ -38,7 +38,8 @@ impl Critic {
         Self { networks }
     }
 
-    /// Both estimates of Q, `[n, 2]`. `observations`: `[n, observation]`, `actions`: `[n, 2]`.
+    /// Returns both estimates of Q, `[n, 2]`. `observations`: `[n, observation]`, `actions`:
+    /// `[n, 2]`.
     pub fn forward(
         &self,
         parameters: &Parameters,
@@ -57,7 +58,7 @@ impl Critic {
         Tensor::cat(&estimates.collect::<Vec<_>>(), 1)
     }
 
-    /// The smaller estimate, `[n]`.
+    /// Returns the smaller estimate, `[n]`.
     pub fn smaller(
         &self,
         parameters: &Parameters,

@@ -7,8 +7,8 @@ use tch::Tensor;
 
 use super::{Layout, Linear, Parameters};
 
-/// Four fully connected layers with ReLU between (paper, section 3.4); the last gives mean and log
-/// standard deviation of a Gaussian, which tanh squashes into the action (arXiv:1812.05905,
+/// Four fully connected layers with ReLU between (the paper, section 3.4). The last one gives mean
+/// and log standard deviation of a Gaussian, which tanh squashes into the action (arXiv:1812.05905,
 /// appendix C).
 #[derive(Debug, Clone, Copy)]
 pub struct Policy {
@@ -18,19 +18,20 @@ pub struct Policy {
 /// Actions drawn from the policy.
 #[derive(Debug)]
 pub struct PolicySample {
-    /// `[n, 2]`, inside (-1, 1).
+    /// Actions, `[n, 2]`, inside (-1, 1).
     pub actions: Tensor,
     /// log π(action | observation) in nats, `[n]`.
     pub log_prob: Tensor,
 }
 
 impl Policy {
-    /// Describes the layers.
+    /// Describes the layers of a stochastic policy: its outputs are means and log standard
+    /// deviations.
     pub fn describe(layout: &mut Layout, observation: i64, hidden_width: i64) -> Self {
         Self::with_outputs(layout, observation, hidden_width, 2 * ACTION as i64)
     }
 
-    /// Describes the layers of a policy that gives so many numbers: the action alone, say.
+    /// Describes the layers of a policy with `outputs` outputs, such as the action alone.
     pub fn with_outputs(
         layout: &mut Layout,
         observation: i64,
@@ -50,7 +51,7 @@ impl Policy {
         }
     }
 
-    /// What the last layer gives, `[n, outputs]`.
+    /// Returns the last layer's output, `[n, outputs]`.
     pub fn output(&self, parameters: &Parameters, observations: &Tensor) -> Tensor {
         let [hidden @ .., last] = &self.layers;
         let mut features = observations.shallow_clone();
@@ -60,7 +61,7 @@ impl Policy {
         last.forward(parameters, &features)
     }
 
-    /// Mean and log standard deviation before tanh, `[n, 2]` each.
+    /// Returns mean and log standard deviation before tanh, `[n, 2]` each.
     pub fn distribution(&self, parameters: &Parameters, observations: &Tensor) -> (Tensor, Tensor) {
         let output = self.output(parameters, observations);
         let (mean, log_std) = (
@@ -73,7 +74,7 @@ impl Policy {
         )
     }
 
-    /// The action without noise, tanh of the mean, `[n, 2]`.
+    /// Returns the action without noise, tanh of the mean, `[n, 2]`.
     pub fn mode(&self, parameters: &Parameters, observations: &Tensor) -> Tensor {
         self.distribution(parameters, observations).0.tanh()
     }
@@ -94,11 +95,11 @@ impl Policy {
     }
 }
 
-/// log π of tanh(x), x = mean + std · noise, summed over the action's dimensions, `[n]`
+/// log π of tanh(x) with x = mean + std · noise, summed over the action's dimensions, `[n]`
 /// (arXiv:1812.05905, eq. 26).
 ///
-/// log(1 - tanh²x) is taken as 2 (ln 2 - x - softplus(-2x)): exact where 1 - tanh²x would have
-/// rounded to zero.
+/// log(1 - tanh²x) is computed as 2 (ln 2 - x - softplus(-2x)): exact even where 1 - tanh²x rounds
+/// to zero.
 fn squashed_log_prob(before_tanh: &Tensor, log_std: &Tensor, noise: &Tensor) -> Tensor {
     let gaussian = noise.square() * -0.5 - log_std - 0.5 * (2.0 * PI).ln();
     let correction = (LN_2 - before_tanh - (before_tanh * -2.0).softplus()) * 2.0;
@@ -109,7 +110,7 @@ fn squashed_log_prob(before_tanh: &Tensor, log_std: &Tensor, noise: &Tensor) -> 
 mod tests {
     use super::*;
 
-    /// log π of tanh(mean + exp(log_std) noise), by definition and in f64.
+    /// log π of tanh(mean + exp(log_std) noise), from its definition and in f64.
     fn by_definition(mean: f64, log_std: f64, noise: f64) -> f64 {
         let x = mean + log_std.exp() * noise;
         let density = (-0.5 * noise * noise).exp() / (log_std.exp() * (2.0 * PI).sqrt());
@@ -137,7 +138,7 @@ mod tests {
 
     #[test]
     fn log_prob_stays_exact_where_tanh_saturates() {
-        // At x = 20 the action is 1.0 to the last bit of f32; log(1 - tanh²x) is 2 ln 2 - 2x up to
+        // At x = 20 the action is 1.0 to the last bit of f32. log(1 - tanh²x) is 2 ln 2 - 2x up to
         // e^-40.
         let (x, log_std, noise) = (row([20.0, -20.0]), row([0.0, 0.0]), row([0.0, 0.0]));
         let computed = squashed_log_prob(&x, &log_std, &noise).double_value(&[0]);

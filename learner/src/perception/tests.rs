@@ -1,4 +1,4 @@
-//! What moves the encoder and what does not, and that images are learned from.
+//! Which loss moves the encoder, and that images are learned from.
 
 use skein_kernels::Team;
 use skein_protocol::IMAGE_PIXELS;
@@ -15,9 +15,9 @@ use crate::sac::samples::{Transitions, shade};
 use crate::state::TensorValues;
 
 const ALGORITHMS: [AlgorithmName; 2] = [AlgorithmName::Sac, AlgorithmName::Td3];
-/// Numbers of the code.
+/// Length of the latent code.
 const LATENT: usize = 16;
-/// Numbers in an observation: velocity beside the code.
+/// Width of an observation: velocity beside the code.
 const OBSERVATION: usize = LATENT + 2;
 
 fn config(algorithm: AlgorithmName) -> Config {
@@ -47,7 +47,7 @@ fn update(
         .map(|_| ())
 }
 
-/// Transitions that go on, so that what comes after counts.
+/// Transitions of which most are not terminal, so that the next state matters.
 fn random(rows: usize, seed: u64) -> Transitions {
     let mut noise = Noise::new(seed);
     let mut draw = || {
@@ -62,7 +62,7 @@ fn random(rows: usize, seed: u64) -> Transitions {
     }
 }
 
-/// The parameters of this name.
+/// The parameters under this name.
 fn part(algorithm: &mut dyn Algorithm, name: &str) -> Vec<f32> {
     let parts = algorithm.named_tensors();
     let part = parts.into_iter().find(|part| part.name.ends_with(name));
@@ -113,7 +113,8 @@ fn the_critics_loss_moves_every_tensor_of_the_encoder_and_its_target_follows() {
                     .fold(0.0, f32::max)
             };
             let (learned, followed) = (moved(&before, &after), moved(&target_before, target_after));
-            // Adam's first step is as long as its rate, and the target goes a small share of that.
+            // Adam's first step is as long as its rate; the target moves by a small fraction of
+            // that.
             assert!(learned > 1e-4, "{name}: {} stood still", tensor.name);
             assert!(
                 followed > 0.0 && followed < 0.02 * learned,
@@ -172,7 +173,7 @@ fn the_policys_loss_moves_the_policy_and_leaves_the_encoder_alone() {
 }
 
 #[test]
-fn what_the_policy_sees_carries_no_gradient_and_what_the_critic_judges_does() {
+fn policy_inputs_carry_no_gradient_and_critic_inputs_do() {
     crate::device::use_threads(1);
     let mut layout = Layout::default();
     let perception = Perception::describe(&mut layout, LATENT);
@@ -183,10 +184,10 @@ fn what_the_policy_sees_carries_no_gradient_and_what_the_critic_judges_does() {
         from_image: Some(LATENT),
         ..algorithm::Inputs::same(OBSERVATION)
     };
-    for ahead in [LooksAhead::Learned, LooksAhead::Target] {
-        let mut batch = Batch::new(seen.columns(), inputs, Device::Cpu);
+    for ahead in [NextStateEncoder::Learned, NextStateEncoder::Target] {
+        let mut batch = TensorBatch::new(seen.columns(), inputs, Device::Cpu);
         let (now, next) = (batch.observations.copy(), batch.next_observations.copy());
-        perception.look(&mut batch, &critic, &target, ahead);
+        perception.encode(&mut batch, &critic, &target, ahead);
         let carry = [
             &batch.states,
             &batch.observations,
@@ -204,7 +205,7 @@ fn what_the_policy_sees_carries_no_gradient_and_what_the_critic_judges_does() {
         );
         assert_eq!(
             batch.next_observations == batch.next_states,
-            ahead == LooksAhead::Target,
+            ahead == NextStateEncoder::Target,
             "two encoders see two things"
         );
         for (seen, flown) in [
@@ -223,7 +224,7 @@ fn what_the_policy_sees_carries_no_gradient_and_what_the_critic_judges_does() {
 }
 
 #[test]
-fn what_actors_saw_when_they_flew_changes_nothing() {
+fn latent_codes_from_the_flight_change_nothing() {
     for name in ALGORITHMS {
         let learned = |code: f32| {
             let mut seen = random(4, 1);
@@ -241,7 +242,7 @@ fn what_actors_saw_when_they_flew_changes_nothing() {
 }
 
 #[test]
-fn a_restored_algorithm_goes_on_bit_for_bit() {
+fn a_restored_algorithm_continues_bit_for_bit() {
     for name in ALGORITHMS {
         let config = config(name);
         let mut algorithm = new(&config);
@@ -296,7 +297,7 @@ fn a_minibatch_without_images_is_a_mistake() {
 }
 
 #[test]
-fn what_can_only_be_seen_in_the_image_is_learned() {
+fn a_reward_that_only_the_image_shows_is_learned() {
     for name in ALGORITHMS {
         let mut config = config(name);
         (
@@ -307,7 +308,7 @@ fn what_can_only_be_seen_in_the_image_is_learned() {
         let (mut data, mut noise) = (Noise::new(1), Noise::new(2));
         let losses: Vec<f32> = (0..120)
             .map(|_| {
-                let seen = Transitions::looking(OBSERVATION, 8, &mut data);
+                let seen = Transitions::one_step_task_in_images(OBSERVATION, 8, &mut data);
                 let metrics = algorithm
                     .update(&mut Team::new(1), seen.columns(), &mut noise)
                     .unwrap();
@@ -326,7 +327,7 @@ fn what_can_only_be_seen_in_the_image_is_learned() {
     }
 }
 
-/// Prints what an update takes of a processor: `cargo test --release -p skein-learner -- --ignored
+/// Prints the processor time of an update: `cargo test --release -p skein-learner -- --ignored
 /// --nocapture update_from_64_images`.
 #[test]
 #[ignore = "a measurement, not a claim"]

@@ -1,13 +1,15 @@
-//! Depth images of stored transitions, kept while the VAE is trained, or for ever where the policy
-//! learns from them.
+//! Depth images of stored transitions, kept while the VAE is trained, or for the whole run where
+//! the policy learns from them.
 //!
-//! An episode's images are taken over in the block the episode brought them in, not copied. Images
-//! are numbered in order of arrival, so the image of a step's next observation is the following
-//! number, the closing image included. For the VAE nothing is dropped before the end: a transition
-//! that the ring overwrites leaves its images behind as training material, and no row can ever
-//! point at an image of another episode; what bounds the store is that the VAE is frozen after a
-//! configured number of steps. For a policy, images that no row needs are [swept
-//! out](ImageStore::keep_only) now and then, and the others numbered anew, in the same order.
+//! An episode's images are taken over as the block they arrived in, without a copy. Images are
+//! numbered in order of arrival, so the next observation's image has the following number, the
+//! closing image included.
+//!
+//! For the VAE, nothing is dropped before the end. A transition that the ring overwrites leaves its
+//! images behind as training material, and no row can ever point at another episode's image. The
+//! store is bounded because the VAE is frozen after a configured number of steps. For a policy,
+//! images that no row needs are [dropped](ImageStore::keep_only) now and then, and the others are
+//! renumbered in the same order.
 
 use std::sync::Arc;
 
@@ -17,7 +19,7 @@ use skein_protocol::{IMAGE_PIXELS, LatentCode};
 /// Images, by number.
 #[derive(Debug)]
 pub(super) struct ImageStore {
-    /// One block an episode, shared with a checkpoint being written: `[steps + 1, 72, 128]`.
+    /// One block per episode, shared with a checkpoint being written: `[steps + 1, 72, 128]`.
     episodes: Vec<Arc<Vec<u8>>>,
     /// Number of each block's first image.
     first: Vec<u32>,
@@ -26,7 +28,7 @@ pub(super) struct ImageStore {
 }
 
 impl ImageStore {
-    /// An empty store for at most `limit` images.
+    /// Creates an empty store for at most `limit` images.
     pub(super) fn new(limit: usize) -> Self {
         // Numbers are 32 bits; the configuration's largest limit is far below.
         Self {
@@ -37,22 +39,22 @@ impl ImageStore {
         }
     }
 
-    /// Images stored.
+    /// Number of images stored.
     pub(super) fn len(&self) -> usize {
         self.len
     }
 
-    /// Images at most.
+    /// Largest number of images.
     pub(super) fn limit(&self) -> usize {
         self.limit
     }
 
-    /// Whether `images` more have room.
+    /// `true` if there is room for `images` more.
     pub(super) fn has_room(&self, images: usize) -> bool {
         self.len + images <= self.limit
     }
 
-    /// Takes over an episode's images; returns the number of the first. The caller made sure of
+    /// Takes over an episode's images; returns the number of the first one. The caller has checked
     /// [`ImageStore::has_room`].
     pub(super) fn push(&mut self, images: Arc<Vec<u8>>) -> u32 {
         let first = self.len as u32;
@@ -63,7 +65,7 @@ impl ImageStore {
     }
 
     /// Appends images to the last episode's block; returns the number of the image before the first
-    /// of them. The caller made sure of [`ImageStore::has_room`], and that there is a block.
+    /// of them. The caller has checked [`ImageStore::has_room`], and that there is a block.
     pub(super) fn extend(&mut self, images: &[u8]) -> u32 {
         let before = self.len as u32 - 1;
         self.len += images.len() / IMAGE_PIXELS;
@@ -75,11 +77,11 @@ impl ImageStore {
         before
     }
 
-    /// Gives up all images but those `needed`, `[len]`; returns the new number of each image, one
-    /// that means nothing of those that are gone.
+    /// Drops all images except those `needed`, `[len]`. Returns the new number of each image; for a
+    /// dropped image it has no meaning.
     ///
-    /// Of an episode that is needed in part, the needed images are copied into a block of their
-    /// own. Two neighbours that are kept remain neighbours.
+    /// If an episode is needed in part, its needed images are copied into a new block. Neighbours
+    /// that both stay remain neighbours.
     pub(super) fn keep_only(&mut self, needed: &[bool]) -> Vec<u32> {
         let mut numbers = Vec::with_capacity(needed.len());
         let (episodes, first) = (
@@ -114,7 +116,7 @@ impl ImageStore {
         &self.episodes
     }
 
-    /// Draws `count` images uniformly with replacement into `into`, `[count, 72, 128]`.
+    /// Samples `count` images uniformly with replacement into `into`, `[count, 72, 128]`.
     pub(super) fn sample(&self, rng: &mut impl Rng, count: usize, into: &mut Vec<u8>) {
         into.clear();
         for _ in 0..count {
@@ -122,9 +124,9 @@ impl ImageStore {
         }
     }
 
-    /// The latent code of every image, by number. `encode` sees `chunk` images at a time, the last
-    /// time what remains, whatever the episodes' lengths: a store restored from a checkpoint is
-    /// encoded in the same pieces.
+    /// Returns the latent code of every image, by number. `encode` receives `chunk` images at a
+    /// time, whatever the episodes' lengths, and the rest last. So a store restored from a
+    /// checkpoint is encoded in the same pieces.
     pub(super) fn encode<E>(
         &self,
         chunk: usize,
@@ -154,7 +156,7 @@ impl ImageStore {
         Ok(latents)
     }
 
-    /// The number of the first image of the episode that image `number` is of.
+    /// Number of the first image of the episode that image `number` belongs to.
     pub(super) fn first_of_episode(&self, number: u32) -> u32 {
         self.first[self.episode_of(number)]
     }

@@ -1,17 +1,18 @@
-//! The split replay buffer (paper, section 3.5).
+//! The split replay buffer (the paper, section 3.5).
 //!
-//! Successful avoidance is rare in the beginning and would drown among everything else, so it has a
-//! part of its own with a fixed share of every minibatch. (With a share of zero there is one part
-//! for all, the ordinary buffer.) Each part is a [`ring`] of self-contained rows. Whole episodes go
-//! in, in episode order, or their segments, and nothing here is random but what the caller's seeded
-//! generator draws: the content is a function of the episodes, and a minibatch one of content and
-//! seed.
+//! Successful avoidance is rare at the beginning and would be lost among everything else. So it has
+//! a part of its own, with a fixed share of every minibatch. (With a share of zero there is only
+//! one part, the ordinary buffer.) Each part is a [`ring`] of self-contained rows.
 //!
-//! While the VAE is trained, the depth [`images`] of stored transitions are kept: the VAE learns
-//! from them, and when it is frozen the latent codes of all rows, each made by the encoder of its
-//! day, are made anew with the final one. Then the images go. Where the encoder is trained end to
-//! end they stay: a minibatch then holds the images of its transitions, as long as the transitions
-//! are stored.
+//! Whole episodes or their segments are inserted, in episode order. The only randomness is the
+//! caller's seeded generator. So the content is a function of the episodes, and a minibatch is a
+//! function of content and seed.
+//!
+//! While the VAE is trained, the depth [`images`] of stored transitions are kept, because the VAE
+//! learns from them. Each row's latent code comes from the encoder of its time; when the VAE is
+//! frozen, all codes are computed again with the final encoder, and the images are dropped. Where
+//! the encoder is trained end to end, images stay as long as their transitions, and a minibatch
+//! contains them.
 
 mod images;
 mod ring;
@@ -27,12 +28,12 @@ use skein_protocol::config::{Config, EncoderTraining, ReplaySection, View};
 use skein_protocol::ids::EpisodeId;
 use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode};
 
-use crate::episode::{CommittedEpisode, EpisodeFault};
+use crate::episode::{CommittedEpisode, MalformedEpisode};
 use images::ImageStore;
 use ring::{Ring, RowLayout};
 
 pub use ring::RingState;
-pub use state::{ReplayState, RestoreError};
+pub use state::{ReplayRestoreError, ReplayState};
 use success::success_steps;
 
 /// The split replay buffer.
@@ -42,86 +43,89 @@ pub struct Replay {
     view: View,
     success: Ring,
     regular: Ring,
-    /// Until the VAE is frozen; for ever where the policy learns from them.
-    images: Option<ImageStore>,
-    /// What learns from the images.
-    encoder: EncoderTraining,
-    /// Images from which on those that no transition needs are looked for, where a policy learns
+    /// Depth images: kept until the VAE is frozen, or for the whole run where the policy learns
     /// from them.
+    images: Option<ImageStore>,
+    /// Training of the encoder, hence the use of the images.
+    encoder: EncoderTraining,
+    /// Number of images above which unneeded ones are searched for, where a policy learns from
+    /// images.
     sweep_above: usize,
-    /// The episode that was stored last, and how many steps of it: what a later segment must
-    /// follow. In no checkpoint, as those lie between episodes.
+    /// Episode stored last and its number of steps so far, which a later segment must follow.
+    /// Checkpoints do not contain it: they lie between episodes.
     last: Option<(EpisodeId, usize)>,
 }
 
 /// A minibatch of transitions in flat buffers that are reused from draw to draw.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Minibatch {
-    /// `[batch, observation]`.
+    /// Observations before the action, `[batch, observation]`.
     pub observations: Vec<f32>,
-    /// `[batch, 2]`.
+    /// Actions, `[batch, 2]`.
     pub actions: Vec<f32>,
-    /// `[batch]`.
+    /// Rewards, `[batch]`.
     pub rewards: Vec<f32>,
-    /// `[batch, observation]`.
+    /// Observations after the action, `[batch, observation]`.
     pub next_observations: Vec<f32>,
-    /// What the critic alone sees, `[batch, TRUE_STATE]`; empty if that is the observation.
+    /// Critic inputs before the action, `[batch, TRUE_STATE]`; empty if the critic sees the
+    /// observation.
     pub true_states: Vec<f32>,
-    /// The same after the action.
+    /// Critic inputs after the action, likewise.
     pub next_true_states: Vec<f32>,
-    /// `[batch]`: 1 where the episode ended in a state without a future, else 0. An episode's last
-    /// step before the time limit is 0: it bootstraps.
+    /// 1 where the episode ended in a state without a future, else 0; `[batch]`. The last step of a
+    /// truncated episode has 0: it bootstraps.
     pub terminated: Vec<f32>,
-    /// Depth images of the observations, `[batch, 72, 128]`, where the encoder is trained end to
-    /// end; else empty.
+    /// Depth images before the action, `[batch, 72, 128]`, where the encoder is trained end to end;
+    /// else empty.
     pub images: Vec<u8>,
-    /// Those of the next observations.
+    /// Depth images after the action, likewise.
     pub next_images: Vec<u8>,
-    /// Slots drawn, before any row is touched: the loads of many rows are then under way at one
-    /// time.
+    /// Slots drawn before any row is read, so that the loads of many rows overlap.
     slots: Vec<usize>,
 }
 
-/// Why an episode cannot be stored. Nothing of it is.
+/// Reason why an episode cannot be stored. Nothing of it is stored then.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InsertError {
-    /// Its parts do not belong together.
+    /// The episode's parts do not fit together.
     #[error(transparent)]
-    Fault(#[from] EpisodeFault),
-    /// It is a segment, and what was stored last is not what was flown before it.
+    Fault(#[from] MalformedEpisode),
+    /// A segment does not follow what was stored last.
     #[error(
-        "a segment of episode {episode} from its step {first_step} on cannot follow what was stored before it"
+        "a segment of episode {episode} from its step {first_step} on \
+         does not follow what was stored before it"
     )]
     OutOfPlace {
-        /// The episode.
+        /// Number of the episode.
         episode: EpisodeId,
-        /// Steps flown before.
+        /// Steps of the episode before the segment.
         first_step: usize,
     },
-    /// It came without depth images while they are learned from.
+    /// The episode has no depth images, but they are needed.
     #[error("episode {episode} has no depth images, but images are still learned from")]
     NoImages {
-        /// The episode.
+        /// Number of the episode.
         episode: EpisodeId,
     },
-    /// The images have no room.
+    /// The images exceed the store's limit.
     #[error(
-        "{found} depth images of episode {episode} exceed the {limit} that can be needed, {held} of them held"
+        "episode {episode} brings {found} depth images to the {held} stored, \
+         more than the {limit} that can ever be needed"
     )]
     TooManyImages {
-        /// The episode.
+        /// Number of the episode.
         episode: EpisodeId,
-        /// Its images.
+        /// Number of its images.
         found: usize,
-        /// Images held.
+        /// Number of images stored.
         held: usize,
-        /// Images that may be held.
+        /// Number of images that may be stored.
         limit: usize,
     },
 }
 
 impl Replay {
-    /// An empty buffer for the run configured by `config`.
+    /// Creates an empty buffer for the run that `config` describes.
     pub fn new(config: &Config) -> Self {
         let view = config.view();
         let layout = RowLayout::of(config);
@@ -138,32 +142,32 @@ impl Replay {
         }
     }
 
-    /// Transitions held in both parts.
+    /// Number of transitions in both parts.
     pub fn len(&self) -> usize {
         self.success.len() + self.regular.len()
     }
 
-    /// Whether there is nothing to draw from.
+    /// `true` if there is nothing to sample from.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Transitions held in the success part.
+    /// Number of transitions in the success part.
     pub fn success_len(&self) -> usize {
         self.success.len()
     }
 
-    /// Depth images held; `None` once the VAE is frozen.
+    /// Number of depth images stored; `None` once the VAE is frozen.
     pub fn image_count(&self) -> Option<usize> {
         self.images.as_ref().map(ImageStore::len)
     }
 
-    /// Stores all transitions of `episode`, in order, each in the part the success rule says. Its
-    /// depth images are taken over while they are learned from, and dropped after. Of a later
-    /// segment the first image is the last one of the segment before, and is not stored twice.
+    /// Stores all transitions of `episode`, in order, each in the part that the success rule names.
+    /// Takes over the depth images while they are learned from, and drops them later. A later
+    /// segment's first image equals the last one of the segment before, and is not stored twice.
     ///
     /// # Errors
-    /// [`InsertError`]; the buffer is as before.
+    /// [`InsertError`]; the buffer is unchanged then.
     pub fn insert(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
         episode.check()?;
         self.check_place(&episode)?;
@@ -189,7 +193,7 @@ impl Replay {
         Ok(())
     }
 
-    /// Whether a later segment follows the one before it.
+    /// Checks that a later segment follows the one before it.
     fn check_place(&self, episode: &CommittedEpisode) -> Result<(), InsertError> {
         let CommittedEpisode {
             episode,
@@ -205,15 +209,15 @@ impl Replay {
         }
     }
 
-    /// Draws `count` transitions uniformly with replacement from each part in the configured ratio;
-    /// all from the other part while one is empty.
+    /// Samples `count` transitions uniformly with replacement, from each part in the configured
+    /// ratio. While one part is empty, all come from the other.
     ///
     /// # Panics
-    /// When the buffer [is empty](Replay::is_empty): the warm-up is over before anything is drawn.
+    /// When the buffer [is empty](Replay::is_empty): the warm-up ends before anything is sampled.
     pub fn sample(&self, rng: &mut impl Rng, count: usize, into: &mut Minibatch) {
         assert!(
             !self.is_empty(),
-            "nothing can be drawn from an empty replay buffer"
+            "cannot sample from an empty replay buffer"
         );
         let from_success = match (self.success.len(), self.regular.len()) {
             (0, _) => 0,
@@ -229,31 +233,30 @@ impl Replay {
         into.gather(&self.regular, images, rng, count - from_success);
     }
 
-    /// Draws `count` depth images uniformly with replacement, `[count, 72, 128]`, for a step of the
-    /// VAE.
+    /// Samples `count` depth images uniformly with replacement, `[count, 72, 128]`, for a VAE step.
     ///
     /// # Panics
-    /// When there are none: none were inserted yet, or the VAE is frozen.
+    /// When there are no images: none were inserted yet, or the VAE is frozen.
     pub fn sample_images(&self, rng: &mut impl Rng, count: usize, into: &mut Vec<u8>) {
         let images = self.images.as_ref().filter(|images| images.len() > 0);
         images
-            .expect("the VAE is trained only before it is frozen and after episodes came in")
+            .expect("the VAE is trained only after episodes arrive and before it is frozen")
             .sample(rng, count, into);
     }
 
-    /// Ends the VAE's training: codes stay what they are, and the images are dropped.
+    /// Ends the VAE's training: codes stay as they are, and the images are dropped.
     pub fn freeze(&mut self) {
         self.images = None;
         self.success.forget_images();
         self.regular.forget_images();
     }
 
-    /// Makes every stored latent code anew by `encode`, which turns up to `chunk` images, `[n, 72,
-    /// 128]`, into as many codes. Does nothing if the VAE is frozen already.
+    /// Recomputes every stored latent code with `encode`, which maps up to `chunk` images,
+    /// `[n, 72, 128]`, to as many codes. Does nothing once the VAE is frozen.
     ///
     /// # Errors
-    /// The first that `encode` returns; the buffer is as before.
-    pub fn renew_latents<E>(
+    /// The first error of `encode`; the buffer is unchanged then.
+    pub fn recode_latents<E>(
         &mut self,
         chunk: usize,
         encode: impl FnMut(&[u8]) -> Result<Vec<LatentCode>, E>,
@@ -267,7 +270,8 @@ impl Replay {
         Ok(())
     }
 
-    /// Hands the episode's images to the store; the number of the first, if images are stored.
+    /// Hands the episode's images to the store; returns the number of the first one, if images are
+    /// stored.
     fn take_images(&mut self, episode: &mut CommittedEpisode) -> Result<Option<u32>, InsertError> {
         if self.images.is_none() {
             return Ok(None);
@@ -298,10 +302,10 @@ impl Replay {
         }))
     }
 
-    /// Gives up the images of transitions that are overwritten, if a policy learns from images and
-    /// there would be too many with so many more. When that is follows from how many are held, so
-    /// that a buffer restored from a checkpoint does the same. The newest transition's images stay:
-    /// a segment may follow it.
+    /// Drops the images of overwritten transitions, if a policy learns from images and `more` would
+    /// exceed the threshold. The decision depends only on the number stored, so a buffer restored
+    /// from a checkpoint decides alike. The newest transition's images stay: a segment may follow
+    /// it.
     fn sweep_images(&mut self, more: usize) {
         let Some(store) = &mut self.images else {
             return;
@@ -332,8 +336,7 @@ impl Minibatch {
         self.next_images.clear();
     }
 
-    /// Appends `count` rows drawn from `ring`, with their `images` if there are any to be learned
-    /// from.
+    /// Appends `count` rows drawn from `ring`, with their `images` if the policy learns from them.
     fn gather(
         &mut self,
         ring: &Ring,
@@ -364,8 +367,8 @@ impl Minibatch {
     }
 }
 
-/// Capacities of the success and the regular part; each has room for one transition at least,
-/// unless there is to be no success part.
+/// Capacities of the success and the regular part. Each has room for at least one transition,
+/// unless the success share is zero.
 fn capacities(section: &ReplaySection) -> (usize, usize) {
     if section.success_share == 0.0 {
         return (0, section.capacity);
@@ -375,10 +378,12 @@ fn capacities(section: &ReplaySection) -> (usize, usize) {
     (success, section.capacity - success)
 }
 
-/// Images that can be needed. The VAE's training can leave behind: before the epoch in which it is
-/// frozen, fewer than `vae.train_steps` steps were flown, with at most as many closing images; then
-/// come the episodes of one epoch. Their mirror images come on top. A policy needs those of the
-/// transitions held, two each at most, and of the episode that comes in.
+/// Largest number of images that can be needed.
+///
+/// For the VAE: before the epoch that freezes it, fewer than `vae.train_steps` steps were flown,
+/// with at most as many closing images; then the episodes of one epoch are added. For a policy: at
+/// most two images per stored transition, and those of the arriving episodes. Mirror images are
+/// counted too.
 fn image_limit(config: &Config) -> usize {
     let steps = match config.learning.encoder {
         EncoderTraining::Vae => config.vae.train_steps,
@@ -387,7 +392,7 @@ fn image_limit(config: &Config) -> usize {
     2 * steps * config.learning.times_stored() + epoch_images(config)
 }
 
-/// Images of an epoch's episodes at most.
+/// Largest number of images in an epoch's episodes.
 fn epoch_images(config: &Config) -> usize {
     config.learning.episodes_per_epoch as usize
         * config.transport.max_records_per_episode

@@ -1,15 +1,15 @@
-//! What counts as success experience.
+//! The rule for success experience.
 //!
 //! The paper keeps "experience of avoiding an obstacle" apart without saying where it begins and
-//! ends, so the rule is the configuration's. An episode is inserted whole, hence the steps that led
-//! to a level-up are known when they are sorted into the two parts.
+//! ends, so the configuration decides. Episodes are inserted whole, hence the steps before a
+//! level-up are known when they are sorted into the two parts.
 
 use skein_protocol::config::{ReplaySection, SuccessRule};
 
-/// Which steps of an episode are success experience, `[steps]`.
+/// Marks the steps of an episode that are success experience, `[steps]`.
 ///
-/// `level_up`, `[steps]`: a wall was crossed or the destination reached in this step. None is where
-/// success experience has no part of its own.
+/// `level_up`, `[steps]`: `true` where the step crossed a wall or reached the destination. No step
+/// is marked where success experience has no part of its own.
 pub(super) fn success_steps(level_up: &[bool], section: &ReplaySection) -> Vec<bool> {
     if section.success_share == 0.0 {
         return vec![false; level_up.len()];

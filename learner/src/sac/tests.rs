@@ -1,4 +1,4 @@
-//! The whole update, on both engines: exactness, determinism, and that it learns.
+//! The whole update on both engines: exactness, determinism, and that it learns.
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::config::{Engine, Observation, SacSection, View};
@@ -14,7 +14,7 @@ use crate::networks::{Layout, Parameters, Policy};
 use crate::noise::Noise;
 use crate::state::{NamedTensor, TensorValues};
 
-/// Numbers in an observation.
+/// Width of an observation.
 const OBSERVATION: usize = 32;
 pub(super) const ENGINES: [Engine; 2] = [Engine::Native, Engine::Libtorch];
 
@@ -51,7 +51,7 @@ fn train(sac: &mut dyn Algorithm, updates: usize, seed: u64) -> Vec<Metrics> {
         .map(|_| {
             update(
                 sac,
-                &Transitions::guessing(OBSERVATION, 32, &mut data),
+                &Transitions::one_step_task(OBSERVATION, 32, &mut data),
                 &mut noise,
             )
             .unwrap()
@@ -69,7 +69,7 @@ fn published(sac: &dyn Algorithm) -> Vec<f32> {
     published
 }
 
-/// What the published policy does without noise, `[n, 2]`.
+/// The published policy's action without noise, `[n, 2]`.
 fn mode(sac: &dyn Algorithm, section: &SacSection, observations: &[f32]) -> Vec<f32> {
     let mut layout = Layout::default();
     let policy = Policy::describe(&mut layout, OBSERVATION as i64, section.hidden_width as i64);
@@ -125,7 +125,7 @@ fn an_update_that_is_not_finite_changes_nothing() {
         let mut sac = sac(engine, &small(), 1);
         train(&mut *sac, 3, 5);
         let before = state(&mut *sac);
-        let sound = Transitions::guessing(OBSERVATION, 32, &mut Noise::new(1));
+        let sound = Transitions::one_step_task(OBSERVATION, 32, &mut Noise::new(1));
         let mut refused = |damage: fn(&mut Transitions)| {
             let mut damaged = sound.clone();
             damage(&mut damaged);
@@ -146,20 +146,20 @@ fn an_update_that_is_not_finite_changes_nothing() {
             refused(|batch| batch.observations[7] = f32::NAN),
             of("critic loss")
         );
-        // Squared, they are still numbers; the square of a gradient's length no longer is.
+        // Their squares are still finite; the gradient's squared norm is not.
         let UpdateError::NonFinite { tensor, .. } = refused(|batch| batch.rewards.fill(1.5e19));
         assert!(tensor.starts_with("critic"), "{engine}: {tensor}");
     }
 }
 
 #[test]
-fn truncated_episode_still_bootstraps() {
+fn a_truncated_episode_still_bootstraps() {
     for engine in ENGINES {
-        // What the critic learns of one transition, the last of its episode, when the state after
-        // it is another.
+        // Metrics after learning from one transition, the last of its episode, for a given next
+        // state.
         let learned = |terminated: f32, next: f32| {
             let mut sac = sac(engine, &small(), 1);
-            let mut last = Transitions::guessing(OBSERVATION, 1, &mut Noise::new(1));
+            let mut last = Transitions::one_step_task(OBSERVATION, 1, &mut Noise::new(1));
             last.terminated[0] = terminated;
             last.next_observations.fill(next);
             let metrics = update(&mut *sac, &last, &mut Noise::new(2)).unwrap();
@@ -218,7 +218,7 @@ fn the_right_action_is_learned_in_a_one_step_task() {
         for seed in 1..=3 {
             let mut sac = sac(engine, &section, seed);
             train(&mut *sac, 600, seed);
-            let test = Transitions::guessing(OBSERVATION, 256, &mut Noise::new(seed + 100));
+            let test = Transitions::one_step_task(OBSERVATION, 256, &mut Noise::new(seed + 100));
             let actions = mode(&*sac, &section, &test.observations);
             let observations = test.observations.chunks_exact(OBSERVATION);
             let squared = observations

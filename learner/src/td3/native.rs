@@ -16,7 +16,7 @@ use crate::networks::native::{
 };
 use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
 /// Policy and critic, the targets that follow them slowly, and their optimizers.
 #[derive(Debug)]
@@ -208,11 +208,11 @@ impl NativeTd3 {
             actions: numbers(rows, ACTION),
             joined: numbers(rows, self.inputs.critic + ACTION),
             target_values: numbers(rows, ESTIMATES),
-            critic: self.critic.places(rows),
-            critic_grad: self.critic.places(rows),
+            critic: self.critic.allocate(rows),
+            critic_grad: self.critic.allocate(rows),
             value_grad: numbers(rows, ESTIMATES),
-            policy: self.policy.places(rows),
-            policy_grad: self.policy.places(rows),
+            policy: self.policy.allocate(rows),
+            policy_grad: self.policy.allocate(rows),
         }
     }
 
@@ -291,7 +291,7 @@ impl Algorithm for NativeTd3 {
 }
 
 impl Stateful for NativeTd3 {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let mut parts = self
             .policy_parameters
             .parts("td3.policy.parameters", "td3.policy.adam");
@@ -303,7 +303,7 @@ impl Stateful for NativeTd3 {
             ("td3.target_policy.parameters", &mut self.target_policy),
             ("td3.target_critic.parameters", &mut self.target_critic),
         ];
-        parts.extend(targets.map(|(name, numbers)| (name.to_owned(), Part::Numbers(numbers))));
+        parts.extend(targets.map(|(name, numbers)| (name.to_owned(), StatePart::Numbers(numbers))));
         parts
     }
 }

@@ -1,5 +1,6 @@
-//! One TD3 update with libtorch's automatic gradients, in reading order: the reference, the way to
-//! a CUDA device, and to policies that learn from images.
+//! One TD3 update with libtorch's automatic gradients, in reading order.
+//!
+//! Equation numbers are those of arXiv:1802.09477.
 
 use skein_kernels::Team;
 use skein_protocol::ACTION;
@@ -8,17 +9,17 @@ use skein_protocol::seeds::{Purpose, derive};
 use tch::{Device, Tensor, no_grad_guard};
 
 use crate::algorithm::{Algorithm, Columns, Inputs};
-use crate::batch::Batch;
+use crate::batch::TensorBatch;
 use crate::error::{UpdateError, finite};
 use crate::metrics::Scalar;
 use crate::networks::{Critic, Layout, Parameters, Policy};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
-use crate::perception::{LooksAhead, Perception};
+use crate::perception::{NextStateEncoder, Perception};
 use crate::sac::losses::critic_loss;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
-/// Policy and critic, the targets that follow them slowly, and their optimizers.
+/// Policy and critic, their target networks, and their optimizers.
 #[derive(Debug)]
 pub struct TorchTd3 {
     inputs: Inputs,
@@ -28,7 +29,7 @@ pub struct TorchTd3 {
     pub(super) policy_parameters: Parameters,
     policy_optimizer: Adam,
     pub(super) target_policy: Parameters,
-    /// Where the encoder is trained end to end: its parameters lie before the critic's.
+    /// Encoder trained end to end, if there is one: its parameters lie before the critic's.
     perception: Option<Perception>,
     critic: Critic,
     pub(super) critic_parameters: Parameters,
@@ -37,7 +38,7 @@ pub struct TorchTd3 {
 }
 
 impl TorchTd3 {
-    /// Untrained networks whose parameters depend on the run's seed alone.
+    /// Returns untrained networks; their parameters depend on the run's seed alone.
     pub fn new(section: &Td3Section, inputs: Inputs, run_seed: u64, device: Device) -> Self {
         let width = section.hidden_width as i64;
         let mut layout = Layout::default();
@@ -78,9 +79,10 @@ impl TorchTd3 {
         }
     }
 
-    /// r + γ (1 - terminated) min Q̄(s', a'), where a' is what the target policy would do, give or
-    /// take some noise (eq. 14 and 15), `[n]`.
-    fn targets(&self, batch: &Batch, noise: &mut Noise) -> Tensor {
+    /// Bellman targets, `[n]` (eq. 14 and 15): r + γ (1 - terminated) min Q̄(s', a').
+    ///
+    /// a' is the target policy's action plus clipped noise.
+    fn targets(&self, batch: &TensorBatch, noise: &mut Noise) -> Tensor {
         let Td3Section {
             discount,
             target_noise,
@@ -101,8 +103,8 @@ impl TorchTd3 {
         &batch.rewards + continues * values * discount
     }
 
-    /// -Q₁ of what the policy would do (eq. 1), a scalar.
-    fn policy_loss(&self, batch: &Batch) -> Tensor {
+    /// Policy loss, a scalar: the mean of -Q₁ of the policy's actions (eq. 1).
+    fn policy_loss(&self, batch: &TensorBatch) -> Tensor {
         let actions = self
             .policy
             .output(&self.policy_parameters, &batch.observations)
@@ -124,10 +126,10 @@ impl Algorithm for TorchTd3 {
         noise: &mut Noise,
     ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
         let number = self.updates() + 1;
-        let mut batch = Batch::new(columns, self.inputs, self.device);
+        let mut batch = TensorBatch::new(columns, self.inputs, self.device);
         if let Some(perception) = &self.perception {
             let (critic, target) = (&self.critic_parameters, &self.target_critic);
-            perception.look(&mut batch, critic, target, LooksAhead::Target);
+            perception.encode(&mut batch, critic, target, NextStateEncoder::Target);
         }
 
         let targets = self.targets(&batch, noise);
@@ -193,7 +195,7 @@ impl Algorithm for TorchTd3 {
 }
 
 impl Stateful for TorchTd3 {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let own = [
             ("td3.policy.parameters", &self.policy_parameters),
             ("td3.critic.parameters", &self.critic_parameters),
@@ -203,7 +205,7 @@ impl Stateful for TorchTd3 {
         let own = own.map(|(name, parameters)| {
             (
                 name.to_owned(),
-                Part::Tensor(parameters.flat().shallow_clone()),
+                StatePart::Tensor(parameters.flat().shallow_clone()),
             )
         });
         let mut parts = Vec::from(own);

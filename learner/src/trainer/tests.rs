@@ -1,4 +1,4 @@
-//! A trainer restored from a checkpoint goes on bit for bit.
+//! A trainer restored from a checkpoint continues bit for bit.
 
 use skein_inference::{Network, Scratch};
 use skein_protocol::IMAGE_PIXELS;
@@ -9,9 +9,9 @@ use super::*;
 use crate::checkpoint::{CheckpointState, CheckpointStore};
 use crate::episode::samples::{episode, shade, with_images};
 
-/// Episodes of an epoch, each of 10 steps.
+/// Episodes per epoch, of 10 steps each.
 const EPISODES: u64 = 2;
-/// Steps of an epoch.
+/// Steps per epoch.
 const STEPS: usize = 20;
 
 /// The VAE is trained in the first three epochs, the policy from the second one on.
@@ -31,18 +31,18 @@ fn config() -> Config {
     config
 }
 
-/// One epoch as the training loop does it. With a lag, `keep` is what was needed when its episodes
-/// were ordered.
-fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
+/// One epoch, as the training loop does it. With a lag, `keep` was chosen when its episodes were
+/// ordered.
+fn learn(trainer: &mut Trainer, epoch: u64, keep: KeptData) {
     for number in epoch * EPISODES..(epoch + 1) * EPISODES {
         let mut flown = episode(number, STEPS / EPISODES as usize, Outcome::Collided);
         flown.level_up[4] = true;
-        // Rewards that a critic of such few updates does not run away from.
+        // Small rewards, so that a critic of so few updates does not diverge.
         flown
             .rewards
             .iter_mut()
             .for_each(|reward| *reward = reward.sin());
-        if keep == Keep::Depth {
+        if keep == KeptData::Depth {
             flown = with_images(flown);
         }
         trainer.take_in(flown).unwrap();
@@ -60,7 +60,7 @@ fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
         .train_policy(
             PolicyVersion(epoch),
             &mut timer,
-            &mut Means::default(),
+            &mut MetricMeans::default(),
             |_| Ok::<_, UpdateError>(()),
         )
         .unwrap();
@@ -73,8 +73,7 @@ fn learn(trainer: &mut Trainer, epoch: u64, keep: Keep) {
     assert_eq!((booked(Stage::VaeStep), booked(Stage::PolicyUpdate)), done);
 }
 
-/// Without a VAE, and with so little room for images that those of overwritten transitions are
-/// given up.
+/// No VAE, and so little room for images that those of overwritten transitions are released.
 fn end_to_end(algorithm: AlgorithmName) -> Config {
     let mut config = config();
     config.learning.encoder = EncoderTraining::EndToEnd;
@@ -87,14 +86,14 @@ fn end_to_end(algorithm: AlgorithmName) -> Config {
 
 fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
     CheckpointState {
-        progress: Progress {
+        progress: TrainingProgress {
             episodes: epochs * EPISODES,
             epochs,
             version: epochs,
             environment_steps: trainer.steps(),
             vae_steps: trainer.vae_updates(),
             policy_updates: trainer.updates(),
-            ..Progress::start(config().evaluation.window_episodes as usize)
+            ..TrainingProgress::start(config().evaluation.window_episodes as usize)
         },
         tensors: trainer.tensors(),
         replay: trainer.replay().state(),
@@ -102,7 +101,7 @@ fn state(trainer: &mut Trainer, epochs: u64) -> CheckpointState {
     }
 }
 
-/// Stored to disk, and taken over by a trainer that knows nothing.
+/// Saves to disk, and restores into a new trainer.
 fn resumed(trainer: &mut Trainer, epochs: u64) -> Trainer {
     let directory = tempfile::tempdir().unwrap();
     let config = trainer.config.clone();
@@ -117,10 +116,10 @@ fn resumed(trainer: &mut Trainer, epochs: u64) -> Trainer {
     resumed
 }
 
-/// Six epochs, resumed after each of `resumed_after`.
+/// Trains six epochs, resumed after each of `resumed_after`.
 fn train(config: &Config, lag: u64, resumed_after: &[u64]) -> CheckpointState {
     let mut trainer = Trainer::new(config).unwrap();
-    // What was needed of the episodes of the first epochs, when they were ordered.
+    // Data to keep of the first epochs' episodes, chosen when they were ordered.
     let mut keep = vec![trainer.keep(); lag as usize];
     for epoch in 0..6 {
         keep.push(trainer.keep());
@@ -133,7 +132,7 @@ fn train(config: &Config, lag: u64, resumed_after: &[u64]) -> CheckpointState {
 }
 
 #[test]
-fn a_resumed_trainer_goes_on_bit_for_bit_whenever_it_is_resumed() {
+fn a_resumed_trainer_continues_bit_for_bit_whenever_it_is_resumed() {
     for lag in [0, 1] {
         let undisturbed = train(&config(), lag, &[]);
         assert!(undisturbed.progress.vae_steps > 3 && undisturbed.progress.policy_updates > 10);
@@ -141,7 +140,7 @@ fn a_resumed_trainer_goes_on_bit_for_bit_whenever_it_is_resumed() {
             undisturbed.replay.images.is_none(),
             "the VAE was never frozen"
         );
-        // While the VAE is trained, as it is frozen after the third epoch, and later.
+        // Resumed while the VAE is trained, when it is frozen after the third epoch, and later.
         for after in [&[2][..], &[1, 2, 3, 4, 5]] {
             let resumed = train(&config(), lag, after);
             assert!(resumed == undisturbed, "lag {lag}, resumed after {after:?}");
@@ -150,11 +149,11 @@ fn a_resumed_trainer_goes_on_bit_for_bit_whenever_it_is_resumed() {
 }
 
 #[test]
-fn what_learns_end_to_end_goes_on_bit_for_bit_too_and_keeps_its_images_to_the_end() {
+fn end_to_end_training_continues_bit_for_bit_too_and_keeps_its_images_to_the_end() {
     for algorithm in [AlgorithmName::Sac, AlgorithmName::Td3] {
         let config = end_to_end(algorithm);
         let undisturbed = train(&config, 1, &[]);
-        let Progress {
+        let TrainingProgress {
             vae_steps,
             policy_updates,
             environment_steps,
@@ -195,7 +194,7 @@ fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
         before.iter().filter(|value| **value == 0.0).count() < 10,
         "it is initialised"
     );
-    (0..3).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+    (0..3).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
     let moved = encoder(&trainer)
         .iter()
         .zip(&before)
@@ -208,7 +207,7 @@ fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
     );
     assert_eq!(
         (trainer.keep(), trainer.reconstruct(&[0; IMAGE_PIXELS])),
-        (Keep::Depth, None)
+        (KeptData::Depth, None)
     );
     assert!(
         trainer
@@ -219,18 +218,18 @@ fn without_a_vae_snapshots_carry_the_encoder_that_the_critic_trains() {
 }
 
 #[test]
-fn what_flies_is_the_average_of_the_policy_where_that_is_asked_for_and_learns_like_any_other() {
+fn the_policy_average_flies_where_configured_and_does_not_change_learning() {
     let mut averaged = config();
     averaged.learning.average_updates = 8;
     let undisturbed = train(&averaged, 0, &[]);
     assert!(train(&averaged, 0, &[2, 4]) == undisturbed, "resumed");
 
-    // The same episodes teach the same, whatever flies.
+    // The same episodes teach the same, whichever policy flies.
     let after = |averaged: usize| {
         let mut config = config();
         config.learning.average_updates = averaged;
         let mut trainer = Trainer::new(&config).unwrap();
-        (0..6).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+        (0..6).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
         let policy = trainer.snapshot(PolicyVersion(6)).values[trainer.layout.policy()].to_vec();
         (policy, trainer.algorithm.named_tensors())
     };
@@ -245,18 +244,18 @@ fn what_flies_is_the_average_of_the_policy_where_that_is_asked_for_and_learns_li
     };
     assert!(
         distance(&of_one) < 1e-6,
-        "the average of one is the latest: {}",
+        "the average over one update is the latest policy: {}",
         distance(&of_one)
     );
     assert!(
         distance(&of_many) > 1e-4,
-        "of many, it lags behind: {}",
+        "the average over many updates lags behind: {}",
         distance(&of_many)
     );
 }
 
 #[test]
-fn a_u_net_is_on_libtorch_and_the_policy_where_it_was() {
+fn a_u_net_runs_on_libtorch_and_leaves_the_policys_start_unchanged() {
     let mut config = config();
     config.vae.decoder = DecoderName::UNet;
     let mut trainer = Trainer::new(&config).unwrap();
@@ -271,14 +270,18 @@ fn a_u_net_is_on_libtorch_and_the_policy_where_it_was() {
         policy(&mut trainer) == policy(&mut plain),
         "both begin alike"
     );
-    (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
-    assert_eq!(trainer.keep(), Keep::Latents, "the VAE was never frozen");
+    (0..4).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
+    assert_eq!(
+        trainer.keep(),
+        KeptData::Latents,
+        "the VAE was never frozen"
+    );
 }
 
 #[test]
 fn a_state_that_lacks_a_tensor_or_miscounts_is_refused_by_name() {
     let mut trainer = Trainer::new(&config()).unwrap();
-    learn(&mut trainer, 0, Keep::Depth);
+    learn(&mut trainer, 0, KeptData::Depth);
     let mut refusal = |damage: fn(&mut CheckpointState)| {
         let mut state = state(&mut trainer, 1);
         damage(&mut state);
@@ -313,9 +316,13 @@ fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
         (config.run.engine, config.vae.encoder_precision) = (Some(engine), precision);
         config.vae.latent = latent;
         let mut trainer = Trainer::new(&config).unwrap();
-        // The last epoch comes in late: its images were ordered before.
-        (0..4).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
-        assert_eq!(trainer.keep(), Keep::Latents, "the VAE was never frozen");
+        // The last epoch arrives late: its images were ordered before the freeze.
+        (0..4).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
+        assert_eq!(
+            trainer.keep(),
+            KeptData::Latents,
+            "the VAE was never frozen"
+        );
         assert!(
             all_codes_are_the_encoders(&trainer, 4),
             "{engine}, {precision}, {latent} numbers"
@@ -324,20 +331,20 @@ fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
 }
 
 #[test]
-fn episodes_are_stored_a_second_time_as_seen_in_a_mirror() {
+fn episodes_are_stored_a_second_time_mirrored() {
     let mut config = config();
     config.learning.mirror = true;
     config.learning.observation = Observation::LatentVelocityAction;
     config.replay.capacity = 1000;
     let mut trainer = Trainer::new(&config).unwrap();
-    (0..3).for_each(|epoch| learn(&mut trainer, epoch, Keep::Depth));
+    (0..3).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
     assert_eq!(
         (trainer.steps(), trainer.replay().len()),
         (3 * STEPS as u64, 6 * STEPS)
     );
     assert_eq!(
         trainer.keep(),
-        Keep::Depth,
+        KeptData::Depth,
         "mirror images are encoded after the VAE is frozen, too"
     );
     assert!(
@@ -364,23 +371,23 @@ fn episodes_are_stored_a_second_time_as_seen_in_a_mirror() {
     let count = to_the_left.count();
     assert!(
         (150..=250).contains(&count),
-        "{count} of 400 go to the left, as all episodes do that were flown"
+        "{count} of 400 go to the left, the side of all flown episodes"
     );
 }
 
 #[test]
-fn while_the_vae_is_trained_stored_codes_are_made_anew_as_often_as_asked_for() {
+fn stored_codes_are_recomputed_as_often_as_configured_while_the_vae_is_trained() {
     let mut trainer = Trainer::new(&config()).unwrap();
     let mut renewed = Vec::new();
     for epoch in 0..3 {
-        learn(&mut trainer, epoch, Keep::Depth);
+        learn(&mut trainer, epoch, KeptData::Depth);
         renewed.push(all_codes_are_the_encoders(&trainer, epoch + 1));
     }
     assert_eq!(renewed, [false, true, true]);
 }
 
-/// Whether what is stored of the first epochs are the codes that actors would make with the encoder
-/// as it is.
+/// `true` if the stored codes of the first `epochs` are those that actors would compute with the
+/// present encoder.
 fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
     let precision = trainer.config.vae.encoder_precision;
     let network = Network::new(

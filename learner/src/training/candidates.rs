@@ -1,5 +1,5 @@
-//! Evaluation episodes in a run: those that confirm a candidate for the best snapshot, and those
-//! that show in the end what it can do.
+//! Confirmation episodes, which judge candidates for the best snapshot, and the final evaluation of
+//! the best one.
 
 use std::ops::Range;
 
@@ -15,24 +15,24 @@ use crate::best::{is_better, is_candidate};
 use crate::checkpoint::BestSnapshot;
 use crate::curriculum;
 use crate::episode::CommittedEpisode;
-use crate::episodes::assembly::Keep;
+use crate::episodes::assembly::KeptData;
 use crate::evaluation;
 use crate::metrics::Scalar;
 
 impl Training<'_> {
-    /// Confirms the newest snapshot by evaluation episodes if it is a candidate; keeps it if it is
-    /// the best. The last one always is a candidate.
+    /// Confirms the newest snapshot if it is a candidate, and keeps it if it is the best so far.
+    /// The last snapshot always is a candidate.
     ///
-    /// It depends on the state alone and does nothing the second time: a run that was stopped here
-    /// looks again when it is resumed.
-    pub(super) fn look_for_best(&mut self) -> Result<(), TrainingError> {
+    /// The result depends on the state alone, and a second call does nothing: a run stopped here
+    /// repeats it when resumed.
+    pub(super) fn confirm_if_candidate(&mut self) -> Result<(), TrainingError> {
         if !self.is_candidate() {
             return Ok(());
         }
         let version = self.progress.version();
         let (run, number) = (self.identity.run, self.progress.evaluations);
         let tickets = curriculum::confirmation(self.config, run, number, version);
-        let flown = self.evaluate(tickets, Keep::Latents)?;
+        let flown = self.evaluate(tickets, KeptData::Latents)?;
         pass(FaultPoint::LearnerCandidateFlown);
         self.note_trained(&flown);
         let passed: f64 = flown
@@ -76,8 +76,8 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Writes down what it took, the first time that `flown` show a policy that does what it was
-    /// trained for.
+    /// Records the effort of training, the first time that `flown` reach the configured success
+    /// rate.
     fn note_trained(&mut self, flown: &[CommittedEpisode]) {
         let sum = |of: fn(&CommittedEpisode) -> u8| {
             flown
@@ -125,7 +125,7 @@ impl Training<'_> {
         version: PolicyVersion,
         courses: Range<u32>,
         episodes: u64,
-        keep: Keep,
+        keep: KeptData,
     ) -> Result<Vec<CommittedEpisode>, TrainingError> {
         let (run, number) = (self.identity.run, self.progress.evaluations);
         let tickets = curriculum::evaluation(self.config, run, number, version, courses, episodes);
@@ -136,7 +136,7 @@ impl Training<'_> {
     fn evaluate(
         &mut self,
         tickets: Vec<Ticket>,
-        keep: Keep,
+        keep: KeptData,
     ) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         let total = tickets.len() as u64;
@@ -159,9 +159,10 @@ impl Training<'_> {
         Ok(flown)
     }
 
-    /// Evaluates the best snapshot on all courses and writes what came of it.
+    /// Evaluates the best snapshot on all courses and writes the report.
     pub(super) fn evaluate_best(&mut self) -> Result<(), TrainingError> {
-        // The last snapshot was a candidate, and the first candidate is the best: there is one.
+        // Never missing: the last snapshot was a candidate, and the first candidate becomes the
+        // best.
         let Some(version) = self
             .progress
             .best
@@ -178,9 +179,9 @@ impl Training<'_> {
             version,
             0..courses,
             self.config.evaluation.episodes,
-            Keep::Latents,
+            KeptData::Latents,
         )?;
-        let pictured = self.evaluate_on(version, 0..1, 1, Keep::Depth)?;
+        let pictured = self.evaluate_on(version, 0..1, 1, KeptData::Depth)?;
         pass(FaultPoint::LearnerEvaluated);
         Ok(self.disk.with_room(self.directory.root(), || {
             evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;

@@ -1,39 +1,42 @@
-//! What the curves of an epoch are drawn from, gathered over its segments and told at its end.
+//! The points of an epoch's curves, gathered over its segments and written at its end.
 
 use std::time::Duration;
 
 use crate::episodes::receiver::Shared;
 use crate::metrics::Scalar;
 use crate::replay::Replay;
-use crate::trainer::Means;
+use crate::trainer::MetricMeans;
 use crate::vae::VaeMetrics;
 
-/// What an epoch brought so far.
+/// Results of an epoch so far.
 #[derive(Debug, Default)]
 pub(super) struct EpochCurves {
-    /// Steps taken in.
+    /// Steps learned from.
     pub(super) steps: usize,
-    /// Of the last step of the VAE, if there was one.
+    /// Metrics of the last VAE step, if there was one.
     pub(super) vae: Option<VaeMetrics>,
-    /// Of the policy's updates.
-    pub(super) policy: Means,
+    /// MetricMeans of the policy updates' metrics.
+    pub(super) policy: MetricMeans,
     pub(super) updates: u64,
-    /// Time for the updates.
+    /// Time spent on the updates.
     pub(super) updating: Duration,
 }
 
 impl EpochCurves {
-    /// The points of an epoch that took so `long`.
+    /// Returns the points of an epoch that took `duration`.
     pub(super) fn points(
         self,
-        long: Duration,
+        duration: Duration,
         replay: &Replay,
         receiver: &Shared,
     ) -> Vec<(Scalar, f64)> {
         let mut points = vec![
             (Scalar::ReplayTransitions, replay.len() as f64),
             (Scalar::ReplaySuccess, replay.success_len() as f64),
-            (Scalar::StepsPerSec, self.steps as f64 / long.as_secs_f64()),
+            (
+                Scalar::StepsPerSec,
+                self.steps as f64 / duration.as_secs_f64(),
+            ),
         ];
         points.extend(receiver.faults().scalars());
         if let Some(vae) = self.vae {

@@ -1,4 +1,4 @@
-//! Why a training ends before its time.
+//! Errors that end a training early.
 
 use std::io;
 use std::path::PathBuf;
@@ -9,14 +9,14 @@ use crate::UpdateError;
 use crate::checkpoint::CheckpointError;
 use crate::device::DeviceError;
 use crate::episodes::receiver::ReceiverError;
-use crate::evaluation::EvaluationError;
+use crate::evaluation::EvaluationWriteError;
 use crate::metrics::MetricsError;
 use crate::replay::InsertError;
 use crate::trainer::TrainerRestoreError;
 
-/// Why a training ended before its time.
+/// Reason why a training ended early.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)] // every variant is the error of the part it is named after
+#[allow(missing_docs)] // every variant is named after the part that failed
 pub enum TrainingError {
     #[error(transparent)]
     Device(#[from] DeviceError),
@@ -33,7 +33,7 @@ pub enum TrainingError {
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
     #[error(transparent)]
-    Evaluation(#[from] EvaluationError),
+    Evaluation(#[from] EvaluationWriteError),
     #[error("cannot start a thread: {0}")]
     Thread(#[source] io::Error),
     #[error("{}: {source}", path.display())]
@@ -42,14 +42,14 @@ pub enum TrainingError {
         #[source]
         source: io::Error,
     },
-    /// A checkpoint is undamaged, and still makes no sense.
+    /// A checkpoint is undamaged, but does not fit.
     #[error("the checkpoint of episode {episodes} cannot be resumed: {source}")]
     Restore {
         episodes: u64,
         #[source]
         source: TrainerRestoreError,
     },
-    /// A checkpoint lacks what it should hold.
+    /// A checkpoint lacks a snapshot it should hold, or holds another one.
     #[error(
         "the checkpoint of episode {episodes} cannot be resumed: its snapshot {version} {problem}"
     )]
@@ -58,9 +58,13 @@ pub enum TrainingError {
         version: u64,
         problem: &'static str,
     },
-    /// There is no checkpoint where there must have been one.
+    /// No checkpoint exists where there must have been one.
     #[error(
-        "{} has {rows} episodes, and yet there is no checkpoint in {}, or no such folder; one is written each {first_after} episodes: put the checkpoints back; or, to train anew from the first episode, remove episodes.csv", episodes_csv.display(), checkpoints.display()
+        "{} has {rows} episodes, but {} holds no checkpoint or does not exist; \
+         one is written every {first_after} episodes: put the checkpoints back; \
+         or, to train again from the first episode, remove episodes.csv",
+        episodes_csv.display(),
+        checkpoints.display()
     )]
     CheckpointsLost {
         episodes_csv: PathBuf,
@@ -68,16 +72,15 @@ pub enum TrainingError {
         checkpoints: PathBuf,
         first_after: u64,
     },
-    /// It was told to stop and did not wait for the end of an epoch's updates, or of the episode
-    /// that it was learning from.
-    #[error("stopped amid an epoch")]
+    /// The run was stopped before the end of an epoch's updates, or of the episode in progress.
+    #[error("stopped in the middle of an epoch")]
     Abandoned,
 }
 
 impl TrainingError {
-    /// Whether a new incarnation of the learner may get further: the transport failed, and nothing
-    /// that was computed is at fault. Anything else would come again.
-    pub fn is_of_the_transport(&self) -> bool {
+    /// `true` if a new incarnation of the learner may get further: the transport failed, and
+    /// nothing that was computed is at fault. Any other error would recur.
+    pub fn is_transport_failure(&self) -> bool {
         matches!(self, Self::EpisodeReceiver(ReceiverError::Transport(_)))
     }
 }
@@ -97,12 +100,12 @@ mod tests {
             why: "the simulator broke down".to_owned(),
         };
         let error = |error: ReceiverError| TrainingError::from(error);
-        assert!(error(ReceiverError::Transport("no memory".to_owned())).is_of_the_transport());
-        assert!(!error(hopeless.into()).is_of_the_transport());
+        assert!(error(ReceiverError::Transport("no memory".to_owned())).is_transport_failure());
+        assert!(!error(hopeless.into()).is_transport_failure());
         let diverged = UpdateError::NonFinite {
             tensor: "critic loss",
             update: 7,
         };
-        assert!(!TrainingError::from(diverged).is_of_the_transport());
+        assert!(!TrainingError::from(diverged).is_transport_failure());
     }
 }

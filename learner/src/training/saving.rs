@@ -1,5 +1,4 @@
-//! How a run outlives its learner: what goes into a checkpoint, how a learner goes on from one, and
-//! how it ends.
+//! Checkpoints of a run: what goes into one, how a learner resumes from one, and how a run ends.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -17,21 +16,21 @@ use skein_protocol::summary::{Ending, Summary};
 use skein_run::fault::{FaultPoint, pass};
 use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity, save_snapshot};
 
-use super::{EpochCurves, StopWatch, Training, TrainingError};
+use super::{EpochCurves, StopMonitor, Training, TrainingError};
 use crate::checkpoint::{
-    CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, Progress,
+    CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, TrainingProgress,
 };
 use crate::disk::Disk;
 use crate::episodes::receiver::EpisodeReceiver;
 use crate::incarnations::begin_incarnation;
 use crate::metrics::{Metrics, MetricsError};
-use crate::report::{Reporter, tell};
+use crate::report::{Reporter, notify_user};
 use crate::threads;
 use crate::trainer::Trainer;
 
 impl<'a> Training<'a> {
-    /// A training at its newest undamaged checkpoint, or at its start if it has none. The episodes
-    /// that were in the air are ordered again.
+    /// Starts a training at its newest undamaged checkpoint, or at episode 0. Orders again what was
+    /// in flight.
     pub(super) fn begin(
         directory: &'a RunDirectory,
         identity: &'a RunIdentity,
@@ -53,27 +52,31 @@ impl<'a> Training<'a> {
                 })
         };
         let newest = store.load_newest(fits, |error| {
-            tell(&format!("a checkpoint is not used: {error}"));
+            notify_user(&format!("a checkpoint is not used: {error}"));
         })?;
         let (saved, snapshots) = match newest {
             Some(checkpoint) => {
-                tell(&format!(
-                    "going on after episode {}",
+                notify_user(&format!(
+                    "resuming after episode {}",
                     checkpoint.progress.episodes
                 ));
                 restore(&mut trainer, checkpoint)?
             }
-            // An incarnation that died before its first checkpoint may have left files: they are
-            // dropped as if they came after episode 0.
+            // An incarnation killed before its first checkpoint may have left files: they are
+            // dropped, as results after episode 0.
             None => {
                 refuse_lost_checkpoints(directory, config)?;
                 (start(config, &trainer), BTreeMap::new())
             }
         };
         let receiver = EpisodeReceiver::start(identity, incarnation, config)?;
-        // Before anything is written: if that has to wait for room on the disk, it is told.
-        let reporter = Reporter::start(first_line(config, &saved), receiver.shared(), disk.clone())
-            .map_err(TrainingError::Thread)?;
+        // Started before anything is written, so that waiting for a full disk is reported.
+        let reporter = Reporter::start(
+            first_report(config, &saved),
+            receiver.shared(),
+            disk.clone(),
+        )
+        .map_err(TrainingError::Thread)?;
         let incarnations = directory.incarnations_csv();
         let resumes = disk
             .with_room(&incarnations, || {
@@ -81,7 +84,7 @@ impl<'a> Training<'a> {
             })
             .map_err(file_error(&incarnations))?;
         if resumes > 0 && saved.episodes == 0 {
-            tell("there is no checkpoint yet: beginning from the first episode");
+            notify_user("there is no checkpoint yet: starting from the first episode");
         }
         let metrics = resume_metrics(directory, &saved, &disk)?;
         let mut training = Self {
@@ -89,7 +92,7 @@ impl<'a> Training<'a> {
             identity,
             directory,
             stop,
-            stop_watch: StopWatch::of(stop),
+            stop_monitor: StopMonitor::of(stop),
             layout: SnapshotLayout::of(config),
             trainer,
             reporter,
@@ -104,18 +107,18 @@ impl<'a> Training<'a> {
             progress: saved.clone(),
             saved,
             resumes,
-            in_the_air: VecDeque::new(),
-            under_way: None,
+            in_flight: VecDeque::new(),
+            open_episode: None,
             snapshots,
         };
-        training.remove_later_results()?;
-        training.take_up()?;
+        training.remove_results_after_checkpoint()?;
+        training.restore_orders()?;
         Ok(training)
     }
 
-    /// Publishes what was published and orders what was ordered when the checkpoint was taken.
-    fn take_up(&mut self) -> Result<(), TrainingError> {
-        let orders = std::mem::take(&mut self.progress.in_the_air);
+    /// Repeats what was published and ordered when the checkpoint was taken.
+    fn restore_orders(&mut self) -> Result<(), TrainingError> {
+        let orders = std::mem::take(&mut self.progress.in_flight);
         if let Some(episodes) = (self.progress.epochs > 0).then_some(self.progress.episodes) {
             tracing::info!(
                 episodes,
@@ -124,7 +127,7 @@ impl<'a> Training<'a> {
                 "resumed from a checkpoint"
             );
         }
-        // The present one comes last, so that it is the newest for whoever attaches now.
+        // The present snapshot comes last, so that it is the newest for actors that attach now.
         for order in &orders {
             let version = PolicyVersion(order.policy_version);
             if version < self.progress.version() {
@@ -138,9 +141,9 @@ impl<'a> Training<'a> {
         self.publish()
     }
 
-    /// Takes back what an earlier incarnation has written since the checkpoint: it was of a future
-    /// that is to be flown again.
-    fn remove_later_results(&mut self) -> Result<(), TrainingError> {
+    /// Removes results that an earlier incarnation wrote after the checkpoint: they will be
+    /// computed again.
+    fn remove_results_after_checkpoint(&mut self) -> Result<(), TrainingError> {
         let best = self
             .progress
             .best
@@ -160,7 +163,7 @@ impl<'a> Training<'a> {
         Ok(())
     }
 
-    /// A snapshot that is kept.
+    /// Returns a snapshot of this run that is still needed.
     pub(super) fn kept_snapshot(&self, version: PolicyVersion) -> Result<Snapshot, TrainingError> {
         let missing = || TrainingError::RestoredSnapshot {
             episodes: self.saved.episodes,
@@ -170,7 +173,7 @@ impl<'a> Training<'a> {
         self.snapshots.get(&version).cloned().ok_or_else(missing)
     }
 
-    /// Writes a snapshot that is kept to a file.
+    /// Writes such a snapshot to a file.
     pub(super) fn save_snapshot(
         &self,
         version: PolicyVersion,
@@ -189,12 +192,11 @@ impl<'a> Training<'a> {
         Ok(())
     }
 
-    /// Hands the state to the writing thread, unless it is that of the newest checkpoint; and keeps
-    /// the newest snapshot as a file.
+    /// Hands the state to the writing thread, unless the newest checkpoint already has it. Also
+    /// saves the newest snapshot as a file.
     ///
-    /// Only between epochs, and so between episodes: then the state follows from the epochs done,
-    /// whether a candidate was looked at, and what had been ordered earlier. What lies in the
-    /// middle of an episode is in none.
+    /// Called only between epochs, hence between episodes. There the state follows from the epochs
+    /// done, the last candidate, and the orders in flight; no checkpoint holds half an episode.
     pub(super) fn checkpoint(&mut self) -> Result<(), TrainingError> {
         let (now, saved) = (&self.progress, &self.saved);
         if (now.epochs, now.latest_candidate) == (saved.epochs, saved.latest_candidate) {
@@ -204,7 +206,7 @@ impl<'a> Training<'a> {
         self.metrics.flush()?;
         self.save_snapshot(self.progress.version(), &self.directory.latest_snapshot())?;
         self.timer.lap(Stage::Checkpoint, 0);
-        let progress = self.counted();
+        let progress = self.full_progress();
         let state = CheckpointState {
             progress: progress.clone(),
             tensors: self.trainer.tensors(),
@@ -217,15 +219,15 @@ impl<'a> Training<'a> {
         Ok(())
     }
 
-    /// The progress with everything that others count.
-    fn counted(&self) -> Progress {
+    /// Returns the progress, with the counters that other parts keep.
+    fn full_progress(&self) -> TrainingProgress {
         let newest = self.snapshots.get(&self.progress.version());
-        Progress {
+        TrainingProgress {
             policy_sha256: newest.map(Snapshot::sha256).unwrap_or_default(),
             environment_steps: self.trainer.steps(),
             vae_steps: self.trainer.vae_updates(),
             policy_updates: self.trainer.updates(),
-            in_the_air: self.in_the_air.iter().map(|epoch| epoch.order).collect(),
+            in_flight: self.in_flight.iter().map(|epoch| epoch.order).collect(),
             metrics: self.metrics.state(),
             spent: self.progress.spent.with_this_incarnation(
                 self.started,
@@ -236,43 +238,42 @@ impl<'a> Training<'a> {
         }
     }
 
-    /// Has everything saved; returns how far the run is.
-    pub(super) fn save(&mut self) -> Result<Progress, TrainingError> {
+    /// Saves everything; returns the progress.
+    pub(super) fn save(&mut self) -> Result<TrainingProgress, TrainingError> {
         self.reporter
             .update(|progress| progress.phase = Phase::Finishing);
         self.metrics.flush()?;
         self.checkpoint()?;
         self.timer.lap(Stage::OtherTraining, 0);
-        Ok(self.counted())
+        Ok(self.full_progress())
     }
 
-    /// Gives up an epoch half done: the files tell what the next incarnation will go on from.
-    /// Returns how far that is.
-    pub(super) fn go_back(&mut self) -> Result<Progress, TrainingError> {
+    /// Gives up an epoch half done: resets the files to the newest checkpoint, from which the next
+    /// incarnation resumes. Returns that checkpoint's progress.
+    pub(super) fn roll_back(&mut self) -> Result<TrainingProgress, TrainingError> {
         tracing::warn!(
             episodes = self.progress.episodes,
             checkpoint = self.saved.episodes,
-            "told to stop, and the end of the epoch takes too long: back to the newest checkpoint"
+            "stopped, and the end of the epoch takes too long: back to the newest checkpoint"
         );
         self.reporter
             .update(|progress| progress.phase = Phase::Finishing);
-        // What is flushed now cannot follow what is cut.
+        // Flush before the files are cut, so that nothing follows later.
         self.metrics.flush()?;
         self.metrics = resume_metrics(self.directory, &self.saved, &self.disk)?;
         self.metrics.flush()?;
         Ok(self.saved.clone())
     }
 
-    /// Finishes the checkpoint being written, sums up how the run ended and how far it came, and
-    /// lets the actors go.
+    /// Finishes the checkpoint being written, writes the summary, and releases the actors.
     ///
-    /// In this order: a learner that dies before all is written is started again, and needs its
-    /// actors still.
+    /// The order matters: a learner killed before everything is written is started again, and still
+    /// needs its actors.
     pub(super) fn conclude(
         self,
-        end: Result<(Ending, Progress), TrainingError>,
+        end: Result<(Ending, TrainingProgress), TrainingError>,
     ) -> Result<Summary, TrainingError> {
-        // A thread that has ended can no longer be asked.
+        // The times of a thread are gone once it has ended.
         let thread_cpu_secs = threads::cpu_secs();
         let written = self.checkpoints.finish();
         let summed_up = match (end, written) {
@@ -306,10 +307,10 @@ fn save_summary(
         .map_err(file_error(&path))
 }
 
-/// The metrics as they were when `saved` was.
+/// Reopens the metrics at the position of `saved`.
 fn resume_metrics(
     directory: &RunDirectory,
-    saved: &Progress,
+    saved: &TrainingProgress,
     disk: &Disk,
 ) -> Result<Metrics, MetricsError> {
     disk.with_room(directory.root(), || {
@@ -317,9 +318,9 @@ fn resume_metrics(
     })
 }
 
-/// A run without checkpoints is not begun anew without a word when it has had some: their folder is
-/// gone, or `episodes.csv` shows more episodes than can be flown before the first. What was flown
-/// before any is flown again.
+/// Refuses to start from episode 0 a run that has had checkpoints. Their folder is gone, or
+/// `episodes.csv` has more episodes than can be flown before the first checkpoint. Episodes flown
+/// before any checkpoint are simply flown again.
 fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<(), TrainingError> {
     let episodes_csv = directory.episodes_csv();
     let content = match fs::read(&episodes_csv) {
@@ -329,8 +330,8 @@ fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<
     let lines = content.iter().filter(|&&byte| byte == b'\n').count() as u64;
     let rows = lines.saturating_sub(1);
     let (checkpoints, first_after) = (directory.checkpoints(), config.checkpoints.every_episodes);
-    // A checkpoint is taken at the end of an epoch, and training goes on while it is written: until
-    // the next one is to be handed over. Their folder was made with the run's.
+    // A checkpoint is taken at the end of an epoch, and training continues while it is written,
+    // until the next one is due. The folder was created with the run's.
     if rows > 2 * (first_after + config.learning.episodes_per_epoch)
         || rows > 0 && !checkpoints.is_dir()
     {
@@ -344,19 +345,19 @@ fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<
     Ok(())
 }
 
-/// A run that has not begun.
-fn start(config: &Config, trainer: &Trainer) -> Progress {
-    Progress {
+/// Progress of a run that has not begun.
+fn start(config: &Config, trainer: &Trainer) -> TrainingProgress {
+    TrainingProgress {
         policy_sha256: trainer.snapshot(PolicyVersion(0)).sha256(),
-        ..Progress::start(config.evaluation.window_episodes as usize)
+        ..TrainingProgress::start(config.evaluation.window_episodes as usize)
     }
 }
 
-/// Takes a checkpoint's state over into `trainer`; what remains of it is returned.
+/// Restores a checkpoint into `trainer`; returns the rest of the checkpoint.
 fn restore(
     trainer: &mut Trainer,
     checkpoint: CheckpointState,
-) -> Result<(Progress, BTreeMap<PolicyVersion, Snapshot>), TrainingError> {
+) -> Result<(TrainingProgress, BTreeMap<PolicyVersion, Snapshot>), TrainingError> {
     let CheckpointState {
         progress,
         tensors,
@@ -368,8 +369,8 @@ fn restore(
         .restore(&progress, &tensors, replay)
         .map_err(|source| TrainingError::Restore { episodes, source })?;
     let version = progress.version();
-    // The parameters are there twice, in the tensors and in the snapshot: a restored trainer that
-    // would publish another snapshot is not the one stored.
+    // The parameters are stored twice, in the tensors and in the snapshot. A trainer that would
+    // publish another snapshot was not restored correctly.
     if trainer.snapshot(version).sha256() != progress.policy_sha256 {
         return Err(TrainingError::RestoredSnapshot {
             episodes,
@@ -384,8 +385,8 @@ fn restore(
     Ok((progress, snapshots))
 }
 
-/// What is reported before anything has happened in this incarnation.
-fn first_line(config: &Config, saved: &Progress) -> progress::Progress {
+/// First report of this incarnation.
+fn first_report(config: &Config, saved: &TrainingProgress) -> progress::Progress {
     let windows = &saved.metrics.windows;
     progress::Progress {
         episodes: saved.episodes,
@@ -403,7 +404,7 @@ fn summary(
     identity: &RunIdentity,
     config: &Config,
     ending: Ending,
-    progress: &Progress,
+    progress: &TrainingProgress,
     resumes: u64,
 ) -> Summary {
     let best = progress.best.as_ref();
@@ -450,7 +451,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_that_lost_its_checkpoints_is_not_begun_anew_without_a_word() {
+    fn a_run_that_lost_its_checkpoints_is_not_silently_started_again() {
         let folder = tempfile::tempdir().unwrap();
         let directory = RunDirectory::new(folder.path());
         fs::create_dir(directory.checkpoints()).unwrap();
@@ -465,8 +466,7 @@ mod tests {
             )
             .unwrap()
         };
-        // The second checkpoint waits until the first is in place, so that many can be flown
-        // without one.
+        // The second checkpoint waits for the first, so many episodes can be flown without one.
         flown(50);
         refuse_lost_checkpoints(&directory, &config).unwrap();
         fs::remove_dir(directory.checkpoints()).unwrap();

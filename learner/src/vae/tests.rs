@@ -1,4 +1,4 @@
-//! The native engine against libtorch's automatic gradients, and against itself on other
+//! The native engine against libtorch's automatic gradients, and against itself with other
 //! instructions and threads.
 
 use skein_kernels::Isa;
@@ -7,8 +7,8 @@ use skein_protocol::config::DecoderName;
 
 use super::*;
 
-/// Depth images of one wall each with a square opening at some place: near, far, and nothing in
-/// between.
+/// Depth images of one wall each, with a square opening at a random place. They have only two
+/// depths, near and far.
 pub(super) fn synthetic_bytes(count: usize, seed: u64) -> Vec<u8> {
     const WIDTH: usize = skein_protocol::IMAGE_WIDTH;
     let mut noise = Noise::new(seed);
@@ -22,7 +22,7 @@ pub(super) fn synthetic_bytes(count: usize, seed: u64) -> Vec<u8> {
     bytes
 }
 
-/// Length of the codes, where it is not said.
+/// Default length of the latent code.
 const LATENT: usize = 32;
 
 fn with_latent(latent: usize) -> VaeSection {
@@ -32,7 +32,7 @@ fn with_latent(latent: usize) -> VaeSection {
     }
 }
 
-/// Both engines with codes of `latent` numbers.
+/// Returns both engines, for codes of `latent` numbers.
 fn both(latent: usize, seed: u64) -> (NativeVae, TorchVae) {
     crate::device::use_threads(1);
     let section = with_latent(latent);
@@ -58,7 +58,7 @@ fn flat(tensor: &Tensor) -> Vec<f32> {
     Vec::try_from(tensor.reshape([-1])).unwrap()
 }
 
-/// Distance of two vectors, as a share of the second one's length.
+/// Distance of two vectors, relative to the length of `expected`.
 fn relative_distance(found: &[f32], expected: &[f32]) -> f64 {
     let length = |values: &mut dyn Iterator<Item = f64>| {
         values.map(|value| value * value).sum::<f64>().sqrt()
@@ -74,8 +74,8 @@ fn state(vae: &mut NativeVae) -> Vec<crate::state::NamedTensor> {
 
 #[test]
 fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_precision() {
-    // Seeds of which no sum lies so near zero that rounding takes it across: a ReLU would then be
-    // open in one and shut in the other.
+    // Seeds for which no sum is so near zero that rounding changes its sign: a ReLU would then be
+    // open in one engine and shut in the other.
     for (seed, count, latent) in [
         (1, 1, 32),
         (2, 3, 32),
@@ -115,7 +115,7 @@ fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_pr
 }
 
 #[test]
-fn both_engines_begin_with_the_same_numbers() {
+fn both_engines_start_with_the_same_numbers() {
     for (seed, latent) in [(1, 32), (2, 8), (3, 64)] {
         let (native, torch) = both(latent, seed);
         assert_eq!(native.published_len(), torch.published_len());
@@ -187,7 +187,7 @@ fn neither_threads_nor_instructions_change_a_bit() {
     }
     let expected = run(LATENT, Isa::best(), 1);
     for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
-        // The slowest once: 3 threads, of which one has no image.
+        // Portable instructions are slow: only once, with 3 threads, of which one has no image.
         for threads in (1..4).filter(|threads| isa != Isa::Portable || *threads == 3) {
             assert!(
                 run(LATENT, isa, threads) == expected,
@@ -198,7 +198,7 @@ fn neither_threads_nor_instructions_change_a_bit() {
 }
 
 #[test]
-fn an_image_is_encoded_and_seen_the_same_in_any_company() {
+fn an_image_is_encoded_and_reconstructed_the_same_in_any_batch() {
     let (mut vae, images) = (native(1), synthetic_bytes(35, 1));
     let (codes, seen) = (vae.encode(&images), vae.reconstruct(&images));
     for index in [0, 33] {
@@ -220,7 +220,7 @@ fn a_restored_native_vae_continues_bit_for_bit() {
     let expected = vae.update(&images, &mut Noise::new(2)).unwrap();
 
     let mut resumed = native(9);
-    // What it has packed must not outlive what it is restored to.
+    // What it has packed must not survive the restore.
     let _ = resumed.encode(&images);
     resumed.load_named(&stored).unwrap();
     assert_eq!(resumed.updates(), 1);
@@ -245,8 +245,8 @@ fn a_native_vae_learns_to_reproduce_images_it_was_not_trained_on() {
     let mut vae = native(3);
     let mut code_noise = vec![0.0; 16 * LATENT];
     Noise::new(5).fill_normal(&mut code_noise);
-    // Through codes drawn as in training: after so few steps, the code's mean is a code that the
-    // decoder has hardly seen.
+    // Uses codes sampled as in training: after so few steps, the decoder has hardly seen the mean
+    // itself.
     let error = |vae: &mut NativeVae| {
         vae.loss_and_gradient(&unseen, &code_noise).0[1] / IMAGE_PIXELS as f32
     };
@@ -270,7 +270,7 @@ fn a_native_vae_learns_to_reproduce_images_it_was_not_trained_on() {
 }
 
 #[test]
-fn what_is_not_finite_changes_nothing() {
+fn a_step_that_is_not_finite_changes_nothing() {
     let images = synthetic_bytes(2, 1);
     let infinite = VaeSection {
         kl_weight: f64::INFINITY,
@@ -283,14 +283,13 @@ fn what_is_not_finite_changes_nothing() {
     assert_eq!(refused, UpdateError::NonFinite { tensor, update: 1 });
     assert!(state(&mut vae) == before);
 
-    // Parameters that are not numbers, each of another layer; and one that only gradients meet, for
-    // the loss is far from overflowing.
+    // Parameters that are NaN, in different layers.
     let broken = |name: &str, value: f32| {
         let mut vae = native(1);
         vae.spoil(name, value);
         let before = state(&mut vae);
         let refused = vae.update(&images, &mut Noise::new(1)).unwrap_err();
-        // Not a number is not equal to itself.
+        // NaN is not equal to itself, so the text is compared.
         let bits_of = |state: Vec<crate::state::NamedTensor>| format!("{state:?}");
         assert_eq!(bits_of(state(&mut vae)), bits_of(before), "{name}");
         refused

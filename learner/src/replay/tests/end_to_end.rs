@@ -1,11 +1,11 @@
-//! Images that a policy learns from: those of the transitions, however often the rings have gone
-//! round, and not many more.
+//! Images that a policy learns from: they belong to the transitions, however often the rings wrap
+//! around, and few others are kept.
 
 use skein_protocol::config::EncoderTraining;
 
 use super::*;
 
-/// For episodes of at most 11 steps, one an epoch.
+/// Configures episodes of at most 11 steps, one per epoch.
 fn end_to_end(capacity: usize) -> Config {
     let mut config = config(capacity, Observation::LatentVelocity);
     config.learning.encoder = EncoderTraining::EndToEnd;
@@ -14,7 +14,7 @@ fn end_to_end(capacity: usize) -> Config {
     config
 }
 
-/// Of 1 to 11 steps; in some, a wall is passed.
+/// An episode of 1 to 11 steps; in some episodes, a wall is passed.
 fn flown(number: u64) -> CommittedEpisode {
     let mut episode = episode(number, 1 + (number as usize * 7) % 11, Outcome::Collided);
     if number.is_multiple_of(3) {
@@ -30,7 +30,7 @@ fn draw(replay: &Replay, seed: u64) -> Minibatch {
     batch
 }
 
-/// Every image drawn is that of its transition, which its reward tells.
+/// Asserts that every sampled image belongs to its transition, which the reward identifies.
 fn assert_images_belong(batch: &Minibatch) {
     let images = batch.images.chunks_exact(IMAGE_PIXELS);
     let next_images = batch.next_images.chunks_exact(IMAGE_PIXELS);
@@ -51,7 +51,7 @@ fn assert_images_belong(batch: &Minibatch) {
 }
 
 #[test]
-fn a_minibatch_has_the_images_of_its_transitions_however_often_the_ring_goes_round() {
+fn a_minibatch_has_the_images_of_its_transitions_however_often_the_ring_wraps_around() {
     for segment_steps in [usize::MAX, 2] {
         let config = end_to_end(60);
         let (most, mut replay) = (2 * 60 + 12, Replay::new(&config));
@@ -65,10 +65,10 @@ fn a_minibatch_has_the_images_of_its_transitions_however_often_the_ring_goes_rou
             }
             let now = replay.image_count().unwrap();
             swept += usize::from(now < held + episode.steps() + 1);
-            assert!(now <= most, "{now} images are held");
+            assert!(now <= most, "{now} images are stored");
             let batch = draw(&replay, number);
             assert_images_belong(&batch);
-            // As a checkpoint has it.
+            // As after a checkpoint.
             let restored = Replay::restore(&config, replay.state()).unwrap();
             assert!(restored.state() == replay.state() && draw(&restored, number) == batch);
             replay = restored;
@@ -82,7 +82,7 @@ fn a_minibatch_has_the_images_of_its_transitions_however_often_the_ring_goes_rou
 }
 
 #[test]
-fn a_buffer_restored_at_any_time_comes_to_hold_the_same() {
+fn a_buffer_restored_at_any_time_ends_with_the_same_content() {
     let config = end_to_end(60);
     let (mut undisturbed, mut restored) = (Replay::new(&config), Replay::new(&config));
     for number in 0..50 {
@@ -97,7 +97,7 @@ fn a_buffer_restored_at_any_time_comes_to_hold_the_same() {
 }
 
 #[test]
-fn transitions_are_drawn_as_without_images() {
+fn transitions_are_sampled_as_without_images() {
     let config = end_to_end(60);
     let mut with = Replay::new(&config);
     let mut without = frozen(&self::config(60, Observation::LatentVelocity));
@@ -123,7 +123,7 @@ fn an_episode_that_is_needed_whole_is_never_copied() {
         let before = replay.state().images.unwrap();
         replay.insert(flown(number + 100)).unwrap();
         let after = replay.state().images.unwrap();
-        // The newest but one lies where it lay, also if the others were swept.
+        // The second newest block stays in place, even if others were dropped.
         let newest = after.len() - 2;
         assert!(
             Arc::ptr_eq(&after[newest], before.last().unwrap()),

@@ -14,7 +14,7 @@ use skein_protocol::{IMAGE_PIXELS, TRUE_STATE};
 use super::*;
 use crate::episode::samples::{code, episode, shade, with_images};
 
-/// Length of the codes.
+/// Length of the latent codes.
 const LATENT: usize = 16;
 
 fn config(capacity: usize, observation: Observation) -> Config {
@@ -41,7 +41,7 @@ fn encode(images: &[u8]) -> Result<Vec<LatentCode>, Infallible> {
         .collect())
 }
 
-/// What the final encoder makes of an image, in contrast to [`code`].
+/// Code of an image under the final encoder, different from [`code`].
 fn final_code(shade: u8) -> LatentCode {
     code(shade).map(|value| -value - 1.0)
 }
@@ -68,7 +68,7 @@ fn a_minibatch_holds_the_configured_share_of_success() {
     }
 }
 
-/// `episode` in segments of `steps` steps, each with the images of all that it saw.
+/// Splits `episode` into segments of `steps` steps, each with the images of all its observations.
 fn in_segments(episode: &CommittedEpisode, steps: usize) -> Vec<CommittedEpisode> {
     let segment = |first: usize| {
         let end = (first + steps).min(episode.steps());
@@ -115,8 +115,8 @@ fn an_episode_stored_in_segments_is_the_episode_stored_whole() {
             whole.insert(flown).unwrap();
         }
         assert_eq!(segments.state(), whole.state());
-        segments.renew_latents(4, encode).unwrap();
-        whole.renew_latents(4, encode).unwrap();
+        segments.recode_latents(4, encode).unwrap();
+        whole.recode_latents(4, encode).unwrap();
         assert_eq!(segments.state(), whole.state());
     }
 }
@@ -146,7 +146,7 @@ fn a_segment_that_does_not_follow_what_was_stored_last_is_refused() {
 }
 
 #[test]
-fn an_empty_part_is_made_up_for_by_the_other() {
+fn the_other_part_makes_up_for_an_empty_one() {
     for level_up in [false, true] {
         let mut replay = frozen(&config(1000, Observation::Latent));
         let mut one_sided = episode(1, 20, Outcome::Collided);
@@ -159,7 +159,7 @@ fn an_empty_part_is_made_up_for_by_the_other() {
 }
 
 #[test]
-fn without_a_success_share_the_whole_buffer_is_one_part_that_knows_no_success() {
+fn without_a_success_share_the_buffer_is_one_part_and_marks_no_success() {
     let mut config = config(1000, Observation::Latent);
     config.replay.success_share = 0.0;
     let mut replay = frozen(&config);
@@ -253,18 +253,14 @@ fn rows_of_a_minibatch_belong_together() {
             assert_eq!(
                 state[17..19],
                 seen[LATENT..LATENT + 2],
-                "the critic is told of the same moment"
+                "the critic sees the same moment"
             );
-            assert_eq!(
-                state[21..],
-                seen[LATENT + 2..],
-                "and of the action before it"
-            );
+            assert_eq!(state[21..], seen[LATENT + 2..], "and the action before it");
         }
         assert_eq!(
             batch.actions[2 * index..2 * index + 2],
             next[LATENT + 2..],
-            "what is done now was done before then"
+            "the present action is the previous one of the next observation"
         );
         assert_eq!(batch.terminated[index] == 1.0, at % 1000.0 == 8.0);
     }
@@ -287,7 +283,7 @@ fn a_truncated_episode_is_not_terminated_anywhere() {
 }
 
 #[test]
-fn memory_is_bounded_and_set_aside_once() {
+fn memory_is_bounded_and_reserved_once() {
     let config = config(64, Observation::Latent);
     let mut replay = frozen(&config);
     replay.insert(episode(0, 1, Outcome::Collided)).unwrap();
@@ -372,7 +368,7 @@ fn images_are_dropped_when_the_vae_is_frozen_and_no_more_are_taken() {
 }
 
 #[test]
-fn the_encoder_sees_pieces_of_one_size_whatever_the_episodes_lengths() {
+fn the_encoder_receives_pieces_of_one_size_whatever_the_episodes_lengths() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
     for (number, steps) in [(0, 2), (1, 6), (2, 1)] {
         replay
@@ -381,7 +377,7 @@ fn the_encoder_sees_pieces_of_one_size_whatever_the_episodes_lengths() {
     }
     let mut pieces = Vec::new();
     replay
-        .renew_latents(5, |images| {
+        .recode_latents(5, |images| {
             pieces.push(images.len() / IMAGE_PIXELS);
             encode(images)
         })
@@ -397,7 +393,7 @@ fn a_failed_encoder_leaves_everything_as_it_was() {
         .unwrap();
     let before = replay.state();
     let mut calls = 0;
-    let result = replay.renew_latents(4, |images| {
+    let result = replay.recode_latents(4, |images| {
         calls += 1;
         if calls == 2 {
             Err("out of memory")
@@ -410,7 +406,7 @@ fn a_failed_encoder_leaves_everything_as_it_was() {
 }
 
 #[test]
-fn sampled_images_are_those_of_the_episodes_closing_ones_included() {
+fn sampled_images_are_the_episodes_own_closing_ones_included() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
     for number in 0..3 {
         replay
@@ -464,8 +460,8 @@ fn content_of_another_shape_is_not_restored() {
     );
 }
 
-/// Prints what a minibatch costs: `cargo test --release -p skein-learner -- --ignored --nocapture
-/// minibatch_of_256`.
+/// Prints the time of a minibatch:
+/// `cargo test --release -p skein-learner -- --ignored --nocapture minibatch_of_256`.
 #[test]
 #[ignore = "a measurement, not a claim"]
 fn time_of_a_minibatch_of_256_from_a_full_buffer() {

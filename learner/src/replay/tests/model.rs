@@ -11,7 +11,7 @@ use super::super::*;
 use super::{config, encode, final_code};
 use crate::episode::samples::{episode, with_images};
 
-/// A transition, owned.
+/// A transition that owns its values.
 #[derive(Debug, Clone, PartialEq)]
 struct Transition {
     observation: Vec<f32>,
@@ -136,7 +136,10 @@ fn assert_same(replay: &Replay, model: &Model) {
 prop_compose! {
     /// Episodes of 1 to 12 steps with crossings anywhere and every outcome.
     fn episodes()(
-        shapes in prop::collection::vec((prop::collection::vec(prop::bool::weighted(0.2), 1..12), 0..3_usize), 1..20)
+        shapes in prop::collection::vec(
+            (prop::collection::vec(prop::bool::weighted(0.2), 1..12), 0..3_usize),
+            1..20,
+        )
     ) -> Vec<CommittedEpisode> {
         shapes
             .into_iter()
@@ -154,8 +157,8 @@ prop_compose! {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Overwriting, classification, freezing at any point, saving and restoring at any point:
-    /// always what the model holds.
+    /// Overwriting, classification, freezing, saving and restoring at any point: the content is
+    /// always the model's.
     #[test]
     fn holds_what_a_naive_model_holds(
         episodes in episodes(),
@@ -179,12 +182,16 @@ proptest! {
         let (mut replay, mut model) = (Replay::new(&config), Model::new(&config));
         for (number, episode) in episodes.iter().enumerate() {
             if number == freeze_after {
-                replay.renew_latents(chunk, encode).unwrap();
+                replay.recode_latents(chunk, encode).unwrap();
                 replay.freeze();
                 model.set_latents(|vector| final_code(vector[0] as u8));
             }
             let images_live = replay.image_count().is_some();
-            replay.insert(if images_live { with_images(episode.clone()) } else { episode.clone() }).unwrap();
+            let flown = match images_live {
+                true => with_images(episode.clone()),
+                false => episode.clone(),
+            };
+            replay.insert(flown).unwrap();
             model.insert(episode);
             assert_same(&replay, &model);
             let restored = Replay::restore(&config, replay.state()).unwrap();

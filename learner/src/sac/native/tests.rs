@@ -1,4 +1,4 @@
-//! Against the reference, number by number; and that neither threads nor instructions change a bit.
+//! Native against libtorch, number by number; neither threads nor instructions change a bit.
 
 use tch::Device;
 
@@ -7,7 +7,7 @@ use super::super::samples::Transitions;
 use super::*;
 use crate::state::{NamedTensor, TensorValues};
 
-/// Numbers in an observation.
+/// Widths of observation to test.
 const OBSERVATIONS: [usize; 3] = [32, 34, 36];
 
 fn section(hidden_width: usize) -> SacSection {
@@ -17,7 +17,7 @@ fn section(hidden_width: usize) -> SacSection {
     }
 }
 
-/// Both engines before their first update.
+/// Returns both engines before their first update.
 fn both(section: &SacSection, inputs: Inputs, seed: u64) -> (NativeSac, TorchSac) {
     crate::device::use_threads(1);
     (
@@ -40,7 +40,7 @@ fn numbers(state: &mut impl Stateful) -> Vec<(String, Vec<f64>)> {
     state.into_iter().map(wide).collect()
 }
 
-/// Largest difference between two vectors, as a share of the largest number in them.
+/// Largest difference between two vectors, relative to the largest number in `expected`.
 fn distance(found: &[f64], expected: &[f64]) -> f64 {
     assert_eq!(found.len(), expected.len());
     let largest = |numbers: &mut dyn Iterator<Item = f64>| numbers.fold(0.0, f64::max);
@@ -70,7 +70,8 @@ fn assert_metrics_are_close(
     }
 }
 
-/// One update of both from the same state; what Adam then remembers is a tenth of the gradient.
+/// Updates both engines once from the same state. Adam's first moment is then a tenth of the
+/// gradient.
 fn assert_one_update_is_equal(
     native: &mut NativeSac,
     torch: &mut TorchSac,
@@ -89,8 +90,8 @@ fn assert_one_update_is_equal(
     for ((name, found), (_, expected)) in numbers(native).iter().zip(&numbers(torch)) {
         let context = format!("{context}: {name}");
         if name.ends_with("parameters") || name.ends_with("log_temperature") {
-            // Where a gradient is nearly nothing, so is what is known of its sign, which is all
-            // that the first step looks at.
+            // A gradient near zero may differ in sign between the engines, and Adam's first step
+            // depends on the sign alone.
             let apart = found
                 .iter()
                 .zip(expected)
@@ -111,14 +112,14 @@ fn assert_one_update_is_equal(
 
 #[test]
 fn gradients_and_one_update_are_the_references() {
-    // Whether the critic is told something else, and how much.
-    for (number, (observation, told)) in OBSERVATIONS
+    // `critic_width`: width of the critic's own input, if it has one.
+    for (number, (observation, critic_width)) in OBSERVATIONS
         .into_iter()
         .zip([None, Some(5), Some(50)])
         .enumerate()
     {
         let inputs = Inputs {
-            critic: told.unwrap_or(observation),
+            critic: critic_width.unwrap_or(observation),
             ..Inputs::same(observation)
         };
         for (width, rows) in [
@@ -138,8 +139,8 @@ fn gradients_and_one_update_are_the_references() {
             let (mut native, mut torch) = both(&section, inputs, seed);
             let mut noise = Noise::new(seed);
             let mut transitions = Transitions::random(observation, rows, &mut noise);
-            if let Some(told) = told {
-                transitions = transitions.telling(told, &mut noise);
+            if let Some(critic_width) = critic_width {
+                transitions = transitions.with_critic_states(critic_width, &mut noise);
             }
             let context = format!(
                 "{observation} seen, width {width}, {rows} rows, {} networks",

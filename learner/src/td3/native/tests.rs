@@ -53,8 +53,8 @@ fn forty_updates_stay_close_to_automatic_gradients() {
             (Noise::new(seed), Noise::new(9), Noise::new(9));
         let before = native.policy_parameters.values.clone();
         for number in 1..=40 {
-            let transitions =
-                Transitions::random(OBSERVATION, 50, &mut data).telling(TOLD.critic, &mut data);
+            let transitions = Transitions::random(OBSERVATION, 50, &mut data)
+                .with_critic_states(TOLD.critic, &mut data);
             let found = native
                 .update(&mut Team::new(1), transitions.columns(), &mut noise)
                 .unwrap();
@@ -148,7 +148,7 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
             (Noise::new(seed), Noise::new(seed + 1), Team::new(1));
         let mut algorithm = td3(&section, seed);
         let error = |algorithm: &NativeTd3| {
-            let asked = Transitions::guessing(OBSERVATION, 200, &mut Noise::new(77));
+            let asked = Transitions::one_step_task(OBSERVATION, 200, &mut Noise::new(77));
             let mut actions = vec![0.0; 400];
             algorithm.policy.forward_through(
                 &mut Team::new(1),
@@ -168,7 +168,7 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
         };
         let before = error(&algorithm);
         for _ in 0..1500 {
-            let transitions = Transitions::guessing(OBSERVATION, 64, &mut data);
+            let transitions = Transitions::one_step_task(OBSERVATION, 64, &mut data);
             algorithm
                 .update(&mut team, transitions.columns(), &mut noise)
                 .unwrap();
@@ -178,7 +178,7 @@ fn it_learns_to_guess_and_goes_on_bit_for_bit_from_its_state() {
 
         let mut resumed = td3(&section, seed + 10);
         resumed.load_named(&algorithm.named_tensors()).unwrap();
-        let transitions = Transitions::guessing(OBSERVATION, 64, &mut data);
+        let transitions = Transitions::one_step_task(OBSERVATION, 64, &mut data);
         for either in [&mut algorithm, &mut resumed] {
             either
                 .update(&mut team, transitions.columns(), &mut Noise::new(5))

@@ -1,12 +1,12 @@
-//! What is done number by number between the products.
+//! Elementwise operations between the matrix products.
 
 use skein_kernels::{Isa, sigmoid};
 
-/// Numbers summed side by side; sums of sums follow in order. So the result does not depend on how
-/// wide a register is.
+/// Width of partial sums, which are then added in order. So the result does not depend on the
+/// register width.
 pub(super) const LANES: usize = 16;
 
-/// Gives every pixel of `image`, `[pixels, channels]`, the `bias`, `[channels]`.
+/// Sets every pixel of `image`, `[pixels, channels]`, to `bias`, `[channels]`.
 pub(super) fn fill(image: &mut [f32], bias: &[f32]) {
     if let [bias] = bias {
         return image.fill(*bias);
@@ -16,7 +16,7 @@ pub(super) fn fill(image: &mut [f32], bias: &[f32]) {
     }
 }
 
-/// Zero for what is below zero. Not a number stays what it is.
+/// Applies ReLU in place. NaN stays NaN.
 pub(super) fn rectify(isa: Isa, values: &mut [f32]) {
     isa.vectorised(
         #[inline(always)]
@@ -28,7 +28,7 @@ pub(super) fn rectify(isa: Isa, values: &mut [f32]) {
     );
 }
 
-/// Zero where `by` is not above zero: the gradient through a ReLU whose output `by` is.
+/// Sets values to zero where `by` is not positive: the gradient through a ReLU with output `by`.
 pub(super) fn gate(isa: Isa, values: &mut [f32], by: &[f32]) {
     isa.vectorised(
         #[inline(always)]
@@ -40,7 +40,7 @@ pub(super) fn gate(isa: Isa, values: &mut [f32], by: &[f32]) {
     );
 }
 
-/// Adds up the rows of `[rows, sums.len()]`, in order.
+/// Sums the rows of `[rows, sums.len()]`, in order.
 pub(super) fn column_sums(isa: Isa, rows: &[f32], sums: &mut [f32]) {
     let columns = sums.len();
     if columns < LANES {
@@ -102,7 +102,7 @@ pub(super) fn squares(isa: Isa, values: &[f32]) -> f64 {
     total
 }
 
-/// Depth as the networks see it, in [0, 1].
+/// Converts depth bytes to pixels in [0, 1].
 pub(super) fn scale(isa: Isa, bytes: &[u8], pixels: &mut [f32]) {
     isa.vectorised(
         #[inline(always)]
@@ -114,7 +114,7 @@ pub(super) fn scale(isa: Isa, bytes: &[u8], pixels: &mut [f32]) {
     );
 }
 
-/// The sigmoid of each number.
+/// Applies the sigmoid in place.
 pub(super) fn sigmoids(isa: Isa, values: &mut [f32]) {
     isa.vectorised(
         #[inline(always)]
@@ -126,8 +126,8 @@ pub(super) fn sigmoids(isa: Isa, values: &mut [f32]) {
     );
 }
 
-/// Replaces the numbers before the last sigmoid by `weight` times half the squared error's gradient
-/// with respect to them. Returns the sum of squared errors between sigmoid and `pixels`.
+/// Replaces the inputs of the last sigmoid by `weight` times the gradient of half the squared error
+/// in them. Returns the sum of squared errors between sigmoid and `pixels`.
 pub(super) fn reconstruction_error(
     isa: Isa,
     values: &mut [f32],

@@ -1,11 +1,10 @@
 //! The decoder's first transposed convolution: three pixels of 1024 channels to 5 × 11 of 128.
 //!
-//! It has three quarters of all weights and three windows an image, so that reading the weights,
-//! not multiplying with them, would take the time. Therefore it is done for the whole batch at
-//! once, and in blocks of weights that have nothing to do with each other: what an input pixel
-//! makes of the image are five runs of seven pixels, one in each image row; a block is a part of a
-//! run, for all input channels. From its gradient through Adam to being packed for the next step, a
-//! block stays in the caches, and no gradient of the whole is ever stored.
+//! It has three quarters of all weights but only three windows per image, so reading the weights,
+//! not multiplying, would take the time. Therefore it is computed for the whole batch at once, in
+//! independent blocks of weights. An input pixel contributes five runs of seven pixels to the
+//! image, one in each image row; a block is one run, for all input channels. A block stays in the
+//! caches from its gradient through Adam to packing, and the whole gradient is never stored.
 
 use skein_kernels::{
     AdamStep, Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product,
@@ -14,9 +13,9 @@ use skein_kernels::{
 use super::buffer::Buffer;
 use super::elementwise::{fill, squares};
 use super::layer::STRIDE;
-use super::order::Affine;
+use super::order::LayerRanges;
 
-/// Rows of the image, and of the kernel: the input has one row, so kernel row k makes image row k
+/// Rows of the image and of the kernel: the input has one row, so kernel row k makes image row k
 /// and nothing else.
 const ROWS: usize = 5;
 /// Pixels of the input.
@@ -25,15 +24,15 @@ const INPUTS: usize = 3;
 const INPUT_CHANNELS: usize = 1024;
 const KERNEL_WIDTH: usize = 7;
 const CHANNELS: usize = 128;
-/// What an input pixel makes of an image row: seven pixels side by side.
+/// Length of an input pixel's contribution to an image row: seven pixels side by side.
 const RUN: usize = KERNEL_WIDTH * CHANNELS;
-/// Numbers in a row of the image, 11 pixels.
+/// Length of an image row, 11 pixels.
 const ROW: usize = (STRIDE * (INPUTS - 1) + KERNEL_WIDTH) * CHANNELS;
-/// Numbers in the input, and in the image.
+/// Lengths of the input and of the image.
 pub(super) const INPUT_LEN: usize = INPUTS * INPUT_CHANNELS;
 pub(super) const IMAGE_LEN: usize = ROWS * ROW;
-/// Blocks that a run is cut into. One: [`super::order::Order`] keeps the weights of a kernel row as
-/// `[1024, 7 · 128]`, so blocks of less would read them in the wrong order.
+/// Blocks that a run is cut into. One: [`super::order::ParameterOrder`] keeps the weights of a
+/// kernel row as `[1024, 7 · 128]`, so blocks of less would read them in the wrong order.
 pub(super) const PARTS: usize = 1;
 /// Numbers of a run in a block.
 const PART: usize = RUN / PARTS;
@@ -42,19 +41,19 @@ const BLOCKS: usize = ROWS * PARTS;
 /// Weights in a block, `[1024, PART]`.
 const BLOCK: usize = INPUT_CHANNELS * PART;
 
-/// The layer.
+/// The layer's packed weights and the batch's columns.
 #[derive(Debug)]
 pub(super) struct Unfold {
-    pub(super) place: Affine,
+    pub(super) place: LayerRanges,
     /// Of each block, `[1024, PART]`.
     panels: [Panels; BLOCKS],
-    /// The weights as an image, of which an input channel sees all numbers that are its own.
+    /// The block weights seen as an image, so that a window holds all weights of one input channel.
     weights: Windows,
     /// What each input pixel makes of each run, or what flows back to it: `[BLOCKS, 3 n, PART]`.
     columns: Buffer,
 }
 
-/// Working memory of a member.
+/// Working memory of one team member.
 #[derive(Debug)]
 pub(super) struct UnfoldScratch {
     team: Team,
@@ -76,7 +75,7 @@ impl UnfoldScratch {
     }
 }
 
-/// What a member needs to move a block of weights.
+/// One block of weights, with all that its update needs.
 #[derive(Debug)]
 pub(super) struct Block<'a> {
     panels: &'a mut Panels,
@@ -87,7 +86,7 @@ pub(super) struct Block<'a> {
 }
 
 impl Unfold {
-    pub(super) fn new(isa: Isa, place: Affine) -> Self {
+    pub(super) fn new(isa: Isa, place: LayerRanges) -> Self {
         assert_eq!(place.weight.len(), BLOCKS * BLOCK, "the layer's weights");
         Self {
             place,
@@ -97,7 +96,7 @@ impl Unfold {
         }
     }
 
-    /// Takes over the weights.
+    /// Packs the present weights.
     pub(super) fn pack(&mut self, parameters: &[f32]) {
         let weights = parameters[self.place.weight.clone()].chunks_exact(BLOCK);
         for (panels, weights) in self.panels.iter_mut().zip(weights) {
@@ -105,7 +104,7 @@ impl Unfold {
         }
     }
 
-    /// First half of the forward pass: what each input pixel, `[3 n, 1024]`, makes of the image.
+    /// First half of the forward pass: multiplies each input pixel, `[3 n, 1024]`, with all blocks.
     pub(super) fn multiply(&mut self, team: &mut Team, input: &[f32]) {
         let pixels = input.len() / INPUT_CHANNELS;
         self.columns.resize(BLOCKS * pixels * PART);
@@ -128,7 +127,7 @@ impl Unfold {
         }
     }
 
-    /// Second half: image number `index` of the batch, `[5, 11, 128]`, before its ReLU.
+    /// Second half: adds up image `index` of the batch, `[5, 11, 128]`, before its ReLU.
     pub(super) fn add_up(&self, isa: Isa, bias: &[f32], index: usize, image: &mut [f32]) {
         fill(image, bias);
         for (row, image) in image.chunks_exact_mut(ROW).enumerate() {
@@ -154,8 +153,8 @@ impl Unfold {
         &self.columns[(block * pixels + pixel) * PART..][..PART]
     }
 
-    /// First half of the backward pass: what each input pixel sees of the gradient grad back to the
-    /// images, `[n, 5, 11, 128]`.
+    /// First half of the backward pass: gathers the columns of each input pixel from the gradient
+    /// with respect to the images, `[n, 5, 11, 128]`.
     pub(super) fn gather(&mut self, grad: &[f32]) {
         let images = grad.len() / (ROWS * ROW);
         self.columns.resize(BLOCKS * INPUTS * images * PART);
@@ -172,11 +171,12 @@ impl Unfold {
         }
     }
 
-    /// Second half: the gradient with respect to the inputs of some images, `[3 · images, 1024]`,
-    /// the first of which is number `first` of the batch; zero where `gate` is.
+    /// Second half: computes the gradient with respect to the inputs of some images,
+    /// `[3 · images, 1024]`, starting with image `first` of the batch. It is zero where `gate` is
+    /// not positive.
     ///
-    /// The weights are the left operand, read where they lie, and not packed for it: pixels are
-    /// few, weights are many.
+    /// The weights are the left operand and are read in place, not packed: pixels are few, weights
+    /// are many.
     pub(super) fn backward(
         &self,
         parameters: &[f32],
@@ -217,13 +217,13 @@ impl Unfold {
         }
     }
 
-    /// At least the sum of the weights' gradient's squares (Cauchy and Schwarz): if it is finite,
-    /// so is each of them.
+    /// Upper bound of the squared norm of the weights' gradient (Cauchy and Schwarz): if it is
+    /// finite, the gradient is.
     pub(super) fn gradient_bound(&self, isa: Isa, input: &[f32]) -> f64 {
         squares(isa, input) * squares(isa, &self.columns)
     }
 
-    /// The weights in blocks.
+    /// Splits the weights, their moments and columns into blocks.
     pub(super) fn blocks<'a>(
         &'a mut self,
         parameters: &'a mut [f32],
@@ -249,7 +249,7 @@ impl Unfold {
             .collect()
     }
 
-    /// Operations of one pass, for an image.
+    /// Operations of one pass per image.
     pub(super) fn operations() -> f64 {
         2.0 * (INPUTS * BLOCKS * BLOCK) as f64
     }
@@ -274,7 +274,7 @@ impl Block<'_> {
         found
     }
 
-    /// Moves the weights against the gradient left by [`Block::gradient`], and packs them.
+    /// Applies Adam with the gradient left by [`Block::gradient`], and packs the weights.
     pub(super) fn step(&mut self, isa: Isa, adam: AdamStep, scratch: &mut UnfoldScratch) {
         let [first, second] = &mut self.moments;
         adam.apply(

@@ -99,8 +99,8 @@ fn gradient_matches_finite_differences() {
     let loss = |vae: &TorchVae| vae.objective(&pixels, &code_noise).loss;
     let gradient = vae.parameters.gradient(&loss(&vae));
 
-    // Along its own gradient, the loss of each tensor rises by the gradient's length: a tensor out
-    // of place in the flat vector would show.
+    // Along its own gradient, the loss rises by the gradient's norm. A tensor out of place in the
+    // flat vector would show.
     let _guard = no_grad_guard();
     let mut start = 0;
     for tensor in vae.parameters.layout().clone().tensors() {
@@ -195,7 +195,7 @@ fn a_non_finite_loss_changes_nothing() {
 }
 
 #[test]
-fn a_u_net_reproduces_what_a_plain_decoder_cannot_and_ends_with_the_same_encoder_for_actors() {
+fn a_u_net_reproduces_more_than_a_plain_decoder_and_publishes_an_encoder_of_equal_layout() {
     let section = VaeSection {
         decoder: DecoderName::UNet,
         ..VaeSection::default()
@@ -209,7 +209,7 @@ fn a_u_net_reproduces_what_a_plain_decoder_cannot_and_ends_with_the_same_encoder
         vae.publish(&mut values);
         values
     };
-    assert_eq!(published(&u_net), published(&plain), "both begin alike");
+    assert_eq!(published(&u_net), published(&plain), "both start alike");
     let images = synthetic_images(8, 1);
     assert_eq!(u_net.reconstruct(&images).size(), [8, 72, 128]);
     let mut noise = [Noise::new(4), Noise::new(4)];

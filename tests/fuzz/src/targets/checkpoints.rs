@@ -8,13 +8,13 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, LazyLock};
 
 use skein_learner::checkpoint::{
-    CheckpointState, CheckpointStore, EpochOrder, Progress, checkpoint_directory,
+    CheckpointState, CheckpointStore, EpochOrder, TrainingProgress, checkpoint_directory,
 };
 use skein_learner::disk::Disk;
-use skein_learner::episodes::assembly::Keep;
+use skein_learner::episodes::assembly::KeptData;
 use skein_learner::metrics::{EpisodeRow, EpisodesCsv, EventFile, EventWriter};
 use skein_learner::replay::Replay;
-use skein_learner::state::{NamedTensor, Part, Stateful, TensorValues};
+use skein_learner::state::{NamedTensor, StatePart, Stateful, TensorValues};
 use skein_protocol::config::Config;
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::Snapshot;
@@ -82,18 +82,18 @@ fn state() -> CheckpointState {
         values,
     };
     CheckpointState {
-        progress: Progress {
+        progress: TrainingProgress {
             episodes: EPISODES,
             epochs: 2,
             version: 2,
-            in_the_air: vec![EpochOrder {
+            in_flight: vec![EpochOrder {
                 epoch: 2,
                 policy_version: 1,
                 exploration: Exploration::Sample,
-                keep: Keep::Depth,
+                keep: KeptData::Depth,
             }],
             latest_candidate: Some(5),
-            ..Progress::start(config().evaluation.window_episodes as usize)
+            ..TrainingProgress::start(config().evaluation.window_episodes as usize)
         },
         tensors: vec![
             tensor("single", &[3, 2], TensorValues::F32(vec![0.5; 6])),
@@ -258,11 +258,11 @@ impl Own {
 }
 
 impl Stateful for Own {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let part = match self.part {
-            "single" => Part::Tensor(self.tensor.shallow_clone()),
-            "flat" => Part::Numbers(&mut self.numbers),
-            _ => Part::Count(&mut self.count),
+            "single" => StatePart::Tensor(self.tensor.shallow_clone()),
+            "flat" => StatePart::Numbers(&mut self.numbers),
+            _ => StatePart::Count(&mut self.count),
         };
         vec![(self.part.to_owned(), part)]
     }

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use bytemuck::{Zeroable, bytes_of_mut};
 use skein_learner::episode::CommittedEpisode;
-use skein_learner::episodes::assembly::Keep;
-use skein_learner::episodes::dispatcher::{Dispatcher, Order, Place};
+use skein_learner::episodes::assembly::KeptData;
+use skein_learner::episodes::dispatcher::{BatchPlace, Dispatcher, EpisodeOrder};
 use skein_protocol::config::TransportSection;
 use skein_protocol::ids::{
     ActorId, ActorIncarnation, Attempt, EpisodeId, Epoch, PolicyVersion, RunId,
@@ -126,7 +126,7 @@ struct Learner {
     dispatcher: Dispatcher,
     now: Instant,
     held: Vec<Held>,
-    committed: BTreeSet<Place>,
+    committed: BTreeSet<BatchPlace>,
 }
 
 /// A ticket, as the incarnation of an actor that holds it knows it.
@@ -145,11 +145,11 @@ impl Learner {
         };
         let mut dispatcher = Dispatcher::new(RUN, &limits, LATENT);
         for episode in 0..EPISODES {
-            dispatcher.order(Order {
+            dispatcher.order(EpisodeOrder {
                 ticket: sample_ticket(episode),
                 epoch: Epoch(0),
                 keep: keep(episode),
-                place: Place {
+                place: BatchPlace {
                     batch: 0,
                     index: episode as usize,
                 },
@@ -272,11 +272,11 @@ impl Learner {
     }
 }
 
-fn keep(episode: u64) -> Keep {
+fn keep(episode: u64) -> KeptData {
     if episode.is_multiple_of(2) {
-        Keep::Depth
+        KeptData::Depth
     } else {
-        Keep::Latents
+        KeptData::Latents
     }
 }
 
@@ -297,7 +297,7 @@ fn assert_sound(episode: &CommittedEpisode) {
     );
     assert_eq!(
         episode.depth.is_some(),
-        keep(episode.episode.0) == Keep::Depth
+        keep(episode.episode.0) == KeptData::Depth
     );
     assert!(episode.observations.len() <= LONGEST_EPISODE);
     assert!(episode.walls_passed <= episode.course_walls);

@@ -68,7 +68,7 @@ fn restore(bytes: &[u8]) -> Verdict {
     let _ = replay.insert(episode());
     let encode =
         |images: &[u8]| Ok::<_, ()>(vec![[0.5; LONGEST_LATENT]; images.len() / IMAGE_PIXELS]);
-    replay.renew_latents(8, encode).unwrap();
+    replay.recode_latents(8, encode).unwrap();
     replay.freeze();
     assert_eq!(replay.image_count(), None);
     Verdict::Accepted
