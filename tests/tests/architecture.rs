@@ -111,9 +111,42 @@ fn every_package_keeps_to_its_side_of_the_fence() {
             physics.to_vec(),
         ),
         (
-            "skein-launch",
-            &["skein-kernels", "skein-protocol", "skein-simulator"],
+            "skein-prepare",
+            &["skein-protocol", "skein-simulator"],
             torch.to_vec(),
+        ),
+        (
+            "skein-reports",
+            &["skein-protocol", "skein-simulator"],
+            torch.to_vec(),
+        ),
+        // An experiment starts `skein run`: it knows no supervisor.
+        (
+            "skein-experiments",
+            &[
+                "skein-prepare",
+                "skein-protocol",
+                "skein-reports",
+                "skein-simulator",
+            ],
+            torch.to_vec(),
+        ),
+        (
+            "skein-launch",
+            &[
+                "skein-experiments",
+                "skein-prepare",
+                "skein-protocol",
+                "skein-reports",
+                "skein-simulator",
+            ],
+            torch.to_vec(),
+        ),
+        // Whoever judges a run trusts no program of it.
+        (
+            "skein-chaos",
+            &["skein-protocol"],
+            [torch, physics].concat(),
         ),
     ] {
         for of in [Of::Programs, Of::Tests] {
@@ -135,6 +168,7 @@ fn what_is_fenced_in_is_found_where_it_belongs() {
         ("skein-simulator", "rapier3d"),
         ("skein-protocol", "iceoryx2"),
         ("skein-actor", "rapier3d"),
+        ("skein-reports", "plotters"),
     ] {
         assert!(
             dependencies(&metadata, package, Of::Programs).contains(inside),

@@ -13,7 +13,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
-use skein_launch::inspection::compare;
+use skein_chaos::compare;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::run::RunDirectory;
 use skein_protocol::summary::{Ending, Summary};
@@ -77,17 +77,17 @@ impl Scene {
 
     fn arguments(&self, more: &[&str]) -> Vec<String> {
         let repository = self.path("").display().to_string();
-        let all = ["--repository", repository.as_str(), "tiny"];
+        let all = ["experiment", "--repository", repository.as_str(), "tiny"];
         all.iter().chain(more).map(ToString::to_string).collect()
     }
 
     /// Runs it to its end.
     fn finish(&self, more: &[&str]) -> Output {
-        run_program("skein-experiment", &self.arguments(more))
+        run_program("skein", &self.arguments(more))
     }
 
     fn start(&self) -> Child {
-        Command::new(program("skein-experiment"))
+        Command::new(program("skein"))
             .args(self.arguments(&[]))
             .stdin(Stdio::null())
             .stdout(Stdio::null())
@@ -198,7 +198,10 @@ fn an_experiment_that_cannot_be_run_does_not_hide_the_others() {
     )
     .unwrap();
     let repository = scene.path("").display().to_string();
-    let output = run_program("skein-experiment", &["--repository", &repository, "--list"]);
+    let output = run_program(
+        "skein",
+        &["experiment", "--repository", &repository, "--list"],
+    );
     assert_eq!(output.code, Some(1));
     assert!(
         output.stdout.contains("tiny") && output.stdout.contains("What for?"),

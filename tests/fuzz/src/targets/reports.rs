@@ -3,10 +3,9 @@
 
 use std::sync::LazyLock;
 
-use skein_launch::inspection::read_curves;
-use skein_launch::prepare::NamedCourse;
-use skein_launch::reports::{Material, draw_all};
+use skein_chaos::read_curves;
 use skein_protocol::run::RunDirectory;
+use skein_reports::{Material, NamedCourse, draw_all};
 use skein_simulator::course::{Course, CourseLayout};
 
 use super::courses::layout;
