@@ -62,7 +62,7 @@ impl ExperimentArguments {
         // What would keep hours of work from being published is told before they begin.
         if self.publish && (self.episodes.is_some() || seeds < experiment.seeds) {
             bail!(
-                "--publish puts the whole experiment into RESULTS.md, and --episodes or fewer than {} would leave a part of it there: leave out the one or the other",
+                "--publish puts the whole experiment into docs/results/{name}.md, and --episodes or fewer than {} would leave a part of it there: leave out the one or the other",
                 plural(experiment.seeds as usize, "seed")
             );
         }

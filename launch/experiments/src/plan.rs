@@ -159,24 +159,15 @@ impl Plan {
     /// # Errors
     /// [`PlanError::UnderWay`] when another process has it.
     pub fn claim(root: &Path) -> Result<Claim, PlanError> {
-        match claim(root).map_err(io_at(root))? {
-            Some(directory) => Ok(Claim {
+        fs::create_dir_all(root).map_err(io_at(root))?;
+        let directory = File::open(root).map_err(io_at(root))?;
+        match directory.try_lock() {
+            Ok(()) => Ok(Claim {
                 _directory: directory,
             }),
-            None => Err(PlanError::UnderWay(root.to_owned())),
+            Err(TryLockError::WouldBlock) => Err(PlanError::UnderWay(root.to_owned())),
+            Err(TryLockError::Error(error)) => Err(io_at(root)(error)),
         }
-    }
-}
-
-/// Makes `folder`, and claims it for this process for as long as what it gives is held; `None` when
-/// another process has it.
-pub(super) fn claim(folder: &Path) -> io::Result<Option<File>> {
-    fs::create_dir_all(folder)?;
-    let handle = File::open(folder)?;
-    match handle.try_lock() {
-        Ok(()) => Ok(Some(handle)),
-        Err(TryLockError::WouldBlock) => Ok(None),
-        Err(TryLockError::Error(error)) => Err(error),
     }
 }
 

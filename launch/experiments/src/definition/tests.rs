@@ -115,9 +115,9 @@ fn what_flies_less_than_the_paper_is_shortened_and_what_flies_as_much_is_not() {
 }
 
 #[test]
-fn the_example_in_the_readme_can_be_run() {
-    let readme = fs::read_to_string(shipped("../README.md")).unwrap();
-    let example = readme
+fn the_example_in_the_documents_can_be_run() {
+    let document = fs::read_to_string(shipped("../docs/experiments.md")).unwrap();
+    let example = document
         .split("```toml\n")
         .find(|part| part.starts_with("question = "))
         .unwrap();

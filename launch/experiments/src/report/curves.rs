@@ -27,7 +27,8 @@ impl Findings<'_> {
             );
             let comparison = self.comparison(curve)?;
             if comparison.draw(&folder.join(&file))? {
-                let caption = format!("{}, over {}", comparison.title, comparison.x);
+                let what = measure_title(curve.measure);
+                let caption = format!("{what} per training episode over {}", comparison.x);
                 pictures.push(Picture { file, caption });
             }
         }
@@ -37,11 +38,7 @@ impl Findings<'_> {
     fn comparison(&self, curve: Curve) -> Result<Comparison<'_>, ExperimentReportError> {
         let arms = &self.experiment.arms;
         let window = arms[0].config.evaluation.window_episodes;
-        let what = match curve.measure {
-            Measure::WallsPassed => "Walls passed",
-            Measure::Return => "Return",
-            Measure::Drawdown => "Drawdown of the walls passed",
-        };
+        let what = measure_title(curve.measure);
         let shortened = match self.experiment.shortened() {
             Some(_) => " (shortened runs)",
             None => "",
@@ -125,6 +122,14 @@ fn summed_up(curves: &[Vec<(f64, f64)>], bootstrap: &Bootstrap) -> Vec<(f64, Est
 fn value_at(curve: &[(f64, f64)], x: f64) -> f64 {
     let after = curve.partition_point(|point| point.0 <= x);
     curve[after.saturating_sub(1)].1
+}
+
+fn measure_title(measure: Measure) -> &'static str {
+    match measure {
+        Measure::WallsPassed => "Walls passed",
+        Measure::Return => "Return",
+        Measure::Drawdown => "Drawdown of the walls passed",
+    }
 }
 
 pub(super) fn measure_name(measure: Measure) -> &'static str {

@@ -4,18 +4,17 @@ use std::collections::BTreeSet;
 use std::fmt::Write;
 
 use super::{Findings, Picture};
-use crate::definition::{Experiment, TableKind};
+use crate::definition::Experiment;
 use crate::results::RunResult;
 use skein_reports::Clock;
 
 impl Findings<'_> {
-    /// The report as Markdown; its pictures and `runs`, the figures of each run, lie where `prefix`
-    /// and a file's name say.
-    pub(super) fn document(&self, pictures: &[Picture], prefix: &str, runs: &str) -> String {
-        let mut text = format!(
-            "**{}**\n\n```sh\n{}\n```\n\n",
-            self.experiment.question, self.command
-        );
+    /// The report as Markdown, without a heading. `runs` and the pictures' files are paths from
+    /// where it stands.
+    ///
+    /// How to read its tables is explained once, in `docs/results/README.md`.
+    pub(super) fn body(&self, pictures: &[Picture], runs: &str) -> String {
+        let mut text = String::new();
         push(&mut text, &self.what_was_run());
         if let Some(note) = self.shortened() {
             push(&mut text, &note);
@@ -33,20 +32,24 @@ impl Findings<'_> {
                 push(&mut text, &titled.table);
             }
         }
-        for picture in pictures {
-            push(
-                &mut text,
-                &format!("![{}]({prefix}{})", picture.caption, picture.file),
-            );
+        for Picture { file, caption } in pictures {
+            push(&mut text, &format!("![{caption}]({file})"));
         }
         push(
             &mut text,
-            &format!(
-                "Every run's own figures, and the SHA-256 of what it learned: [one line a run]({prefix}{runs})."
-            ),
+            &format!("The figures of each run: [{runs}]({runs})."),
         );
-        push(&mut text, &self.how_to_read(pictures));
         text
+    }
+
+    /// The heading of a document of its own: the question.
+    pub(super) fn heading(&self) -> String {
+        format!("# {}\n\n", self.experiment.question)
+    }
+
+    /// The command that makes the report again.
+    pub(super) fn how_to_repeat(&self) -> String {
+        format!("## Repeat it\n\n```sh\n{}\n```\n", self.command)
     }
 
     fn what_was_run(&self) -> String {
@@ -63,7 +66,7 @@ impl Findings<'_> {
             text.push('.');
             return text;
         }
-        text.push_str("; the arms set, beside that:\n\n");
+        text.push_str(". The arms also set:\n\n");
         for arm in arms {
             let settings = match arm.settings.is_empty() {
                 true => "nothing".to_owned(),
@@ -92,7 +95,7 @@ impl Findings<'_> {
             seeds => format!("{seeds} seeds"),
         };
         format!(
-            "{seeds} an arm; a run: {} episodes, {} steps, {} updates, {} of wall time. Skein {}.",
+            "{seeds} an arm. A run: {} episodes, {} steps, {} updates, {} of wall time. Skein {}.",
             range(
                 self.results,
                 |run| run.summary.episodes as f64,
@@ -132,53 +135,12 @@ impl Findings<'_> {
             .collect();
         versions.into_iter().collect()
     }
-
-    fn how_to_read(&self, pictures: &[Picture]) -> String {
-        let tables = &self.experiment.tables;
-        let estimates = tables.iter().any(|kind| *kind != TableKind::Outcomes);
-        let mut text = String::new();
-        if estimates {
-            text.push_str(match self.plan.seeds {
-                1 => "One seed has no interval, and says nothing about others. ",
-                2 | 3 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval, which of so few seeds reaches from the least value to the greatest, and is rather too narrow. ",
-                4 | 5 => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval; of so few seeds it is a rough one, and rather too narrow. ",
-                _ => "Interquartile mean over the seeds, in brackets its 95 % bootstrap interval. ",
-            });
-        }
-        if tables.contains(&TableKind::Suite) {
-            text.push_str("*Completed, mean* is the plain mean, in which the worst seed counts as much as any, with an interval of its own. ");
-        }
-        let window = self.experiment.arms[0].config.evaluation.window_episodes;
-        if tables.contains(&TableKind::Learning) {
-            text.push_str(
-                "A run that never came to a wall or to the rate counts with all that it took (≥). ",
-            );
-        }
-        if tables.contains(&TableKind::Learning) || tables.contains(&TableKind::Steadiness) {
-            let _ = write!(
-                text,
-                "Volatility is the root mean square of the differences between the walls passed in successive {window} episodes, once they have risen to 0.9 of the level that the run comes to; – where a run has too few episodes after that. A run that has learned nothing has a small one as well: read it beside the walls passed. "
-            );
-        }
-        if tables.contains(&TableKind::Steadiness) {
-            let _ = write!(
-                text,
-                "The level is what a run comes to: the median of the averages over {window} episodes in its second half. Dispersion across time is the interquartile range of the differences between the walls passed in successive {window} episodes, once they have risen to 0.9 of the level that the run comes to; the largest drawdown is how far the average over {window} episodes ever fell below the highest it had been (arXiv:1912.05663). "
-            );
-        }
-        if !pictures.is_empty() {
-            text.push_str("Lines are interquartile means over the seeds, bands their 95 % bootstrap intervals; a line ends where the first of its runs does. ");
-        }
-        text.trim_end().to_owned()
-    }
 }
 
 /// One paragraph more.
 fn push(text: &mut String, paragraph: &str) {
-    if !paragraph.is_empty() {
-        text.push_str(paragraph);
-        text.push_str("\n\n");
-    }
+    text.push_str(paragraph);
+    text.push_str("\n\n");
 }
 
 fn code(settings: &[String]) -> String {

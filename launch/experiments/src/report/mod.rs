@@ -22,6 +22,9 @@ use skein_simulator::course::CourseError;
 
 pub use publication::{Publication, PublicationError};
 
+/// Where a report that lies beside its runs sends its reader.
+const LEGEND: &str = "How to read these tables and pictures: docs/results/README.md.\n\n";
+
 /// What a report is drawn from.
 #[derive(Debug)]
 pub struct Findings<'a> {
@@ -99,7 +102,12 @@ impl Findings<'_> {
         let pictures = self.draw(&folder)?;
         let runs = folder.join(RUNS);
         self.write_runs(&runs).map_err(write(&runs))?;
-        let text = self.document(&pictures, "", RUNS);
+        let text = format!(
+            "{}{}{LEGEND}{}",
+            self.heading(),
+            self.body(&pictures, RUNS),
+            self.how_to_repeat()
+        );
         let document = folder.join("report.md");
         fs::write(&document, &text).map_err(write(&document))?;
         Ok(Written {

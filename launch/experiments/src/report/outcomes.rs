@@ -24,12 +24,12 @@ impl Findings<'_> {
     /// Of the evaluation courses, and of the entries of the suite, if there is one.
     pub(super) fn outcomes(&self) -> Vec<Titled> {
         let courses = Titled {
-            title: "How the evaluation episodes went, all seeds together".to_owned(),
+            title: "How the evaluation episodes ended, all seeds together".to_owned(),
             table: self.outcomes_of(&self.courses(), course_of),
         };
         let suite = self.experiment.suite.as_ref().map(|flown| Titled {
             title: format!(
-                "How the episodes of the suite `{}` went, all seeds together",
+                "How the episodes of the suite `{}` ended, all seeds together",
                 flown.file_name()
             ),
             table: self.outcomes_of(&self.entries(), entry_of),

@@ -1,28 +1,34 @@
-//! Putting a report where readers find it: RESULTS.md, and the pictures of the documents.
+//! Publishes a report in the documents: `docs/results/NAME.md`, its pictures and the figures of
+//! each run.
 
-use std::fs::{self, File};
+use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use super::runs::RUNS;
 use super::{Findings, Picture, Written};
-use crate::plan::{self, REPORT};
+use crate::plan::REPORT;
 
-/// What begins the part of RESULTS.md that belongs to an experiment, before its name.
-const BEGIN: &str = "<!-- experiment: ";
-/// What ends the part of RESULTS.md that belongs to an experiment.
+/// Folder of the published reports, relative to the repository.
+const RESULTS: &str = "docs/results";
+/// Folder of the pictures, relative to the published reports.
+const PICTURES: &str = "pictures";
+/// Folder of the figures of each run, relative to the published reports.
+const FIGURES: &str = "runs";
+/// Line before the report in its document.
+const BEGIN: &str = "<!-- report -->";
+/// Line after it.
 const END: &str = "<!-- end -->";
-/// Where the pictures and the figures of each run lie, relative to RESULTS.md.
-const PICTURES: &str = "launch/pictures/experiments";
+/// Line under the report. The documents explain tables in one place.
+const LEGEND: &str = "[How to read these tables and pictures](README.md#how-to-read-a-table).";
 
-/// RESULTS.md, with a place for an experiment.
+/// The document of an experiment, with a place for its report.
 #[derive(Debug)]
 pub struct Publication {
-    results: PathBuf,
-    name: String,
+    document: PathBuf,
 }
 
-/// RESULTS.md without the part of the experiment.
+/// The document without the report.
 struct Surroundings {
     before: String,
     after: String,
@@ -40,124 +46,102 @@ pub enum PublicationError {
         #[source]
         source: io::Error,
     },
-    /// The part of the experiment has no end, or there are two of it.
-    #[error("{}: {problem}", path.display())]
-    Markers {
-        /// RESULTS.md.
-        path: PathBuf,
-        /// What is wrong with it, and what to write.
-        problem: String,
-    },
-    /// Somebody is publishing.
-    #[error("{}: another experiment is being published: do it again, with --report --publish", .0.display())]
-    Busy(PathBuf),
+    /// The document does not say where the report belongs.
+    #[error(
+        "{}: the report belongs between a line {BEGIN} and a line {END} after it: write both, once",
+        .0.display()
+    )]
+    Markers(PathBuf),
 }
 
 impl Publication {
-    /// Finds the place of the experiment called `name` in RESULTS.md of `repository`: between its
-    /// markers, or, where there are none, a new part at the end. Nothing is written.
+    /// Finds the place of the report of the experiment called `name` in `repository`. Nothing is
+    /// written.
     ///
     /// # Errors
-    /// [`PublicationError`] names the file and what is wrong with the markers.
+    /// [`PublicationError`] names the document and what to write into it.
     pub fn find(repository: &Path, name: &str) -> Result<Self, PublicationError> {
         let found = Self {
-            results: repository.join("RESULTS.md"),
-            name: name.to_owned(),
+            document: repository.join(RESULTS).join(format!("{name}.md")),
         };
         found.surroundings().map(|_| found)
     }
 
-    /// What RESULTS.md has around the experiment's part now.
-    fn surroundings(&self) -> Result<Surroundings, PublicationError> {
-        let text = fs::read_to_string(&self.results).map_err(at(&self.results))?;
-        let begin = &self.begin();
-        let markers = |problem| {
-            Err(PublicationError::Markers {
-                path: self.results.clone(),
-                problem,
-            })
+    /// What the document has around the report now; `None` if there is no document yet.
+    fn surroundings(&self) -> Result<Option<Surroundings>, PublicationError> {
+        let text = match fs::read_to_string(&self.document) {
+            Ok(text) => text,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(at(&self.document)(error)),
         };
-        let parts: Vec<&str> = text.split(begin).collect();
-        match parts[..] {
-            [all] => Ok(Surroundings {
-                before: format!("{}\n\n## Experiment: {}\n\n", all.trim_end(), self.name),
-                after: "\n".to_owned(),
-            }),
-            [before, after] => match after.split_once(END) {
-                Some((mine, after)) if !mine.contains(BEGIN) => Ok(Surroundings {
-                    before: before.to_owned(),
-                    after: after.to_owned(),
-                }),
-                _ => markers(format!(
-                    "nothing ends what `{begin}` begins: write {END} after it"
-                )),
-            },
-            _ => markers(format!("`{begin}` is there more than once: leave one")),
+        let parts = text.split_once(BEGIN).and_then(|(before, rest)| {
+            let (_, after) = rest.split_once(END)?;
+            Some((before, after))
+        });
+        let once = [BEGIN, END]
+            .iter()
+            .all(|line| text.matches(line).count() == 1);
+        match parts {
+            Some((before, after)) if once => Ok(Some(Surroundings {
+                before: before.to_owned(),
+                after: after.to_owned(),
+            })),
+            _ => Err(PublicationError::Markers(self.document.clone())),
         }
     }
 
-    fn begin(&self) -> String {
-        format!("{BEGIN}{} -->", self.name)
-    }
-
-    /// Puts the report there, and its pictures and the figures of each run beside the documents'
-    /// others. Returns what was written.
+    /// Puts the report into its document, and its pictures and the figures of each run beside it.
+    /// Returns the files written.
     ///
     /// # Errors
-    /// [`PublicationError`] names the file; nothing was written where another experiment is just
-    /// being published.
+    /// [`PublicationError`] names the file.
     pub fn publish(
         &self,
         findings: &Findings<'_>,
         report: &Written,
     ) -> Result<Vec<PathBuf>, PublicationError> {
-        let repository = self.results.parent().unwrap_or(Path::new(""));
-        let folder = repository.join(PICTURES);
-        let _claim = claim(&folder)?;
+        let results = self.document.parent().unwrap_or(Path::new(""));
+        let name = &findings.experiment.name;
         let mut written = Vec::new();
-        let mut put = |file: &str| {
-            let published = format!("{}_{file}", findings.experiment.name);
-            let (from, to) = (
-                findings.plan.root.join(REPORT).join(file),
-                folder.join(&published),
-            );
+        let mut put = |file: &str, folder: &str, published: String| {
+            fs::create_dir_all(results.join(folder)).map_err(at(results))?;
+            let from = findings.plan.root.join(REPORT).join(file);
+            let within = format!("{folder}/{published}");
+            let to = results.join(&within);
             fs::copy(&from, &to).map_err(at(&to))?;
             written.push(to);
-            Ok(published)
+            Ok(within)
         };
-        let runs = put(RUNS)?;
+        let runs = put(RUNS, FIGURES, format!("{name}.csv"))?;
         let mut pictures = Vec::new();
         for Picture { file, caption } in &report.pictures {
-            let caption = caption.clone();
             pictures.push(Picture {
-                file: put(file)?,
-                caption,
+                file: put(file, PICTURES, format!("{name}_{file}"))?,
+                caption: caption.clone(),
             });
         }
-        self.write(&findings.document(&pictures, &format!("{PICTURES}/"), &runs))?;
-        written.push(self.results.clone());
+        let surroundings = Surroundings {
+            before: findings.heading(),
+            after: format!("\n\n{}", findings.how_to_repeat()),
+        };
+        self.write(&findings.body(&pictures, &runs), surroundings)?;
+        written.push(self.document.clone());
         Ok(written)
     }
 
-    /// Puts `document` into RESULTS.md as it is now: hours have passed since its place was found.
-    fn write(&self, document: &str) -> Result<(), PublicationError> {
-        let Surroundings { before, after } = self.surroundings()?;
+    /// Puts `report` into the document as it is now: hours have passed since its place was found. A
+    /// document that is not there is made with the surroundings in `new`.
+    fn write(&self, report: &str, new: Surroundings) -> Result<(), PublicationError> {
+        let Surroundings { before, after } = self.surroundings()?.unwrap_or(new);
         let text = format!(
-            "{before}{}\n{}\n{END}{after}",
-            self.begin(),
-            document.trim_end()
+            "{before}{BEGIN}\n{}\n\n{LEGEND}\n{END}{after}",
+            report.trim_end()
         );
-        let aside = self.results.with_extension("md.partial");
+        let aside = self.document.with_extension("md.partial");
         fs::write(&aside, text)
-            .and_then(|()| fs::rename(&aside, &self.results))
-            .map_err(at(&self.results))
+            .and_then(|()| fs::rename(&aside, &self.document))
+            .map_err(at(&self.document))
     }
-}
-
-/// Claims the documents, by the folder of their pictures, until what it gives is dropped.
-fn claim(folder: &Path) -> Result<File, PublicationError> {
-    let claimed = plan::claim(folder).map_err(at(folder))?;
-    claimed.ok_or_else(|| PublicationError::Busy(folder.to_owned()))
 }
 
 fn at(path: &Path) -> impl FnOnce(io::Error) -> PublicationError {
@@ -169,67 +153,67 @@ fn at(path: &Path) -> impl FnOnce(io::Error) -> PublicationError {
 mod tests {
     use super::*;
 
-    /// What RESULTS.md becomes when `new` is published for the experiment `lag`, and somebody has
-    /// put `changed` there since its place was found.
-    fn published(results: &str, changed: &str) -> Result<String, String> {
+    /// What the document becomes when `new` is published, and somebody has made it `changed` since
+    /// its place was found.
+    fn published(found: Option<&str>, changed: Option<&str>) -> Result<String, String> {
         let repository = tempfile::tempdir().unwrap();
-        let file = repository.path().join("RESULTS.md");
-        fs::write(&file, results).unwrap();
+        let results = repository.path().join(RESULTS);
+        fs::create_dir_all(&results).unwrap();
+        let file = results.join("lag.md");
+        let put = |text: Option<&str>| text.map(|text| fs::write(&file, text).unwrap());
+        put(found);
         let place =
             Publication::find(repository.path(), "lag").map_err(|error| error.to_string())?;
-        fs::write(&file, changed).unwrap();
-        place.write("new\n\n").map_err(|error| error.to_string())?;
+        put(changed);
+        let new = Surroundings {
+            before: "# Why?\n\n".to_owned(),
+            after: "\n".to_owned(),
+        };
+        let written = place.write("new\n\n", new);
+        written.map_err(|error| error.to_string())?;
         Ok(fs::read_to_string(&file).unwrap())
     }
 
-    fn place(results: &str) -> Result<String, String> {
-        published(results, results)
+    fn with(report: &str, words: &str) -> String {
+        format!("# Why?\n\n{words}\n\n{BEGIN}\n{report}\n{END}\n\nafter\n")
     }
 
     #[test]
     fn only_what_lies_between_the_markers_is_replaced() {
-        let results = "# Results\n<!-- experiment: lagging -->\nx\n<!-- end -->\n<!-- experiment: lag -->\nold\n<!-- end -->\nafter\n<!-- end -->\n";
-        assert_eq!(place(results).unwrap(), results.replace("old", "new"));
+        let (old, new) = (
+            with("old", "Because."),
+            with(&format!("new\n\n{LEGEND}"), "Because."),
+        );
+        assert_eq!(published(Some(&old), Some(&old)).unwrap(), new);
+        assert_eq!(published(Some(&new), Some(&new)).unwrap(), new);
+    }
+
+    #[test]
+    fn a_document_that_is_not_there_is_made_with_the_question() {
         assert_eq!(
-            place("# Results\n\n").unwrap(),
-            "# Results\n\n## Experiment: lag\n\n<!-- experiment: lag -->\nnew\n<!-- end -->\n"
+            published(None, None).unwrap(),
+            format!("# Why?\n\n{BEGIN}\nnew\n\n{LEGEND}\n{END}\n")
         );
     }
 
     #[test]
     fn what_was_written_while_runs_were_under_way_stays() {
-        let results = |words| format!("{words}\n<!-- experiment: lag -->\nold\n<!-- end -->\n");
-        let published = published(&results("before"), &results("since"));
-        assert_eq!(published.unwrap(), results("since").replace("old", "new"));
-    }
-
-    #[test]
-    fn two_do_not_publish_at_a_time() {
-        let folder = tempfile::tempdir().unwrap();
-        let first = claim(folder.path()).unwrap();
-        let second = claim(folder.path()).unwrap_err().to_string();
-        assert!(second.contains("--report --publish"), "{second}");
-        drop(first);
-        claim(folder.path()).unwrap();
+        let (before, since) = (with("old", "Before."), with("old", "Since."));
+        assert_eq!(
+            published(Some(&before), Some(&since)).unwrap(),
+            with(&format!("new\n\n{LEGEND}"), "Since.")
+        );
     }
 
     #[test]
     fn markers_that_leave_a_doubt_are_refused() {
-        let begin = "<!-- experiment: lag -->";
-        for unended in [
-            begin.to_owned(),
-            format!("{begin}\n<!-- experiment: k -->\n{END}"),
-        ] {
+        let twice = format!("{BEGIN}\n{END}\n{BEGIN}\n{END}");
+        for text in ["no marker", BEGIN, "<!-- end -->\n<!-- report -->", &twice] {
+            let refusal = published(Some(text), None).unwrap_err();
             assert!(
-                place(&unended)
-                    .unwrap_err()
-                    .contains("write <!-- end --> after it")
+                refusal.contains("lag.md") && refusal.contains("write both, once"),
+                "{refusal}"
             );
         }
-        assert!(
-            place(&format!("{begin}\n{END}\n{begin}\n{END}"))
-                .unwrap_err()
-                .contains("more than once")
-        );
     }
 }

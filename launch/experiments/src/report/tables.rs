@@ -42,9 +42,7 @@ impl Findings<'_> {
         let episodes = self.experiment.arms[0].config.evaluation.episodes;
         vec![
             Titled {
-                title: format!(
-                    "R, the share of walls passed, of the best snapshot in {episodes} episodes a course without exploration"
-                ),
+                title: format!("R of the best snapshot, {episodes} episodes a course"),
                 table: self.by_course(|course| course.r, rate),
             },
             Titled {
@@ -113,10 +111,7 @@ impl Findings<'_> {
             "R",
         ];
         Some(Titled {
-            title: format!(
-                "How the best snapshot flew the suite `{}` without exploration: the share of episodes that completed their course, and R",
-                flown.file_name()
-            ),
+            title: format!("The best snapshot in the suite `{}`", flown.file_name()),
             table: grid(header.map(str::to_owned).to_vec(), rows, 2),
         })
     }
@@ -180,7 +175,7 @@ impl Findings<'_> {
         header.extend(names);
         Titled {
             title: format!(
-                "Learning: after how many episodes the average of {window} came to one wall passed, when R ≥ {} was first confirmed in {} evaluation episodes on {}, and the last {window} training episodes",
+                "Learning, with R ≥ {} confirmed in {} episodes on {}",
                 evaluation.trained_rate,
                 evaluation.confirm_episodes,
                 match evaluation.confirm_on {
@@ -216,7 +211,7 @@ impl Findings<'_> {
             "largest drawdown",
         ];
         Titled {
-            title: "Steadiness of the walls passed in training: the smaller beside its level, the steadier".to_owned(),
+            title: "Steadiness of the walls passed in training".to_owned(),
             table: grid(header.map(str::to_owned).to_vec(), rows, 1),
         }
     }
@@ -299,7 +294,7 @@ impl Findings<'_> {
             "wall time",
         ];
         Titled {
-            title: "What a run took, side by side with others".to_owned(),
+            title: "Cost of a run".to_owned(),
             table: grid(header.map(str::to_owned).to_vec(), rows, 1),
         }
     }

@@ -134,7 +134,7 @@ fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
     let (experiment, plan) = two_runs(folder.path());
     let told = || {
         let runs = results::read(&plan).unwrap();
-        findings(&experiment, &plan, &runs).document(&[], "", "runs.csv")
+        findings(&experiment, &plan, &runs).body(&[], "runs.csv")
     };
     let (one, several) = (told(), "**Of several builds**");
     let shortened = "**Shortened**: 300 training episodes a run instead of the 4000 of the paper.";
