@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Measures every stage of the data's way against its baseline, and prints one table.
 set -euo pipefail
-source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
+source "$(dirname "${BASH_SOURCE[0]}")/../launch/common.sh"
 
-help_if_asked "$@" <<END
-Usage: launch/bench.sh [--quick] [--only NAME ...] [--growth]
+help_if_asked -- "$@" <<END
+Usage: tests/bench.sh [--quick] [--only NAME ...] [--growth]
 
 Builds Skein and its benchmarks, runs them one after the other, and prints what they measured: figure, what it must reach, baseline,
 ratio, and the machine. Figures and their baselines are measured by the same run; what is meant for one core runs on one. Less than
@@ -12,17 +12,17 @@ ratio, and the machine. Figures and their baselines are measured by the same run
 
 Options:
   --quick       a fraction of a second for each, to see that they work: no time is judged, and results lie in target/bench-quick/
-  --only NAME   this benchmark alone; may be repeated. launch/benchmarks.toml names them
-  --growth      measure as well how cost grows with the episodes of an epoch, and draw all growth into launch/pictures/
+  --only NAME   this benchmark alone; may be repeated. tests/bench/benchmarks.toml names them
+  --growth      measure as well how cost grows with the episodes of an epoch, and draw all growth into docs/pictures/
   -h, --help    this text
 
 What was measured lies in target/bench/: table.md, table.json, criterion's samples, and what each benchmark printed.
 
-Exit status: 0 everything was measured, 1 a benchmark failed or did not tell a figure that launch/benchmarks.toml asks for, 2 called wrongly.
+Exit status: 0 everything was measured, 1 a benchmark failed or did not print a figure that tests/bench/benchmarks.toml asks for, 2 wrong arguments.
 END
 
 # Rows and pictures have no `name`.
-known=$(sed -n 's/^name = "\(.*\)"$/\1/p' "$repository/launch/benchmarks.toml")
+known=$(sed -n 's/^name = "\(.*\)"$/\1/p' "$repository/tests/bench/benchmarks.toml")
 quick='' growth='' only=()
 while (($# > 0)); do
     case $1 in
@@ -30,7 +30,7 @@ while (($# > 0)); do
     --growth) growth=--growth ;;
     --only)
         (($# > 1)) || {
-            echo "bench.sh: --only takes a name: see launch/bench.sh --help" >&2
+            echo "bench.sh: --only takes a name: see tests/bench.sh --help" >&2
             exit 2
         }
         grep -qxF "$2" <<<"$known" || {
@@ -40,7 +40,7 @@ while (($# > 0)); do
         only+=(--only "$2") && shift
         ;;
     *)
-        echo "bench.sh: unknown argument \"$1\": see launch/bench.sh --help" >&2
+        echo "bench.sh: unknown argument \"$1\": see tests/bench.sh --help" >&2
         exit 2
         ;;
     esac
@@ -51,7 +51,7 @@ build
 cd "$repository"
 target=$(target_directory)
 benches=$("$target/release/skein-bench" list ${growth:+"$growth"} "${only[@]}")
-# A trial leaves what was measured in earnest where it is.
+# A trial leaves what was measured before where it is.
 readonly results=$target/bench${quick:+-quick}
 rm -rf "$results"
 mkdir -p "$results"
@@ -91,7 +91,7 @@ while read -r name kind; do
     printf '%-20s measured in %d s\n' "$name" $((SECONDS - started))
 done <<<"$benches"
 
-# Pictures of times that mean nothing are none for the documents.
-pictures=$repository/launch/pictures
+# Times of a trial mean nothing: their pictures do not belong into the documents.
+pictures=$repository/docs/pictures
 [[ -z $quick ]] || pictures=$results
 "${pin[@]}" "$target/release/skein-bench" table "$results" ${quick:+"$quick"} ${growth:+--pictures "$pictures"} "${only[@]}"

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Throws bytes at everything that reads bytes from outside, for as long as wanted, following what code they reach.
 set -euo pipefail
-source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
+source "$(dirname "${BASH_SOURCE[0]}")/../launch/common.sh"
 
-help_if_asked "$@" <<END
-Usage: launch/fuzz.sh [SECONDS | --executions N] [--target NAME ...] [--jobs N]
+help_if_asked -- "$@" <<END
+Usage: tests/fuzz.sh [SECONDS | --executions N] [--target NAME ...] [--jobs N]
 
 Drives every fuzz target of tests/fuzz for SECONDS each [default: 60], or until each has done its share of N executions in all (slow
 ones a smaller one), and prints for each its executions, how many edges of the code it reached, and what it found.
@@ -22,7 +22,7 @@ Exit status: 0 nothing was found, 1 something was, or the targets could not be d
 END
 
 fail() {
-    echo "fuzz.sh: $1: see launch/fuzz.sh --help" >&2
+    echo "fuzz.sh: $1: see tests/fuzz.sh --help" >&2
     exit 2
 }
 

@@ -8,8 +8,8 @@ use clap::{Args, CommandFactory, Parser, Subcommand};
 
 /// Trains a drone to avoid obstacles from its depth camera.
 ///
-/// One learner and several actor processes on this machine share a run. Whoever flies or fails, a
-/// configuration and a seed give the same policy, bit for bit.
+/// One learner and several actors, processes on this machine, share a run. The same configuration
+/// and seed give the same policy, bit for bit, however many actors fly and whichever of them fail.
 #[derive(Parser)]
 #[command(name = "skein", version, after_help = SCRIPTS)]
 pub(crate) struct Cli {
@@ -21,25 +21,21 @@ const SCRIPTS: &str = "\
 The scripts in launch/ build what a command needs and hand over to it: run_local.sh (run), \
 attach_actor.sh (attach), evaluate.sh (evaluate), experiment.sh (experiment).";
 
+/// The commands; the text of each stands at its arguments.
 #[derive(Subcommand)]
 pub(crate) enum Command {
-    /// Train: start a learner and its actors, and watch them until the run ends.
     #[command(after_long_help = RUN_NOTES)]
     Run(RunArguments),
-    /// Add actors to a run that is under way on this machine.
     #[command(after_long_help = ATTACH_NOTES)]
     Attach(AttachArguments),
-    /// Fly a trained snapshot without exploration, and print how far it gets.
     #[command(disable_help_flag = true)]
     Evaluate(EvaluateArguments),
-    /// Train several configurations with several seeds, and report how they compare.
     #[command(after_long_help = EXPERIMENT_NOTES)]
     Experiment(ExperimentArguments),
-    /// Draw the plots of a run again, from the files it left.
     Report(ReportArguments),
 }
 
-/// Trains: starts a learner and its actors, and watches them until the run ends.
+/// Trains on this machine: starts a learner and its actors, and watches them until the run ends.
 ///
 /// Progress goes to standard error. At the end, the best snapshot flies the evaluation courses; the
 /// table of how it flew and the paths of everything the run left go to standard output.
@@ -109,7 +105,9 @@ Ctrl-C removes these actors again; the run continues without them.
 
 Exit status: 0 the run ended, 1 failed, 2 wrong arguments, 130 interrupted.";
 
-/// What the program `skein-evaluate`, beside this one, is given.
+/// Flies a trained snapshot without exploration, and prints how far it gets.
+///
+/// This is the program `skein-evaluate`, which lies beside this one.
 #[derive(Args)]
 pub(crate) struct EvaluateArguments {
     /// Options of `skein-evaluate`.

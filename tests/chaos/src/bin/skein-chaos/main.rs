@@ -36,10 +36,15 @@ use storm::{Calm, Spared, Storm};
 
 /// Kills, freezes, attaches and detaches the processes of a training at random, and compares what
 /// it learned with an undisturbed one.
+///
+/// Trains the configuration undisturbed, then once more with the disturbances, and compares bit for
+/// bit: policy, episodes, best snapshot, evaluation, curves. Then it looks for what is left of the
+/// run on the machine. DIR/disturbances.jsonl lists everything that was done; the same seed does
+/// the same. --points, --soak and --cost do something else instead.
 #[derive(Debug, Parser)]
-#[command(version)]
+#[command(version, after_long_help = EXIT_STATUS)]
 struct Arguments {
-    /// What to train, and how.
+    /// What to train, and how; tests/chaos.sh sets configs/smoke.toml by default.
     #[arg(
         long,
         value_name = "FILE",
@@ -47,14 +52,15 @@ struct Arguments {
         overrides_with = "config"
     )]
     config: Option<PathBuf>,
-    /// Change one setting of the config; may be repeated.
+    /// Change one setting of the config, for example --set run.seed=7; may be repeated.
     #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
     overrides: Vec<String>,
     /// Compare with this finished run and train by its configuration, instead of training in peace
     /// first.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["config", "overrides"])]
     calm: Option<PathBuf>,
-    /// Where everything goes; must be new or empty.
+    /// Where everything goes; must be new or empty. tests/chaos.sh sets runs/chaos_<date>_<time> by
+    /// default.
     #[arg(long, value_name = "DIR", overrides_with = "run_dir")]
     run_dir: PathBuf,
     /// What is done and when follows from it.
@@ -73,24 +79,28 @@ struct Arguments {
     /// each time.
     #[arg(long, value_name = "N", default_value_t = 2)]
     supervisor_kills: u32,
-    /// Processes to stop with SIGSTOP and to continue later, half of them too late.
+    /// Processes to stop with SIGSTOP and to continue later, half of them after their deadline.
     #[arg(long, value_name = "N", default_value_t = 6)]
     freezes: u32,
     /// Times to attach one or two actors, and to take them away.
     #[arg(long, value_name = "N", default_value_t = 3)]
     attachments: u32,
-    /// Instead of all that, train for so long with actors coming and going, and look for anything
-    /// that grows.
+    /// Instead, train for so long with actors coming and going, sample what every process holds
+    /// (DIR/soak.csv), and look for anything that grows.
     #[arg(long, value_name = "MINUTES", conflicts_with_all = ["calm", "points"])]
     soak: Option<f64>,
-    /// Instead of all that, train so many times with checkpoints and so many times without, and
-    /// tell what they cost.
+    /// Instead, train so many times with checkpoints and so many times without, in turn, and print
+    /// what checkpoints and assembling episodes cost; on a machine that does nothing else.
     #[arg(long, value_name = "TIMES", conflicts_with_all = ["calm", "points", "soak"], value_parser = clap::value_parser!(u32).range(1..))]
     cost: Option<u32>,
-    /// Instead of all that, let a process die at each of the named points of the programs.
+    /// Instead, let a process die at each of the points named in the source (fault.rs).
     #[arg(long)]
     points: bool,
 }
+
+const EXIT_STATUS: &str = "\
+Exit status: 0 everything was done, and nothing differs, grew, is left or costs 3 % or more; 1 \
+otherwise; 2 wrong arguments.";
 
 /// What a soak sets, unless it is set otherwise: a run that outlasts it, and a replay buffer that
 /// is full, both parts of it, while it is still warming up.
