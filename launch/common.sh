@@ -6,14 +6,24 @@ readonly repository
 # Where the default courses are, for whoever writes a configuration elsewhere.
 export SKEIN_CONFIGS="$repository/configs"
 
-# Prints the help text (standard input) and ends the script if one of the arguments asks for it: help must not need a build.
+# Ends the script with its help if one of the arguments asks for it; help must not need a build.
+# What the script does comes from standard input, the options from the program that it hands over
+# to, if that is built: help_if_asked [PROGRAM [SUBCOMMAND]] -- "$@"
 help_if_asked() {
-    local argument
+    local built_command=() argument built
+    while [[ $1 != -- ]]; do
+        built_command+=("$1") && shift
+    done
+    shift
     for argument in "$@"; do
-        if [[ $argument == -h || $argument == --help ]]; then
-            cat
-            exit 0
-        fi
+        [[ $argument == -h || $argument == --help ]] || continue
+        cat
+        ((${#built_command[@]} > 0)) || exit 0
+        built=$(target_directory || true)/release/${built_command[0]}
+        echo
+        [[ ! -x $built ]] || exec "$built" "${built_command[@]:1}" "$argument"
+        echo "It is not built yet: once it is, this shows its options."
+        exit 0
     done
 }
 

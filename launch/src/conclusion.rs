@@ -11,7 +11,7 @@ use skein_protocol::summary::{Ending, Summary, Trained};
 use skein_run::RunDirectory;
 use skein_run::tables::{evaluation_table, stages_table};
 
-use crate::display::Clock;
+use skein_reports::Clock;
 
 /// The evaluation table, the run in one sentence, the table of where the time went, and the paths
 /// of everything it left, for standard output. What a run did not come to write is left out.

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use skein_protocol::progress::{Phase, Progress};
+use skein_reports::Clock;
 
 use crate::supervisor::{Restarts, Watcher};
 
@@ -32,7 +33,7 @@ enum Surface {
 }
 
 /// A progress bar, if standard error is a terminal.
-pub(crate) fn bar_on_terminal() -> Option<ProgressBar> {
+pub fn bar_on_terminal() -> Option<ProgressBar> {
     std::io::stderr().is_terminal().then(|| {
         let style = ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}")
             .expect("the template is well-formed");
@@ -216,20 +217,6 @@ fn terminal_columns() -> usize {
         0 => 80,
         columns => columns.into(),
     })
-}
-
-/// A duration as `m:ss` or `h:mm:ss`.
-pub(crate) struct Clock(pub(crate) f64);
-
-impl fmt::Display for Clock {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let secs = self.0.max(0.0).round() as u64;
-        let (hours, minutes, secs) = (secs / 3600, secs / 60 % 60, secs % 60);
-        match hours {
-            0 => write!(f, "{minutes}:{secs:02}"),
-            _ => write!(f, "{hours}:{minutes:02}:{secs:02}"),
-        }
-    }
 }
 
 /// The pace of the training episodes over the last [`PACE_SECS`].

@@ -6,9 +6,6 @@ use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
-/// Status of a process that was interrupted, as shells report it: 128 + SIGINT.
-pub const INTERRUPTED: u8 = 130;
-
 /// All on the main thread: children are bound to the incarnation of the thread that started them.
 ///
 /// # Errors

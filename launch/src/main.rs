@@ -1,97 +1,40 @@
-//! `skein`: runs a training, adds actors to one, draws what one left.
+//! `skein`: the front door. Runs a training, adds actors to one, draws what one left; evaluates and
+//! experiments.
 
+mod cli;
+mod experiment;
+
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::process::{self, ExitCode};
 use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use clap::error::ErrorKind;
-use clap::{Args, CommandFactory, Parser, Subcommand};
+use clap::Parser;
 use rustix::fs::Mode;
 use rustix::process::umask;
 use skein_launch::conclusion::conclusion;
 use skein_launch::display::Display;
-use skein_launch::interrupts::{INTERRUPTED, interrupts, runtime};
-use skein_launch::prepare::room::{check_shared_memory_for_more, scarce_disk};
-use skein_launch::prepare::{Prepared, ideal_walls_passed, load_courses, prepare};
-use skein_launch::reports;
+use skein_launch::interrupts::{interrupts, runtime};
 use skein_launch::resume::resume;
 use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, SupervisorError};
-use skein_protocol::summary::Ending;
+use skein_prepare::room::{check_shared_memory_for_more, scarce_disk};
+use skein_prepare::{Prepared, prepare};
+use skein_protocol::config::{Config, CoursesSection};
+use skein_protocol::summary::{Ending, Summary};
+use skein_reports::{ideal_walls_passed, load_courses};
 use skein_run::ActorClaim;
-use skein_run::failure::with_causes;
+use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
 use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
+
+use cli::{AttachArguments, Cli, Command, EvaluateArguments, ReportArguments, RunArguments, Task};
 
 /// What the system may refuse.
 const RUNTIME: &str = "cannot start the runtime";
 const SIGNALS: &str = "cannot listen for signals";
 /// How long a learner that nobody supervises may still be ending, before its run is resumed.
 const PATIENCE: Duration = Duration::from_secs(10);
-
-/// Trains a drone to avoid obstacles from its depth camera.
-#[derive(Parser)]
-#[command(version)]
-struct Cli {
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    /// Start a learner and its actors, and watch them until the run ends.
-    Run(RunArguments),
-    /// Add actors to a run that is under way on this machine.
-    Attach(AttachArguments),
-    /// Draw the plots of a run again.
-    Report(ReportArguments),
-}
-
-#[derive(Args)]
-struct RunArguments {
-    /// What to train, and how.
-    #[arg(
-        long,
-        value_name = "FILE",
-        overrides_with = "config",
-        required_unless_present = "resume"
-    )]
-    config: Option<PathBuf>,
-    /// Where everything goes; must be new or empty.
-    #[arg(
-        long,
-        value_name = "DIR",
-        overrides_with = "run_dir",
-        required_unless_present = "resume"
-    )]
-    run_dir: Option<PathBuf>,
-    /// Go on with the run in this directory, with the configuration it was started with.
-    #[arg(long, value_name = "DIR")]
-    resume: Option<PathBuf>,
-    /// Actors to start [default: number of cores].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    actors: Option<u32>,
-    /// Change one setting of the config; may be repeated.
-    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
-    overrides: Vec<String>,
-}
-
-#[derive(Args)]
-struct AttachArguments {
-    /// The run's directory.
-    #[arg(long, value_name = "DIR")]
-    run: PathBuf,
-    /// Actors to start.
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
-    count: u32,
-}
-
-#[derive(Args)]
-struct ReportArguments {
-    /// The run's directory.
-    #[arg(long, value_name = "DIR")]
-    run: PathBuf,
-}
 
 /// A run that failed, and what is left of it.
 #[derive(Debug, thiserror::Error)]
@@ -104,13 +47,14 @@ struct Unfinished {
 
 fn main() -> ExitCode {
     let outcome = match Cli::parse().command {
-        Command::Run(arguments) => run(&arguments),
-        Command::Attach(arguments) => attach(&arguments),
+        Command::Run(arguments) => run(&arguments).map(status),
+        Command::Attach(arguments) => attach(&arguments).map(status),
+        Command::Evaluate(arguments) => evaluate(&arguments),
+        Command::Experiment(arguments) => experiment::carry_out(&arguments),
         Command::Report(arguments) => report(&arguments),
     };
     match outcome {
-        Ok(Ended::Finished) => ExitCode::SUCCESS,
-        Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
+        Ok(status) => status,
         Err(error) => {
             eprintln!("skein: {}", with_causes(error.as_ref()));
             // What keeps a learner from starting would keep it from going on, too.
@@ -121,6 +65,13 @@ fn main() -> ExitCode {
             }
             ExitCode::FAILURE
         }
+    }
+}
+
+fn status(ended: Ended) -> ExitCode {
+    match ended {
+        Ended::Finished => ExitCode::SUCCESS,
+        Ended::Interrupted => ExitCode::from(EXIT_INTERRUPTED),
     }
 }
 
@@ -143,11 +94,7 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     };
     announce(&prepared, actors, arguments);
     let Prepared {
-        run,
-        config,
-        courses,
-        new,
-        ..
+        run, config, new, ..
     } = &prepared;
     if let Some(warning) = scarce_disk(config, run.root()) {
         eprintln!("skein: {warning}");
@@ -184,8 +131,7 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
 
     // Plots are a service: a run that failed may have left something worth looking at, and one that
     // succeeded has, plots or not.
-    let window = config.evaluation.window_episodes as usize;
-    if let Err(error) = reports::draw_all(run, courses, window, ideal_walls_passed(config)?) {
+    if let Err(error) = draw(run, config) {
         eprintln!("skein: not all plots could be drawn: {error}");
     }
     let ended = outcome.map_err(|source| Unfinished {
@@ -213,28 +159,6 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     Ok(ended)
 }
 
-/// What `skein run` is to do.
-enum Task<'a> {
-    New { config: &'a Path, run_dir: &'a Path },
-    Resume(&'a Path),
-}
-
-impl RunArguments {
-    /// Ends the process with the reason if the arguments contradict each other.
-    fn task(&self) -> Task<'_> {
-        match (&self.resume, &self.config, &self.run_dir) {
-            (None, Some(config), Some(run_dir)) => Task::New { config, run_dir },
-            (Some(directory), None, None) if self.overrides.is_empty() => Task::Resume(directory),
-            _ => Cli::command()
-                .error(
-                    ErrorKind::ArgumentConflict,
-                    "a run is resumed in its own directory, with the configuration it was started with: --config, --run-dir and --set cannot be given with --resume",
-                )
-                .exit(),
-        }
-    }
-}
-
 /// Tells what is about to be done.
 fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
     let config = &prepared.config;
@@ -254,9 +178,11 @@ fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
         eprintln!(
             "skein: note: the training course is not among courses.evaluation; the best snapshot is chosen on {}",
             prepared
+                .config
                 .courses
+                .evaluation
                 .first()
-                .map_or("none", |course| &course.name)
+                .map_or("none".to_owned(), |course| CoursesSection::name_of(course))
         );
     }
 }
@@ -317,15 +243,43 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     })
 }
 
-fn report(arguments: &ReportArguments) -> anyhow::Result<Ended> {
+fn report(arguments: &ReportArguments) -> anyhow::Result<ExitCode> {
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
-    let courses = load_courses(&config)?;
-    let window = config.evaluation.window_episodes as usize;
-    for picture in reports::draw_all(&run, &courses, window, ideal_walls_passed(&config)?)? {
+    for picture in draw(&run, &config)? {
         println!("{}", picture.display());
     }
-    Ok(Ended::Finished)
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Draws every plot that the run left the files for.
+fn draw(run: &RunDirectory, config: &Config) -> anyhow::Result<Vec<PathBuf>> {
+    let courses = load_courses(config)?;
+    let window = config.evaluation.window_episodes as usize;
+    let ideal = ideal_walls_passed(config)?;
+    Ok(skein_reports::draw_all(run, &courses, window, ideal)?)
+}
+
+/// Becomes the program `skein-evaluate`.
+fn evaluate(arguments: &EvaluateArguments) -> anyhow::Result<ExitCode> {
+    let program = beside_this("skein-evaluate")?;
+    let error = process::Command::new(&program)
+        .args(&arguments.arguments)
+        .exec();
+    Err(error).with_context(|| format!("cannot start {}", program.display()))
+}
+
+/// The program `name`, which is built beside this one.
+fn beside_this(name: &str) -> anyhow::Result<PathBuf> {
+    let this = std::env::current_exe().context("cannot find where this program lies")?;
+    let program = this.with_file_name(name);
+    if !program.is_file() {
+        bail!(
+            "{} is missing: build it with `cargo build --release --workspace --bins`",
+            program.display()
+        );
+    }
+    Ok(program)
 }
 
 /// Removes what runs of this user left whose processes were all killed.

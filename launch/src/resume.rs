@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use skein_protocol::summary::Ending;
 use skein_run::{LockError, PlaceError, RunDirectory, RunError, SupervisorLock};
 
-use crate::prepare::room::{check_folders, check_shared_memory};
-use crate::prepare::{PrepareError, Prepared, check, load_courses};
+use skein_prepare::room::{check_folders, check_shared_memory};
+use skein_prepare::{PrepareError, Prepared, check};
 
 /// Between two looks whether an earlier learner is gone.
 const LOOK: Duration = Duration::from_millis(100);
@@ -118,13 +118,11 @@ pub fn resume(
     check(&run.config(), &config, actors)?;
     check_shared_memory(&config, actors).map_err(PrepareError::from)?;
     check_folders().map_err(PrepareError::from)?;
-    let courses = load_courses(&config).map_err(PrepareError::from)?;
     Ok((
         Prepared {
             run,
             identity,
             config,
-            courses,
             new: None,
         },
         lock,
@@ -152,7 +150,13 @@ mod tests {
     use skein_protocol::config::Config;
 
     use super::*;
-    use crate::prepare::tests::prepared_run;
+    use skein_prepare::prepare;
+
+    /// A run of the shipped small configuration in a folder of `directory`, ready to be started.
+    fn prepared_run(directory: &Path) -> Prepared {
+        let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/smoke.toml");
+        prepare(&config, &[], &directory.join("run"), 1).unwrap()
+    }
 
     fn refusal(directory: &Path) -> String {
         resume(directory, 1, Duration::ZERO)
@@ -166,8 +170,8 @@ mod tests {
         let prepared = prepared_run(directory.path());
         let (resumed, lock) = resume(prepared.run.root(), 3, Duration::ZERO).unwrap();
         assert_eq!(
-            (&resumed.identity, &resumed.config, &resumed.courses),
-            (&prepared.identity, &prepared.config, &prepared.courses)
+            (&resumed.identity, &resumed.config),
+            (&prepared.identity, &prepared.config)
         );
         assert!(refusal(prepared.run.root()).contains("is under way"));
         drop(lock);

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, Result};
 use clap::Parser;
 use skein_learner::training::{self, TrainingError};
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::summary::Ending;
 use skein_run::allocation::keep_freed_memory;
 use skein_run::failure::{EXIT_START_AGAIN, with_causes};
 use skein_run::logging::{LogFormat, log_to_file};

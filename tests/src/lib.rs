@@ -16,4 +16,4 @@ mod run;
 pub use episodes::{Episode, Learned, episodes};
 pub use programs::{Output, program, repository, run_program};
 pub use run::{Ended, Recipe, Running};
-pub use skein_launch::inspection::{Process, Role, leftovers, processes_of};
+pub use skein_chaos::{Process, Role, leftovers, processes_of};

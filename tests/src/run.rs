@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde::de::DeserializeOwned;
-use skein_launch::inspection::{Process, Role, compare, leftovers, processes_of};
+use skein_chaos::{Process, Role, compare, leftovers, processes_of};
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::summary::Summary;
 use skein_run::{RunDirectory, sweep_leftovers};

@@ -139,15 +139,51 @@ fn every_package_keeps_to_its_side_of_the_fence() {
             &[physics],
         ),
         (
-            "skein-launch",
+            "skein-prepare",
             &[
-                "skein-kernels",
                 "skein-protocol",
                 "skein-run",
                 "skein-simulator",
                 "skein-transport",
             ],
             &[torch],
+        ),
+        (
+            "skein-reports",
+            &["skein-protocol", "skein-run", "skein-simulator"],
+            &[torch, transport],
+        ),
+        // An experiment starts `skein run`: it knows no supervisor.
+        (
+            "skein-experiments",
+            &[
+                "skein-prepare",
+                "skein-protocol",
+                "skein-reports",
+                "skein-run",
+                "skein-simulator",
+                "skein-transport",
+            ],
+            &[torch],
+        ),
+        (
+            "skein-launch",
+            &[
+                "skein-experiments",
+                "skein-prepare",
+                "skein-protocol",
+                "skein-reports",
+                "skein-run",
+                "skein-simulator",
+                "skein-transport",
+            ],
+            &[torch],
+        ),
+        // Whoever judges a run trusts no program of it.
+        (
+            "skein-chaos",
+            &["skein-protocol", "skein-run"],
+            &[torch, physics, transport],
         ),
     ] {
         for of in [Of::Programs, Of::Tests] {
@@ -171,6 +207,9 @@ fn what_is_fenced_in_is_found_where_it_belongs() {
         ("skein-transport", "iceoryx2-bb-posix"),
         ("skein-learner", "tokio"),
         ("skein-rollout", "rapier3d"),
+        ("skein-protocol", "iceoryx2"),
+        ("skein-actor", "rapier3d"),
+        ("skein-reports", "plotters"),
     ] {
         assert!(
             dependencies(&metadata, package, Of::Programs).contains(inside),

@@ -14,7 +14,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
-use skein_launch::inspection::{Footprint, footprint};
+use skein_chaos::{Footprint, footprint};
 use skein_run::RunIdentity;
 use skein_tests::{Ended, Recipe, Role, Running, episodes, run_program};
 

@@ -13,9 +13,9 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
-use skein_launch::inspection::compare;
+use skein_chaos::compare;
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::summary::Ending;
 use skein_run::RunDirectory;
 use skein_tests::{Output, Recipe, episodes, leftovers, program, repository, run_program};
 
@@ -36,7 +36,6 @@ impl Scene {
         };
         fs::create_dir_all(scene.path("configs/experiments")).unwrap();
         scene.write_suite(5);
-        fs::write(scene.path("RESULTS.md"), "# Results\n\nBefore.\n").unwrap();
         scene.write("0.5");
         scene
     }
@@ -71,23 +70,24 @@ impl Scene {
         RunDirectory::new(self.path(&format!("runs/experiments/tiny/{arm}/seed-{seed}")))
     }
 
-    fn results(&self) -> String {
-        fs::read_to_string(self.path("RESULTS.md")).unwrap()
+    /// The published document.
+    fn document(&self) -> String {
+        fs::read_to_string(self.path("docs/results/tiny.md")).unwrap()
     }
 
     fn arguments(&self, more: &[&str]) -> Vec<String> {
         let repository = self.path("").display().to_string();
-        let all = ["--repository", repository.as_str(), "tiny"];
+        let all = ["experiment", "--repository", repository.as_str(), "tiny"];
         all.iter().chain(more).map(ToString::to_string).collect()
     }
 
     /// Runs it to its end.
     fn finish(&self, more: &[&str]) -> Output {
-        run_program("skein-experiment", &self.arguments(more))
+        run_program("skein", &self.arguments(more))
     }
 
     fn start(&self) -> Child {
-        Command::new(program("skein-experiment"))
+        Command::new(program("skein"))
             .args(self.arguments(&[]))
             .stdin(Stdio::null())
             .stdout(Stdio::null())
@@ -147,23 +147,19 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
     let output = scene.finish(&[]);
     assert_eq!(output.code, Some(0), "{}", output.stderr);
     assert!(runs.iter().all(completed));
-    assert_eq!(
-        scene.results(),
-        "# Results\n\nBefore.\n",
-        "nothing is published unasked"
-    );
+    assert!(!scene.path("docs").exists(), "nothing is published unasked");
     let report = scene.path("runs/experiments/tiny/report");
     let text = fs::read_to_string(report.join("report.md")).unwrap();
     assert!(output.stdout.contains(text.trim_end()));
     for part in [
-        "**What for?**",
+        "# What for?",
         "| one part |",
         "`replay.success_share=0.0`",
         "non_rectangular",
-        "flew the suite `few.toml`",
+        "The best snapshot in the suite `few.toml`",
         "| in any order |     2 |       5 |",
         "| hit wall 1, 2, … | hit the corridor before 1, …, end | timed out before 1, …, end |",
-        "How the episodes of the suite `few.toml` went",
+        "How the episodes of the suite `few.toml` ended",
         "2 seeds an arm",
     ] {
         assert!(text.contains(part), "`{part}` is missing in\n{text}");
@@ -199,7 +195,10 @@ fn an_experiment_that_cannot_be_run_does_not_hide_the_others() {
     )
     .unwrap();
     let repository = scene.path("").display().to_string();
-    let output = run_program("skein-experiment", &["--repository", &repository, "--list"]);
+    let output = run_program(
+        "skein",
+        &["experiment", "--repository", &repository, "--list"],
+    );
     assert_eq!(output.code, Some(1));
     assert!(
         output.stdout.contains("tiny") && output.stdout.contains("What for?"),
@@ -215,21 +214,24 @@ fn an_experiment_that_cannot_be_run_does_not_hide_the_others() {
 
 /// Telling it again runs nothing, gives the same report, and replaces what was published before.
 fn assert_published(scene: &Scene, report: &str) {
-    for _ in 0..2 {
+    for answer in ["Because.\n", ""] {
         let output = scene.finish(&["--report", "--publish"]);
         assert_eq!(output.code, Some(0), "{}", output.stderr);
+        let answered = scene
+            .document()
+            .replace("<!-- report", &format!("{answer}<!-- report"));
+        fs::write(scene.path("docs/results/tiny.md"), answered).unwrap();
     }
-    let results = scene.results();
+    let document = scene.document();
     assert!(
-        results.starts_with(
-            "# Results\n\nBefore.\n\n## Experiment: tiny\n\n<!-- experiment: tiny -->\n"
-        )
+        document.starts_with("# What for?\n\nBecause.\n<!-- report -->\n"),
+        "{document}"
     );
-    assert_eq!(results.matches("<!-- end -->").count(), 1);
-    let picture = "launch/pictures/experiments/tiny_walls_passed_over_episodes.png";
-    assert!(results.contains(picture) && scene.path(picture).is_file());
-    let lines =
-        fs::read_to_string(scene.path("launch/pictures/experiments/tiny_runs.csv")).unwrap();
+    assert_eq!(document.matches("<!-- end -->").count(), 1);
+    let picture = "pictures/tiny_walls_passed_over_episodes.png";
+    let folder = scene.path("docs/results");
+    assert!(document.contains(picture) && folder.join(picture).is_file());
+    let lines = fs::read_to_string(folder.join("runs/tiny.csv")).unwrap();
     for (arm, seed) in [("one-part", 1), ("half", 1), ("one-part", 2), ("half", 2)] {
         let learned = scene.run(arm, seed).summary().unwrap().policy_sha256;
         let line = lines
@@ -237,22 +239,20 @@ fn assert_published(scene: &Scene, report: &str) {
             .find(|line| line.starts_with(&format!("{arm},{seed},")));
         assert!(line.is_some_and(|line| line.contains(&learned)), "{lines}");
     }
-    let published = results.replace("launch/pictures/experiments/tiny_", "");
+    let published = document
+        .replace("(pictures/tiny_", "(")
+        .replace("runs/tiny.csv", "runs.csv");
+    let (heading, body) = report.split_once("\n\n").unwrap();
+    let (body, _) = body.split_once("\n\nHow to read").unwrap();
     assert!(
-        published.contains(report.trim_end()),
+        heading == "# What for?" && published.contains(body),
         "{published}\n---\n{report}"
     );
-    // Not while another is being published.
-    let pictures = fs::File::open(scene.path("launch/pictures/experiments")).unwrap();
-    pictures.lock().unwrap();
-    let output = scene.finish(&["--report", "--publish"]);
-    output.assert_refused(&["another experiment is being published"]);
-    drop(pictures);
     // A part of it is no result to replace that by.
     for part in [["--seeds", "1"], ["--episodes", "20"]] {
         let output = scene.finish(&[&part[..], &["--report", "--publish"]].concat());
         output.assert_refused(&["--publish", "2 seeds"]);
-        assert_eq!(scene.results(), results);
+        assert_eq!(scene.document(), document);
     }
 }
 

@@ -13,7 +13,7 @@ use std::sync::{Arc, mpsc};
 use std::thread::sleep;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use skein_launch::inspection::footprint;
+use skein_chaos::footprint;
 use skein_learner::episode::CommittedEpisode;
 use skein_learner::episodes::assembly::KeptData;
 use skein_learner::episodes::dispatcher::{BatchPlace, Dispatcher, EpisodeOrder};

@@ -313,7 +313,7 @@ fn every_process_has_its_log(run: &Ended) {
 fn the_conclusion_shows_the_tables_and_the_paths(run: &Ended) {
     for part in [
         "non_rectangular",
-        &run.summary().stages.to_string(),
+        &skein_run::tables::stages_table(&run.summary().stages),
         "episodes.csv",
         "plots/walls_passed.png",
         "snapshots/best.safetensors",

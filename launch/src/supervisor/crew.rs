@@ -11,13 +11,13 @@ use skein_run::RunDirectory;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep};
 
-use super::log_tail::log_tail;
 use super::memory::want_of_memory;
 use super::process::{Exit, Launch, Order, Output, reap};
 use super::restarts::{ActorDeaths, LearnerIncarnation, Verdict};
 use super::work::Work;
 use super::{Event, SupervisorError};
-use crate::prepare::room::free_shared_memory;
+use skein_prepare::room::free_shared_memory;
+use skein_run::log_tail::log_tail;
 
 /// An incarnation that lasted so long was a good start, whether or not there are reports that show
 /// it.

@@ -9,13 +9,13 @@ use tokio::process::ChildStdout;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep, timeout};
 
-use super::log_tail::{last_words, log_tail};
 use super::memory::want_of_memory;
 use super::process::{Exit, Launch, Order, Output, reap};
 use super::restarts::{Cause, LearnerDeaths, Verdict};
 use super::work::Work;
 use super::{Event, Plan, SupervisorError};
-use crate::prepare::room::free_shared_memory;
+use skein_prepare::room::free_shared_memory;
+use skein_run::log_tail::{last_words, log_tail};
 
 /// Last words come before the end; a pipe that somebody else holds open must not delay that for
 /// ever.

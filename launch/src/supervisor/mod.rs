@@ -17,7 +17,6 @@ mod crew;
 mod dismissal;
 mod error;
 mod learner;
-pub(crate) mod log_tail;
 mod memory;
 mod process;
 mod restarts;

@@ -13,7 +13,7 @@ use skein_run::failure::{EXIT_LEARNER_GONE, EXIT_START_AGAIN};
 use tokio::process::{Child, Command};
 use tokio::sync::watch;
 
-use crate::orphans::signal_when_orphaned;
+use skein_run::orphans::signal_when_orphaned;
 
 /// Status of a Rust program that panicked.
 const PANICKED: i32 = 101;

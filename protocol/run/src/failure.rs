@@ -11,6 +11,9 @@ pub const EXIT_LEARNER_GONE: u8 = 3;
 /// started again, from its newest checkpoint.
 pub const EXIT_START_AGAIN: u8 = 4;
 
+/// Exit status of a program that its user interrupted, as shells report it: 128 + SIGINT.
+pub const EXIT_INTERRUPTED: u8 = 130;
+
 /// The error and those of its causes that it does not quote itself, on one line.
 pub fn with_causes(error: &(dyn Error + 'static)) -> String {
     successors(Some(error), |&error| error.source())

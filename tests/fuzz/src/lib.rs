@@ -4,7 +4,7 @@
 //! A [`Target`] takes any bytes and panics if the reader does, or if what the reader accepts is not
 //! what it promises: an accepted course can be flown, a committed episode is whole and finite, an
 //! accepted configuration reads back the same. The test suite drives every target over its samples,
-//! the corpus in `corpus/` and a few thousand mutations with a fixed seed; `launch/fuzz.sh` drives
+//! the corpus in `corpus/` and a few thousand mutations with a fixed seed; `tests/fuzz.sh` drives
 //! them for as long as wanted, following coverage.
 
 #![allow(

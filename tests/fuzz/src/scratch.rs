@@ -10,7 +10,7 @@ thread_local! {
     static FOLDER: TempDir = folder();
 }
 
-/// An empty folder that is removed with the value. `launch/fuzz.sh`, whose processes end without a
+/// An empty folder that is removed with the value. `tests/fuzz.sh`, whose processes end without a
 /// word, names one of its own to remove.
 pub(crate) fn folder() -> TempDir {
     let memory = Path::new("/dev/shm");

@@ -1,4 +1,4 @@
-//! Drives one target for as long as wanted, following coverage. Started by `launch/fuzz.sh`, which
+//! Drives one target for as long as wanted, following coverage. Started by `tests/fuzz.sh`, which
 //! builds it with the counters this takes.
 //!
 //! `SKEIN_FUZZ_TARGET` names the target; without it the targets are listed. Arguments are

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::{Arc, LazyLock};
 
-use skein_launch::experiments::definition::{Experiment, MOST_ARMS};
+use skein_experiments::definition::{Experiment, MOST_ARMS};
 use skein_protocol::config::{Config, ConfigError, culprit};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_simulator::course::Course;

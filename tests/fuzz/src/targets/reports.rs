@@ -3,9 +3,8 @@
 
 use std::sync::LazyLock;
 
-use skein_launch::inspection::read_curves;
-use skein_launch::prepare::NamedCourse;
-use skein_launch::reports::{Material, draw_all};
+use skein_chaos::read_curves;
+use skein_reports::{Material, NamedCourse, draw_all};
 use skein_run::RunDirectory;
 use skein_simulator::course::{Course, CourseLayout};
 

@@ -1,0 +1,168 @@
+//! The pictures of a report.
+
+use std::path::Path;
+
+use super::{ExperimentReportError, Findings, Picture};
+use crate::definition::{Axis, Curve, Measure};
+use crate::results::RunResult;
+use crate::statistics::{Bootstrap, Estimate};
+use skein_reports::comparison::{BandPoint, ComparedLine, Comparison};
+use skein_reports::ideal_walls_passed;
+
+/// Places at which a curve is summed up over the seeds; a picture has not many more pixels.
+const PLACES: usize = 400;
+/// Resamples at each of them: the edge of a band needs no more digits.
+const RESAMPLES: usize = 2000;
+
+impl Findings<'_> {
+    /// Draws every picture of the experiment into `folder`. One that would have no line, because
+    /// runs are shorter than what is averaged over, is left out.
+    pub(super) fn draw(&self, folder: &Path) -> Result<Vec<Picture>, ExperimentReportError> {
+        let mut pictures = Vec::new();
+        for &curve in &self.experiment.curves {
+            let file = format!(
+                "{}_over_{}.png",
+                measure_name(curve.measure),
+                axis_name(curve.over)
+            );
+            let comparison = self.comparison(curve)?;
+            if comparison.draw(&folder.join(&file))? {
+                let what = measure_title(curve.measure);
+                let caption = format!("{what} per training episode over {}", comparison.x);
+                pictures.push(Picture { file, caption });
+            }
+        }
+        Ok(pictures)
+    }
+
+    fn comparison(&self, curve: Curve) -> Result<Comparison<'_>, ExperimentReportError> {
+        let arms = &self.experiment.arms;
+        let window = arms[0].config.evaluation.window_episodes;
+        let what = measure_title(curve.measure);
+        let shortened = match self.experiment.shortened() {
+            Some(_) => " (shortened runs)",
+            None => "",
+        };
+        Ok(Comparison {
+            title: format!(
+                "{what} per training episode, average over {window} episodes{shortened}"
+            ),
+            x: match curve.over {
+                Axis::Episodes => "training episodes",
+                Axis::Steps => "environment steps",
+                Axis::Updates => "updates of the agent",
+            },
+            y: match curve.measure {
+                Measure::WallsPassed => "walls passed",
+                Measure::Return => "return",
+                Measure::Drawdown => "walls below the highest average before",
+            },
+            level: match curve.measure {
+                Measure::WallsPassed => self.ideal()?,
+                Measure::Return | Measure::Drawdown => None,
+            },
+            lines: arms
+                .iter()
+                .enumerate()
+                .map(|(number, arm)| ComparedLine {
+                    label: &arm.label,
+                    points: self.line(number, curve),
+                })
+                .collect(),
+        })
+    }
+
+    /// What a perfect agent would average, where that is one number for all arms.
+    fn ideal(&self) -> Result<Option<(f64, String)>, ExperimentReportError> {
+        let mut ideals = Vec::new();
+        for arm in &self.experiment.arms {
+            ideals.push(ideal_walls_passed(&arm.config)?);
+        }
+        let first = ideals[0];
+        Ok(ideals
+            .iter()
+            .all(|ideal| *ideal == first)
+            .then(|| (first, format!("all walls passed: {first}"))))
+    }
+
+    fn line(&self, arm: usize, curve: Curve) -> Vec<BandPoint> {
+        let curves: Vec<_> = self
+            .of_arm(arm)
+            .map(|result: &RunResult| result.curve(curve.measure, curve.over))
+            .collect();
+        let points = summed_up(&curves, &self.bootstrap(arm, RESAMPLES));
+        let point = |(x, Estimate { value, interval })| BandPoint { x, value, interval };
+        points.into_iter().map(point).collect()
+    }
+}
+
+/// `curves`, one a seed, as one: from where the last of them begins to where the first of them
+/// ends.
+fn summed_up(curves: &[Vec<(f64, f64)>], bootstrap: &Bootstrap) -> Vec<(f64, Estimate)> {
+    let begin = curves
+        .iter()
+        .map(|curve| curve.first().map_or(f64::INFINITY, |point| point.0));
+    let end = curves
+        .iter()
+        .map(|curve| curve.last().map_or(f64::NEG_INFINITY, |point| point.0));
+    let (begin, end) = (begin.fold(0.0, f64::max), end.fold(f64::INFINITY, f64::min));
+    if curves.is_empty() || begin > end || begin.is_infinite() {
+        return Vec::new();
+    }
+    (0..PLACES)
+        .map(|place| begin + (end - begin) * place as f64 / (PLACES - 1) as f64)
+        .filter_map(|x| {
+            let values: Vec<f64> = curves.iter().map(|curve| value_at(curve, x)).collect();
+            Some((x, bootstrap.interquartile_mean(&values)?))
+        })
+        .collect()
+}
+
+/// The newest value of a curve that begins at `x` or before.
+fn value_at(curve: &[(f64, f64)], x: f64) -> f64 {
+    let after = curve.partition_point(|point| point.0 <= x);
+    curve[after.saturating_sub(1)].1
+}
+
+fn measure_title(measure: Measure) -> &'static str {
+    match measure {
+        Measure::WallsPassed => "Walls passed",
+        Measure::Return => "Return",
+        Measure::Drawdown => "Drawdown of the walls passed",
+    }
+}
+
+pub(super) fn measure_name(measure: Measure) -> &'static str {
+    match measure {
+        Measure::WallsPassed => "walls_passed",
+        Measure::Return => "return",
+        Measure::Drawdown => "drawdown",
+    }
+}
+
+pub(super) fn axis_name(axis: Axis) -> &'static str {
+    match axis {
+        Axis::Episodes => "episodes",
+        Axis::Steps => "steps",
+        Axis::Updates => "updates",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_summed_up_curve_reaches_as_far_as_all_seeds_do() {
+        let curves = [
+            vec![(0.0, 1.0), (10.0, 2.0), (20.0, 3.0)],
+            vec![(5.0, 1.0), (15.0, 4.0)],
+        ];
+        let line = summed_up(&curves, &Bootstrap::new(2, 100));
+        assert_eq!((line[0].0, line[line.len() - 1].0), (5.0, 15.0));
+        // At 5 the values are 1 and 1, at 15 they are 2 and 4.
+        assert_eq!((line[0].1.value, line[line.len() - 1].1.value), (1.0, 3.0));
+        assert!(summed_up(&[vec![], vec![(1.0, 1.0)]], &Bootstrap::new(2, 100)).is_empty());
+        assert!(summed_up(&[], &Bootstrap::new(0, 100)).is_empty());
+    }
+}

@@ -1,0 +1,169 @@
+//! The text of a report: everything a reader needs to judge a figure, and to have it again.
+
+use std::collections::BTreeSet;
+use std::fmt::Write;
+
+use super::{Findings, Picture};
+use crate::definition::Experiment;
+use crate::results::RunResult;
+use skein_reports::Clock;
+
+impl Findings<'_> {
+    /// The report as Markdown, without a heading. `runs` and the pictures' files are paths from
+    /// where it stands.
+    ///
+    /// How to read its tables is explained once, in `docs/results/README.md`.
+    pub(super) fn body(&self, pictures: &[Picture], runs: &str) -> String {
+        let mut text = String::new();
+        push(&mut text, &self.what_was_run());
+        if let Some(note) = self.shortened() {
+            push(&mut text, &note);
+        }
+        if let Some(note) = self.missing() {
+            push(&mut text, &note);
+        }
+        push(&mut text, &self.rests_on());
+        if let Some(note) = self.of_several_builds() {
+            push(&mut text, &note);
+        }
+        for &kind in &self.experiment.tables {
+            for titled in self.tables(kind) {
+                push(&mut text, &format!("*{}.*", titled.title));
+                push(&mut text, &titled.table);
+            }
+        }
+        for Picture { file, caption } in pictures {
+            push(&mut text, &format!("![{caption}]({file})"));
+        }
+        push(
+            &mut text,
+            &format!("The figures of each run: [{runs}]({runs})."),
+        );
+        text
+    }
+
+    /// The heading of a document of its own: the question.
+    pub(super) fn heading(&self) -> String {
+        format!("# {}\n\n", self.experiment.question)
+    }
+
+    /// The command that makes the report again.
+    pub(super) fn how_to_repeat(&self) -> String {
+        format!("## Repeat it\n\n```sh\n{}\n```\n", self.command)
+    }
+
+    fn what_was_run(&self) -> String {
+        let Experiment {
+            base_name,
+            settings,
+            arms,
+            ..
+        } = self.experiment;
+        let mut text = format!("Trained with `configs/{base_name}` and {}", code(settings));
+        if let [arm] = &arms[..]
+            && arm.settings.is_empty()
+        {
+            text.push('.');
+            return text;
+        }
+        text.push_str(". The arms also set:\n\n");
+        for arm in arms {
+            let settings = match arm.settings.is_empty() {
+                true => "nothing".to_owned(),
+                false => code(&arm.settings),
+            };
+            let _ = writeln!(text, "- {}: {settings}", arm.label);
+        }
+        text.trim_end().to_owned()
+    }
+
+    fn shortened(&self) -> Option<String> {
+        let shortened = self.experiment.shortened()?;
+        Some(format!("**Shortened**: {shortened}."))
+    }
+
+    fn missing(&self) -> Option<String> {
+        let (planned, complete) = (self.plan.runs.len(), self.results.len());
+        (complete < planned)
+            .then(|| format!("**Not all of it**: {complete} of {planned} runs are complete."))
+    }
+
+    /// What all figures rest on.
+    fn rests_on(&self) -> String {
+        let seeds = match self.plan.seeds {
+            1 => "1 seed".to_owned(),
+            seeds => format!("{seeds} seeds"),
+        };
+        format!(
+            "{seeds} an arm. A run: {} episodes, {} steps, {} updates, {} of wall time. Skein {}.",
+            range(
+                self.results,
+                |run| run.summary.episodes as f64,
+                |value| format!("{value:.0}")
+            ),
+            range(
+                self.results,
+                |run| run.summary.steps as f64,
+                |value| format!("{value:.0}")
+            ),
+            range(
+                self.results,
+                |run| run.summary.updates as f64,
+                |value| format!("{value:.0}")
+            ),
+            range(
+                self.results,
+                |run| run.summary.wall_secs,
+                |secs| Clock(secs).to_string()
+            ),
+            self.builds().join(", ")
+        )
+    }
+
+    fn of_several_builds(&self) -> Option<String> {
+        (self.builds().len() > 1).then(|| {
+            "**Of several builds**: what differs between runs may be what changed between them. Runs that are moved away are done again, with one build.".to_owned()
+        })
+    }
+
+    /// Versions that the runs were trained with, each once.
+    fn builds(&self) -> Vec<&str> {
+        let versions: BTreeSet<_> = self
+            .results
+            .iter()
+            .map(|run| run.summary.skein_version.as_str())
+            .collect();
+        versions.into_iter().collect()
+    }
+}
+
+/// One paragraph more.
+fn push(text: &mut String, paragraph: &str) {
+    text.push_str(paragraph);
+    text.push_str("\n\n");
+}
+
+fn code(settings: &[String]) -> String {
+    let quoted: Vec<_> = settings
+        .iter()
+        .map(|setting| format!("`{setting}`"))
+        .collect();
+    quoted.join(", ")
+}
+
+/// From the least to the most, or the one that all have.
+fn range(
+    results: &[RunResult],
+    of: impl Fn(&RunResult) -> f64,
+    show: impl Fn(f64) -> String,
+) -> String {
+    let values = || results.iter().map(&of);
+    let (least, most) = (
+        values().fold(f64::INFINITY, f64::min),
+        values().fold(0.0, f64::max),
+    );
+    match (show(least), show(most)) {
+        (least, most) if least == most => least,
+        (least, most) => format!("{least} to {most}"),
+    }
+}

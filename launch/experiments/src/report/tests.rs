@@ -1,0 +1,319 @@
+//! Tables from the files that runs leave.
+
+use std::fs;
+use std::path::Path;
+
+use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
+use skein_protocol::ids::PolicyVersion;
+use skein_protocol::transition::Outcome;
+
+use super::*;
+use crate::definition::{Axis, Measure, TableKind};
+use crate::plan::PlannedRun;
+use crate::results;
+
+const SUMMARY: &str = r#"{"skein_version":"0","run":7,"seed":1,"ending":"completed","policy_sha256":"","final_version":8,"best_version":7,
+    "best_confirmed_walls_passed":4.9,"episodes":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_episodes":4,
+    "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
+
+/// `completed` of four episodes passed both walls of a course, the others none.
+fn flown(entry: &str, completed: usize) -> CourseEvaluation {
+    let score = |number: usize| EpisodeScore {
+        walls_passed: if number < completed { 2 } else { 0 },
+        episode_return: 0.0,
+        outcome: match number < completed {
+            true => Outcome::ReachedEnd,
+            false => Outcome::TimedOut,
+        },
+        hit_wall: None,
+    };
+    let episodes: Vec<_> = (0..4).map(score).collect();
+    CourseEvaluation::of(entry, 2, &episodes)
+}
+
+fn leave(run: &PlannedRun, suite: &[CourseEvaluation]) {
+    let result = run.suite_json.as_ref().unwrap();
+    fs::create_dir_all(result.parent().unwrap()).unwrap();
+    let report = |courses: &[CourseEvaluation]| {
+        let report = EvaluationReport {
+            policy_version: PolicyVersion(7),
+            policy_sha256: String::new(),
+            courses: courses.to_vec(),
+        };
+        serde_json::to_string(&report).unwrap()
+    };
+    fs::write(result, report(suite)).unwrap();
+    fs::write(run.directory.evaluation_json(), report(&[])).unwrap();
+    fs::write(run.directory.summary_json(), SUMMARY).unwrap();
+    fs::write(
+        run.directory.episodes_csv(),
+        "steps,walls_passed,return\n4,2,1.0\n",
+    )
+    .unwrap();
+}
+
+/// An experiment in `folder` of one arm and two seeds, and its runs, which are complete: the first
+/// completed half of its calm episodes, the second all.
+fn two_runs(folder: &Path) -> (Experiment, Plan) {
+    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
+    let (base, course) = (
+        configs.join("smoke.toml"),
+        configs.join("courses/training.toml"),
+    );
+    let entry = |name: &str| format!("[[entry]]\nname = \"{name}\"\ncourse = {course:?}\n");
+    let suite = format!(
+        "name = \"few\"\nepisodes = 4\n{}{}",
+        entry("calm"),
+        entry("windy")
+    );
+    fs::write(folder.join("few.toml"), suite).unwrap();
+    let experiment = format!(
+        "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\npaper_episodes = 4000\ncurves = []\n[settings]\nevaluation.window_episodes = 2\nlearning.warmup_steps = 20\nsac.batch_size = 16\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
+    );
+    fs::write(folder.join("test.toml"), experiment).unwrap();
+    let experiment = Experiment::load(folder, "test", None).unwrap();
+    let mut plan = Plan::new(&experiment, &folder.join("runs"), 2).unwrap();
+    for (run, calm) in plan.runs.iter_mut().zip([2, 4]) {
+        leave(run, &[flown("calm", calm), flown("windy", 1)]);
+        run.state = State::Complete;
+    }
+    (experiment, plan)
+}
+
+fn findings<'a>(
+    experiment: &'a Experiment,
+    plan: &'a Plan,
+    results: &'a [RunResult],
+) -> Findings<'a> {
+    Findings {
+        experiment,
+        plan,
+        results,
+        command: String::new(),
+    }
+}
+
+#[test]
+fn a_suite_is_told_entry_by_entry_over_the_seeds() {
+    let folder = tempfile::tempdir().unwrap();
+    let (experiment, mut plan) = two_runs(folder.path());
+    let told = |plan: &Plan| {
+        let runs = results::read(plan).unwrap();
+        let findings = findings(&experiment, plan, &runs);
+        let tables = findings.tables(TableKind::Suite);
+        assert!(
+            tables[0].title.contains("`few.toml`"),
+            "{}",
+            tables[0].title
+        );
+        tables[0].table.clone()
+    };
+    assert_eq!(
+        told(&plan),
+        "| arm | entry | seeds | episodes |          completed, mean |                completed |                    R |\n\
+         |-----|-------|------:|--------:|-------------------------:|-------------------------:|---------------------:|\n\
+         | A   | calm  |     2 |       4 | 75.0 % [50.0 %, 100.0 %] | 75.0 % [50.0 %, 100.0 %] | 0.750 [0.500, 1.000] |\n\
+         | A   | windy |     2 |       4 |  25.0 % [25.0 %, 25.0 %] |  25.0 % [25.0 %, 25.0 %] | 0.250 [0.250, 0.250] |"
+    );
+    // A run that did not fly it says nothing, and nothing is made up for it.
+    plan.runs[1].state = State::Trained;
+    assert!(told(&plan).contains("| 1 of 2 |"), "{}", told(&plan));
+
+    let result = plan.runs[0].suite_json.clone().unwrap();
+    fs::write(&result, "{").unwrap();
+    let error = results::read(&plan).unwrap_err().to_string();
+    assert!(
+        error.contains(&result.display().to_string()) && error.contains("move this file away"),
+        "{error}"
+    );
+}
+
+#[test]
+fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let (experiment, plan) = two_runs(folder.path());
+    let told = || {
+        let runs = results::read(&plan).unwrap();
+        findings(&experiment, &plan, &runs).body(&[], "runs.csv")
+    };
+    let (one, several) = (told(), "**Of several builds**");
+    let shortened = "**Shortened**: 300 training episodes a run instead of the 4000 of the paper.";
+    assert!(one.contains(shortened), "{one}");
+    assert!(
+        one.contains("Skein 0.\n") && !one.contains(several),
+        "{one}"
+    );
+
+    let newer = SUMMARY.replace(r#""skein_version":"0""#, r#""skein_version":"0+b873565""#);
+    fs::write(plan.runs[1].directory.summary_json(), newer).unwrap();
+    let two = told();
+    assert!(
+        two.contains("Skein 0, 0+b873565.\n") && two.contains(several),
+        "{two}"
+    );
+}
+
+#[test]
+fn every_run_has_a_line_of_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let (experiment, plan) = two_runs(folder.path());
+    let mut calm = flown("calm", 2);
+    calm.r = 0.75;
+    leave(&plan.runs[0], &[calm, flown("windy", 1)]);
+    let learned = SUMMARY.replace(r#""policy_sha256":"""#, r#""policy_sha256":"ab""#);
+    fs::write(plan.runs[1].directory.summary_json(), learned).unwrap();
+    let runs = results::read(&plan).unwrap();
+    let file = folder.path().join("runs.csv");
+    findings(&experiment, &plan, &runs)
+        .write_runs(&file)
+        .unwrap();
+    let mut reader = csv::Reader::from_path(file).unwrap();
+    let header = reader.headers().unwrap().clone();
+    let rows: Vec<_> = reader.records().map(Result::unwrap).collect();
+    let column = |name: &str| {
+        let place = header.iter().position(|column| column == name).unwrap();
+        rows.iter()
+            .map(|row| row[place].to_owned())
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(column("seed"), ["1", "2"]);
+    assert_eq!(column("policy_sha256"), ["", "ab"]);
+    assert_eq!(column("completed calm"), ["0.5000", "1.0000"]);
+    assert_eq!(column("R calm"), ["0.7500", "1.0000"]);
+    assert_eq!(column("R windy"), ["0.2500", "0.2500"]);
+    assert_eq!(column("trained_episodes"), ["", ""], "never");
+    assert_eq!(
+        column("one_wall_episodes"),
+        ["", ""],
+        "one episode is not two"
+    );
+}
+
+/// Two runs of ten episodes, told by hand: the first rises and is trained after six of them, the
+/// second never comes to a wall.
+#[test]
+fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let (experiment, plan) = two_runs(folder.path());
+    let episodes = |walls: [u8; 10], steps: u32| {
+        let row = |walls: u8| format!("{steps},{walls},{walls}.5\n");
+        format!("steps,walls_passed,return\n{}", walls.map(row).concat())
+    };
+    let summary = |steps: u64, updates: u64, trained: &str| {
+        let counts = format!(r#""episodes":10,"steps":{steps},"updates":{updates}"#);
+        SUMMARY
+            .replace(r#""episodes":8,"steps":4,"updates":2"#, &counts)
+            .replace(
+                r#""wall_secs":3.3}"#,
+                &format!(r#""wall_secs":70.0{trained}}}"#),
+            )
+    };
+    let trained =
+        r#","trained":{"rate":0.95,"episodes":6,"steps":60,"updates":20,"wall_secs":30.0}"#;
+    for (run, walls, steps, summary) in [
+        (
+            &plan.runs[0],
+            [0, 0, 1, 3, 3, 3, 2, 2, 2, 3],
+            10,
+            summary(100, 40, trained),
+        ),
+        (
+            &plan.runs[1],
+            [0, 0, 1, 0, 0, 0, 0, 1, 0, 1],
+            20,
+            summary(200, 60, ""),
+        ),
+    ] {
+        fs::write(run.directory.episodes_csv(), episodes(walls, steps)).unwrap();
+        fs::write(run.directory.summary_json(), summary).unwrap();
+    }
+    let runs = results::read(&plan).unwrap();
+    let findings = findings(&experiment, &plan, &runs);
+    let row = |kind| {
+        let table = findings.tables(kind)[0].table.clone();
+        let cells = table
+            .lines()
+            .nth(2)
+            .unwrap()
+            .split('|')
+            .map(|cell| cell.trim().to_owned());
+        cells.filter(|cell| !cell.is_empty()).collect::<Vec<_>>()
+    };
+    // Averages of two episodes: 0, 2, 3, 2, 2.5, whose level is 2.5, and 0, 0.5, 0, 0.5, 0.5, whose
+    // is 0.5. Once risen they change by -1 and 0.5, and by -0.5, 0.5 and 0: the root mean squares
+    // are 0.79 and 0.41, the interquartile ranges 0.75 and 0.5.
+    let volatility = "0.60 [0.41, 0.79]";
+    assert_eq!(
+        row(TableKind::Learning),
+        [
+            "A",
+            "2",
+            "≥ 7 [4, 10]",
+            "1 of 2",
+            "≥ 8 [6, 10]",
+            "≥ 130 [60, 200]",
+            "≥ 40 [20, 60]",
+            "≥ 0:50 [0:30, 1:10]",
+            "1.50 [0.50, 2.50]",
+            "2.00 [1.00, 3.00]",
+            volatility
+        ]
+    );
+    assert_eq!(
+        row(TableKind::Steadiness),
+        [
+            "A",
+            "2",
+            "1.50 [0.50, 2.50]",
+            volatility,
+            "0.62 [0.50, 0.75]",
+            "0.75 [0.50, 1.00]"
+        ]
+    );
+    assert_eq!(
+        row(TableKind::Cost),
+        ["A", "2", "10", "150", "50", "4", "4", "1:10"]
+    );
+
+    let walls = |axis| runs[0].curve(Measure::WallsPassed, axis);
+    let averages = [0.0, 0.5, 2.0, 3.0, 3.0, 2.5, 2.0, 2.0, 2.5];
+    let over = |places: [f64; 9]| places.into_iter().zip(averages).collect::<Vec<_>>();
+    assert_eq!(
+        walls(Axis::Episodes),
+        over([2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0])
+    );
+    assert_eq!(
+        walls(Axis::Steps),
+        over([20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0])
+    );
+    // None before the warm-up is over, all behind the last episode.
+    assert_eq!(
+        walls(Axis::Updates),
+        over([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0])
+    );
+    assert_eq!(
+        runs.iter()
+            .map(RunResult::one_wall_after)
+            .collect::<Vec<_>>(),
+        [Some(4.0), None]
+    );
+}
+
+#[test]
+fn returns_of_different_rewards_are_in_no_table() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut experiment, plan) = two_runs(folder.path());
+    let runs = results::read(&plan).unwrap();
+    let told = |experiment: &Experiment| {
+        let tables = findings(experiment, &plan, &runs).tables(TableKind::Learning);
+        tables[0].table.contains("return, last 2")
+    };
+    assert!(told(&experiment));
+    let mut other = experiment.arms[0].clone();
+    other
+        .config
+        .simulator
+        .insert("reward".to_owned(), toml::Table::new().into());
+    experiment.arms.push(other);
+    assert!(!told(&experiment));
+}

@@ -1,0 +1,123 @@
+//! Whether a configuration can be flown: its simulator settings, its courses, and what only shows
+//! when they are seen together.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use skein_protocol::config::{Config, ConfirmOn, culprit};
+use skein_simulator::course::Course;
+use skein_simulator::simulator::{Simulator, SimulatorSettings};
+
+use super::PrepareError;
+
+/// Checks everything that must hold for `actors` actors to fly for `config`, which was read from
+/// `config_file`, and returns the simulator's settings.
+///
+/// # Errors
+/// [`PrepareError`] names file, key and remedy.
+pub fn check(
+    config_file: &Path,
+    config: &Config,
+    actors: usize,
+) -> Result<SimulatorSettings, PrepareError> {
+    let in_file = || config_file.to_owned();
+    let settings: SimulatorSettings =
+        config
+            .simulator
+            .clone()
+            .try_into()
+            .map_err(|error: toml::de::Error| PrepareError::Simulator {
+                config: in_file(),
+                problem: error.to_string().trim_end().replace('\n', " "),
+            })?;
+    for path in config
+        .courses
+        .evaluation
+        .iter()
+        .chain([&config.courses.training])
+    {
+        let course = Arc::new(Course::load(path)?);
+        Simulator::new(course, &settings).map_err(|source| PrepareError::Settings {
+            config: in_file(),
+            source,
+        })?;
+    }
+    check_level_count(
+        config_file,
+        config,
+        &Course::load(&config.courses.training)?,
+        &config.courses.training.display(),
+    )?;
+    let trains_on_generated = config.courses.generated_share > 0.0;
+    if trains_on_generated || config.evaluation.confirm_on == ConfirmOn::Generated {
+        let course =
+            Course::generate(0, &settings.generator).map_err(|source| PrepareError::Ranges {
+                config: in_file(),
+                source,
+            })?;
+        if trains_on_generated {
+            check_level_count(
+                config_file,
+                config,
+                &course,
+                &"[simulator.generator] wall_x_m",
+            )?;
+        }
+    }
+    let records = config.transport.max_records_per_episode;
+    if settings.max_steps as usize + 1 > records {
+        return Err(PrepareError::EpisodeTooLong {
+            max_steps: settings.max_steps,
+            records,
+        });
+    }
+    if actors > config.transport.max_actors {
+        return Err(PrepareError::TooManyActors {
+            actors,
+            max: config.transport.max_actors,
+        });
+    }
+    Ok(settings)
+}
+
+/// Whether training can start from every level it is to start from on `course`, which the user
+/// knows as `name`.
+fn check_level_count(
+    config_file: &Path,
+    config: &Config,
+    course: &Course,
+    name: &dyn std::fmt::Display,
+) -> Result<(), PrepareError> {
+    let (levels, walls) = (config.learning.levels, course.levels());
+    if levels <= walls {
+        return Ok(());
+    }
+    Err(PrepareError::TooManyLevels {
+        config: config_file.to_owned(),
+        levels,
+        course: name.to_string(),
+        walls,
+    })
+}
+
+/// Adds to the `error` of a check the override that brought it about, if one did.
+pub(super) fn blame(
+    error: PrepareError,
+    config_file: &Path,
+    overrides: &[String],
+    actors: usize,
+) -> PrepareError {
+    let told = |overrides: &[String]| {
+        let checked = Config::load(config_file, overrides)
+            .map_err(PrepareError::from)
+            .and_then(|config| check(config_file, &config, actors));
+        checked.err().map(|error| error.to_string())
+    };
+    match culprit(overrides, told) {
+        Some(text) => PrepareError::Overridden {
+            text: text.clone(),
+            source: Box::new(error),
+        },
+        None => error,
+    }
+}

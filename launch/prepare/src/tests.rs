@@ -1,0 +1,190 @@
+//! Runs that can be prepared, and runs that cannot.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use skein_simulator::course::Course;
+
+use super::*;
+
+fn shipped(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../../configs/courses")
+        .join(name)
+}
+
+/// A configuration file that flies one shipped course.
+fn config_file(directory: &Path, text: &str) -> PathBuf {
+    let path = directory.join("test.toml");
+    let course = shipped("training.toml");
+    let courses = format!("[courses]\ntraining = {course:?}\nevaluation = [{course:?}]\n{text}");
+    fs::write(&path, courses).unwrap();
+    path
+}
+
+#[test]
+fn a_prepared_run_holds_copies_of_all_it_needs() {
+    let directory = tempfile::tempdir().unwrap();
+    let config = config_file(directory.path(), "");
+    let prepared = prepare(
+        &config,
+        &["run.seed=7".to_owned()],
+        &directory.path().join("run"),
+        2,
+    )
+    .unwrap();
+    assert_eq!(prepared.config.run.seed, 7);
+    let root = directory.path().join("run").canonicalize().unwrap();
+    assert_eq!(
+        prepared.config.courses.training,
+        root.join("courses/training.toml")
+    );
+    assert_eq!(
+        Course::load(&prepared.config.courses.evaluation[0]).unwrap(),
+        Course::load(shipped("training.toml")).unwrap()
+    );
+    assert_eq!(prepared.run.open().unwrap().0, prepared.identity);
+    let copy = fs::metadata(prepared.run.courses().join("training.toml")).unwrap();
+    assert_eq!(copy.permissions().mode() & 0o777, 0o600);
+}
+
+#[test]
+fn the_simulators_defaults_are_written_out_to_the_last_bit() {
+    let mut settings = SimulatorSettings::default();
+    settings.vehicle.control_period_secs = 0.1;
+    let written = written_out(&settings);
+    assert_eq!(written["vehicle"]["control_period_secs"].to_string(), "0.1");
+    assert_eq!(SimulatorSettings::deserialize(written).unwrap(), settings);
+}
+
+#[test]
+fn two_courses_of_one_file_name_stay_two() {
+    let directory = tempfile::tempdir().unwrap();
+    let other = directory.path().join("training.toml");
+    fs::copy(shipped("non_rectangular.toml"), &other).unwrap();
+    let config = config_file(directory.path(), "");
+    let set = format!(
+        "courses.evaluation=[{:?}, {other:?}]",
+        shipped("training.toml")
+    );
+    let prepared = prepare(&config, &[set], &directory.path().join("run"), 1).unwrap();
+    let [first, second] = &prepared.config.courses.evaluation[..] else {
+        panic!("{:?}", prepared.config.courses.evaluation);
+    };
+    assert!(first.ends_with("training.toml") && second.ends_with("training_2.toml"));
+    assert_ne!(Course::load(first).unwrap(), Course::load(second).unwrap());
+}
+
+#[test]
+fn what_cannot_run_is_refused_before_anything_is_created() {
+    let directory = tempfile::tempdir().unwrap();
+    for (text, set, actors, expected) in [
+        (
+            "[run]\nseed = -1",
+            "",
+            1,
+            vec!["test.toml", "[run]", "seed"],
+        ),
+        (
+            "[simulator]\nmax_step = 1",
+            "",
+            1,
+            vec!["test.toml", "[simulator]", "max_step"],
+        ),
+        ("[simulator]\nmax_steps = 0", "", 1, vec!["max_steps = 0"]),
+        (
+            "[simulator]\nmax_steps = 256",
+            "",
+            1,
+            vec![
+                "max_steps = 256",
+                "transport.max_records_per_episode = 256",
+                "257",
+            ],
+        ),
+        (
+            "",
+            "courses.training=\"/nowhere.toml\"",
+            1,
+            vec!["with --set courses.training=", "/nowhere.toml"],
+        ),
+        (
+            "",
+            "simulator.max_step=1",
+            1,
+            vec![
+                "with --set simulator.max_step=1, ",
+                "test.toml",
+                "[simulator]",
+            ],
+        ),
+        (
+            "",
+            "simulator.max_steps=256",
+            1,
+            vec![
+                "with --set simulator.max_steps=256, ",
+                "max_records_per_episode",
+            ],
+        ),
+        (
+            "[learning]\nlevels = 6",
+            "",
+            1,
+            vec![
+                "test.toml",
+                "learning.levels = 6",
+                "5 walls",
+                "training.toml",
+            ],
+        ),
+        (
+            "[simulator.generator]\nwall_x_m = [10.0, 20.0]",
+            "courses.generated_share=0.5",
+            1,
+            vec!["learning.levels = 5", "2 walls", "wall_x_m"],
+        ),
+        (
+            "[simulator.generator]\nclearance_m = [3.4, 3.4]",
+            "evaluation.confirm_on=generated",
+            1,
+            vec!["generator", "no opening drawn for wall 1"],
+        ),
+        (
+            "[transport]\nmax_actors = 3",
+            "",
+            4,
+            vec!["4 actors", "transport.max_actors = 3"],
+        ),
+    ] {
+        let config = config_file(directory.path(), text);
+        let overrides: Vec<_> = [set]
+            .iter()
+            .filter(|set| !set.is_empty())
+            .map(ToString::to_string)
+            .collect();
+        let run = directory.path().join("run");
+        let error = prepare(&config, &overrides, &run, actors)
+            .unwrap_err()
+            .to_string();
+        for part in expected {
+            assert!(error.contains(part), "`{error}` does not mention `{part}`");
+        }
+        assert!(!run.exists());
+    }
+}
+
+#[test]
+fn a_used_directory_is_refused_with_a_remedy() {
+    let directory = tempfile::tempdir().unwrap();
+    let config = config_file(directory.path(), "");
+    let error = prepare(&config, &[], directory.path(), 1)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("not empty") && error.contains("--run-dir"),
+        "{error}"
+    );
+}

@@ -1,0 +1,85 @@
+//! The last lines of a log file, for errors that should not send the user looking.
+
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::Path;
+
+/// Lines shown of a log.
+const LINES: usize = 12;
+/// More of a log than this is never read.
+const MAX_BYTES: u64 = 16 * 1024;
+
+/// The last lines of the log at `path`, indented; a remark if there are none.
+pub fn log_tail(path: &Path) -> String {
+    let text = read_end(path).unwrap_or_default();
+    let lines: Vec<_> = text
+        .lines()
+        .filter(|line| !line.trim().is_empty())
+        .collect();
+    if lines.is_empty() {
+        return "    (the log is empty)".to_owned();
+    }
+    let first = lines.len().saturating_sub(LINES);
+    lines[first..]
+        .iter()
+        .map(|line| format!("    {line}"))
+        .collect::<Vec<_>>()
+        .join("\n")
+}
+
+/// What `program` printed last about why it ended, without its name: programs of ours write `name:
+/// reason` on standard error, which goes to their log. `None` if the log holds no such words.
+pub fn last_words(path: &Path, program: &Path) -> Option<String> {
+    let start = format!("{}: ", program.file_name()?.to_str()?);
+    let text = read_end(path).ok()?;
+    let lines: Vec<_> = text.lines().collect();
+    let first = lines.iter().rposition(|line| line.starts_with(&start))?;
+    lines[first..]
+        .join("\n")
+        .strip_prefix(&start)
+        .map(str::to_owned)
+}
+
+fn read_end(path: &Path) -> std::io::Result<String> {
+    let mut file = File::open(path)?;
+    let length = file.metadata()?.len();
+    file.seek(SeekFrom::Start(length.saturating_sub(MAX_BYTES)))?;
+    let mut bytes = Vec::new();
+    file.take(MAX_BYTES).read_to_end(&mut bytes)?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_last_lines_are_shown() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("learner.log");
+        let text: String = (0..5000).map(|line| format!("line {line}\n")).collect();
+        std::fs::write(&path, text).unwrap();
+        let tail = log_tail(&path);
+        assert_eq!(tail.lines().count(), LINES);
+        assert!(tail.ends_with("    line 4999"), "{tail}");
+    }
+
+    #[test]
+    fn last_words_are_the_programs_own_and_its_last() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("learner.log");
+        let program = Path::new("/bin/skein-learner");
+        std::fs::write(
+            &path,
+            "INFO starts\nskein-learner: old\nERROR x\nskein-learner: no device\nuse cpu\n",
+        )
+        .unwrap();
+        assert_eq!(last_words(&path, program).unwrap(), "no device\nuse cpu");
+        assert_eq!(last_words(&path, Path::new("/bin/skein-actor")), None);
+    }
+
+    #[test]
+    fn a_missing_log_is_said_to_be_empty() {
+        assert!(log_tail(Path::new("/nowhere/learner.log")).contains("empty"));
+    }
+}

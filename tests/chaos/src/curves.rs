@@ -1,0 +1,198 @@
+//! Reads back what TensorBoard is shown: every point of every curve, however many event files it is
+//! spread over.
+//!
+//! Field numbers and frame are those that the learner writes by; every length and checksum is
+//! checked.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use prost::Message;
+
+/// The values at each step of each curve, in the order in which they are in the files. One each, if
+/// all is well.
+pub type Curves = BTreeMap<String, BTreeMap<i64, Vec<f32>>>;
+
+/// Why curves cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum CurvesError {
+    /// The file system refuses.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// File or folder.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+    /// An event is cut short, damaged, or none.
+    #[error("{} is damaged after {offset} bytes: {problem}", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// Where the event begins.
+        offset: usize,
+        /// What is wrong with it.
+        problem: String,
+    },
+}
+
+/// All points in the event files of `folder`.
+///
+/// # Errors
+/// [`CurvesError`] names the file.
+pub fn read_curves(folder: &Path) -> Result<Curves, CurvesError> {
+    let at = |path: &Path| {
+        let path = path.to_owned();
+        move |source| CurvesError::Io { path, source }
+    };
+    let mut files = Vec::new();
+    for entry in fs::read_dir(folder).map_err(at(folder))? {
+        files.push(entry.map_err(at(folder))?.path());
+    }
+    // TensorBoard's order.
+    files.sort();
+    let mut curves = Curves::new();
+    for path in files {
+        let bytes = fs::read(&path).map_err(at(&path))?;
+        read_file(&bytes, &mut curves).map_err(|(offset, problem)| CurvesError::Damaged {
+            path: path.clone(),
+            offset,
+            problem,
+        })?;
+    }
+    Ok(curves)
+}
+
+fn read_file(bytes: &[u8], curves: &mut Curves) -> Result<(), (usize, String)> {
+    let mut rest = bytes;
+    while !rest.is_empty() {
+        let offset = bytes.len() - rest.len();
+        let event = take_event(&mut rest).map_err(|problem| (offset, problem))?;
+        for value in event
+            .summary
+            .map(|summary| summary.value)
+            .unwrap_or_default()
+        {
+            let points = curves.entry(value.tag).or_default();
+            points
+                .entry(event.step)
+                .or_default()
+                .push(value.simple_value.unwrap_or(f32::NAN));
+        }
+    }
+    Ok(())
+}
+
+fn take_event(rest: &mut &[u8]) -> Result<Event, String> {
+    let cut = || "cut short".to_owned();
+    let (length, after) = rest.split_first_chunk::<8>().ok_or_else(cut)?;
+    let (length_crc, after) = after.split_first_chunk::<4>().ok_or_else(cut)?;
+    if masked_crc(length) != u32::from_le_bytes(*length_crc) {
+        return Err("the checksum of its length is wrong".to_owned());
+    }
+    let length = usize::try_from(u64::from_le_bytes(*length)).map_err(|_| cut())?;
+    let (message, after) = after.split_at_checked(length).ok_or_else(cut)?;
+    let (crc, after) = after.split_first_chunk::<4>().ok_or_else(cut)?;
+    if masked_crc(message) != u32::from_le_bytes(*crc) {
+        return Err("its checksum is wrong".to_owned());
+    }
+    *rest = after;
+    Event::decode(message).map_err(|error| error.to_string())
+}
+
+fn masked_crc(bytes: &[u8]) -> u32 {
+    crc32c::crc32c(bytes)
+        .rotate_right(15)
+        .wrapping_add(0xa282_ead8)
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Event {
+    #[prost(int64, tag = "2")]
+    step: i64,
+    #[prost(message, optional, tag = "5")]
+    summary: Option<Summary>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Summary {
+    #[prost(message, repeated, tag = "1")]
+    value: Vec<Value>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Value {
+    #[prost(string, tag = "1")]
+    tag: String,
+    #[prost(float, optional, tag = "2")]
+    simple_value: Option<f32>,
+}
+
+#[cfg(test)]
+pub(super) mod samples {
+    use super::*;
+
+    /// An event file with one point for each of `points`: tag, step, value.
+    pub(crate) fn file(points: &[(&str, i64, f32)]) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        for &(tag, step, value) in points {
+            let value = Value {
+                tag: tag.to_owned(),
+                simple_value: Some(value),
+            };
+            let summary = Some(Summary { value: vec![value] });
+            let message = Event { step, summary }.encode_to_vec();
+            let length = (message.len() as u64).to_le_bytes();
+            bytes.extend_from_slice(&length);
+            bytes.extend_from_slice(&masked_crc(&length).to_le_bytes());
+            bytes.extend_from_slice(&message);
+            bytes.extend_from_slice(&masked_crc(&message).to_le_bytes());
+        }
+        bytes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_of_several_files_are_read_as_one() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(
+            folder.path().join("events.1"),
+            samples::file(&[("a", 1, 0.5), ("b", 1, 1.0)]),
+        )
+        .unwrap();
+        fs::write(
+            folder.path().join("events.2"),
+            samples::file(&[("a", 2, -1.0), ("a", 1, 7.0)]),
+        )
+        .unwrap();
+        let curves = read_curves(folder.path()).unwrap();
+        assert_eq!(
+            curves["a"],
+            BTreeMap::from([(1, vec![0.5, 7.0]), (2, vec![-1.0])])
+        );
+        assert_eq!(curves["b"], BTreeMap::from([(1, vec![1.0])]));
+    }
+
+    #[test]
+    fn an_event_that_is_cut_short_or_damaged_is_named() {
+        let sound = samples::file(&[("a", 1, 0.5), ("a", 2, 1.0)]);
+        let second = sound.len() / 2;
+        for length in second + 1..sound.len() {
+            let error = read_file(&sound[..length], &mut Curves::new()).unwrap_err();
+            assert_eq!(error.0, second, "{error:?}");
+        }
+        for index in second..sound.len() {
+            let mut damaged = sound.clone();
+            damaged[index] ^= 1;
+            let error = read_file(&damaged, &mut Curves::new()).unwrap_err();
+            assert_eq!(error.0, second, "{error:?}");
+        }
+    }
+}
