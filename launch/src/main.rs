@@ -22,7 +22,7 @@ use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, Superviso
 use skein_prepare::room::{check_shared_memory_for_more, scarce_disk};
 use skein_prepare::{Prepared, prepare};
 use skein_protocol::config::{Config, CoursesSection};
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::summary::Ending;
 use skein_reports::{ideal_walls_passed, load_courses};
 use skein_run::ActorClaim;
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
