@@ -31,7 +31,7 @@ pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};
 pub use td3::Td3Section;
 pub use transport::TransportSection;
-pub use vae::{DecoderName, Precision, VaeSection};
+pub use vae::{DecoderName, VaeSection};
 
 /// Everything that determines a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
