@@ -179,7 +179,7 @@ impl Panels {
     }
 
     /// Columns of the product.
-    pub(crate) fn columns(&self) -> usize {
+    pub fn columns(&self) -> usize {
         self.columns
     }
 
