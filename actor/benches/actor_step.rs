@@ -39,11 +39,7 @@ fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     let transport = Transport::open();
     let config = &transport.learner.config;
-    let network = Network::new(
-        &transport.learner.snapshot(),
-        &SnapshotLayout::of(config),
-        config.vae.encoder_precision,
-    );
+    let network = Network::new(&transport.learner.snapshot(), &SnapshotLayout::of(config));
     let courses = Arc::new(Courses::of_run(config).expect("shipped courses can be flown"));
     let tickets = [ticket(transport.learner.identity.run, 1, 1)];
     let mut environment_loop = EnvironmentLoop::new(

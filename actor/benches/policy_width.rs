@@ -4,7 +4,7 @@ use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion};
 use skein_inference::{Network, Scratch};
-use skein_protocol::config::{Observation, Precision, VaeSection, View};
+use skein_protocol::config::{Observation, VaeSection, View};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 
@@ -22,7 +22,7 @@ fn main() {
                 .map(|index| (index as f32 * 0.37).sin() * 0.03)
                 .collect(),
         };
-        let network = Network::new(&snapshot, &layout, Precision::F32);
+        let network = Network::new(&snapshot, &layout);
         let mut scratch = Scratch::default();
         group.bench_function(BenchmarkId::new("action", width), |bencher| {
             bencher.iter(|| black_box(network.distribution(black_box(&observation), &mut scratch)));

@@ -75,8 +75,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
         .with_context(|| format!("cannot write {}", log.display()))?;
 
     let (isa, camera) = (Isa::best(), InstructionSet::best());
-    let encoder = config.vae.encoder_precision;
-    info!(%actor, pid = std::process::id(), run = %identity.run, %isa, %camera, %encoder, "actor started");
+    info!(%actor, pid = std::process::id(), run = %identity.run, %isa, %camera, "actor started");
     let _presence = Presence::enter(&identity)?;
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config)?));
     // Each learner that is joined gives it an incarnation.

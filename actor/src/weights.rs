@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use skein_protocol::config::{Config, Precision};
+use skein_protocol::config::Config;
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 
@@ -14,7 +14,6 @@ use skein_inference::Network;
 #[derive(Debug)]
 pub struct Weights {
     layout: SnapshotLayout,
-    precision: Precision,
     most: usize,
     /// In order of arrival, the newest last.
     held: VecDeque<Held>,
@@ -39,10 +38,9 @@ impl Held {
 
 impl Weights {
     /// No snapshot yet, and never more than the `most` that came last.
-    fn new(layout: SnapshotLayout, precision: Precision, most: usize) -> Self {
+    fn new(layout: SnapshotLayout, most: usize) -> Self {
         Self {
             layout,
-            precision,
             most,
             held: VecDeque::with_capacity(most),
         }
@@ -53,11 +51,7 @@ impl Weights {
     /// for what comes before its ticket.
     pub fn of_run(config: &Config) -> Self {
         let most = config.learning.policy_lag as usize + 2;
-        Self::new(
-            SnapshotLayout::of(config),
-            config.vae.encoder_precision,
-            most,
-        )
+        Self::new(SnapshotLayout::of(config), most)
     }
 
     /// Takes in a snapshot; the one that came first goes when there are too many.
@@ -86,11 +80,7 @@ impl Weights {
             .iter_mut()
             .find(|held| held.version() == version)?;
         if let Held::Raw(snapshot) = held {
-            *held = Held::Network(Arc::new(Network::new(
-                snapshot,
-                &self.layout,
-                self.precision,
-            )));
+            *held = Held::Network(Arc::new(Network::new(snapshot, &self.layout)));
         }
         match held {
             Held::Network(network) => Some(Arc::clone(network)),
@@ -107,7 +97,7 @@ mod tests {
     fn weights(versions: impl IntoIterator<Item = u64>) -> Weights {
         let layout = SnapshotLayout::new(&View::present(Observation::Latent, 32), 1);
         let values = layout.values();
-        let mut weights = Weights::new(layout, Precision::F32, 4);
+        let mut weights = Weights::new(layout, 4);
         for version in versions {
             weights.insert(Snapshot {
                 version: PolicyVersion(version),

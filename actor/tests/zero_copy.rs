@@ -9,7 +9,7 @@
 use std::sync::Arc;
 
 use skein_inference::Network;
-use skein_protocol::config::{Config, Precision};
+use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
@@ -124,11 +124,7 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
         loaned: Vec::new(),
         sent: Vec::new(),
     };
-    let flown = environment_loop.fly(
-        &ticket,
-        &Network::new(&snapshot, &layout, Precision::F32),
-        &mut watched,
-    );
+    let flown = environment_loop.fly(&ticket, &Network::new(&snapshot, &layout), &mut watched);
 
     let mut received = Vec::new();
     while let Some(record) = learner.receive_transition().unwrap() {

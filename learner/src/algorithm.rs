@@ -18,7 +18,7 @@ use crate::networks::Layout;
 use crate::noise::Noise;
 use crate::sac::{NativeSac, TorchSac};
 use crate::state::Stateful;
-use crate::td3::{NativeTd3, TorchTd3};
+use crate::td3::Td3;
 
 /// A method that learns a policy from transitions.
 ///
@@ -72,12 +72,7 @@ pub fn new(config: &Config, device: Device) -> Box<dyn Algorithm> {
         (AlgorithmName::Sac, Engine::Libtorch) => {
             Box::new(TorchSac::new(&config.sac, inputs, seed, device))
         }
-        (AlgorithmName::Td3, Engine::Native) => {
-            Box::new(NativeTd3::new(&config.td3, inputs, seed, Isa::best()))
-        }
-        (AlgorithmName::Td3, Engine::Libtorch) => {
-            Box::new(TorchTd3::new(&config.td3, inputs, seed, device))
-        }
+        (AlgorithmName::Td3, _) => Box::new(Td3::new(&config.td3, inputs, seed, device)),
     }
 }
 

@@ -313,10 +313,7 @@ impl Trainer {
             .filter(|(made_after, _)| *made_after == updates);
         let make = || {
             let snapshot = self.snapshot(PolicyVersion(0));
-            (
-                updates,
-                encoder(&snapshot, &self.layout, self.config.vae.encoder_precision),
-            )
+            (updates, encoder(&snapshot, &self.layout))
         };
         let made = made.unwrap_or_else(make);
         let (_, encoder) = self.encoder.insert(made);

@@ -9,7 +9,7 @@ use skein_learner::algorithm::{Algorithm, Inputs};
 use skein_learner::device::use_threads;
 use skein_learner::sac::TorchSac;
 use skein_learner::vae::{TorchVae, images_from_bytes};
-use skein_protocol::config::{Config, Observation, Precision, View};
+use skein_protocol::config::{Config, Observation, View};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{
     ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout,
@@ -47,16 +47,14 @@ fn main() {
         &view,
         config.sac.hidden_width,
     )));
-    for (name, precision) in [("native", Precision::F32), ("native-bf16", Precision::Bf16)] {
-        let network = Network::new(&snapshot, &layout, precision);
-        group.bench_function(name, |bencher| {
-            let mut scratch = Scratch::default();
-            bencher.iter(|| {
-                let latent = network.encode(black_box(&image), &mut scratch);
-                black_box(network.distribution(&observe(latent), &mut scratch).mode())
-            });
+    let network = Network::new(&snapshot, &layout);
+    group.bench_function("native", |bencher| {
+        let mut scratch = Scratch::default();
+        bencher.iter(|| {
+            let latent = network.encode(black_box(&image), &mut scratch);
+            black_box(network.distribution(&observe(latent), &mut scratch).mode())
         });
-    }
+    });
     group.bench_function("libtorch", |bencher| {
         bencher.iter(|| {
             let mut latent = [0.0; LONGEST_LATENT];

@@ -52,7 +52,6 @@ fn network(config: &Config, vae: &Vae, policy: impl Fn(&mut [f32])) -> Network {
             values,
         },
         &layout,
-        config.vae.encoder_precision,
     )
 }
 

@@ -114,9 +114,8 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         evaluation.threads()
     );
     eprintln!(
-        "networks are computed with {}, the encoder in {}; images are drawn with {}",
+        "networks are computed with {}; images are drawn with {}",
         Isa::best(),
-        config.vae.encoder_precision,
         InstructionSet::best()
     );
     for note in shapes_trained_on(&config, &courses) {

@@ -145,11 +145,7 @@ impl Evaluation<'_> {
 
     /// Every episode's end, in entry and episode order.
     fn fly_all(&self) -> Result<Vec<Result<EvaluatedEpisode, EvaluationError>>, EvaluationError> {
-        let network = Network::new(
-            self.snapshot,
-            &SnapshotLayout::of(self.config),
-            self.config.vae.encoder_precision,
-        );
+        let network = Network::new(self.snapshot, &SnapshotLayout::of(self.config));
         let next = AtomicU64::new(0);
         let threads = self.threads();
         let mut flown: Vec<_> = std::thread::scope(|scope| {

@@ -2,7 +2,7 @@
 
 use skein_inference::{Network, Scratch};
 use skein_protocol::IMAGE_PIXELS;
-use skein_protocol::config::{AlgorithmName, DecoderName, EncoderTraining, Observation, Precision};
+use skein_protocol::config::{AlgorithmName, DecoderName, EncoderTraining, Observation};
 use skein_protocol::transition::Outcome;
 
 use super::*;
@@ -306,14 +306,14 @@ fn a_state_that_lacks_a_tensor_or_miscounts_is_refused_by_name() {
 
 #[test]
 fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
-    for (engine, precision, latent) in [
-        (Engine::Native, Precision::Bf16, 32),
-        (Engine::Libtorch, Precision::F32, 32),
-        (Engine::Native, Precision::F32, 8),
-        (Engine::Libtorch, Precision::F32, 64),
+    for (engine, latent) in [
+        (Engine::Native, 32),
+        (Engine::Libtorch, 32),
+        (Engine::Native, 8),
+        (Engine::Libtorch, 64),
     ] {
         let mut config = config();
-        (config.run.engine, config.vae.encoder_precision) = (Some(engine), precision);
+        config.run.engine = Some(engine);
         config.vae.latent = latent;
         let mut trainer = Trainer::new(&config).unwrap();
         // The last epoch arrives late: its images were ordered before the freeze.
@@ -325,7 +325,7 @@ fn once_the_vae_is_frozen_all_stored_codes_are_those_that_actors_make() {
         );
         assert!(
             all_codes_are_the_encoders(&trainer, 4),
-            "{engine}, {precision}, {latent} numbers"
+            "{engine}, {latent} numbers"
         );
     }
 }
@@ -389,12 +389,7 @@ fn stored_codes_are_recomputed_as_often_as_configured_while_the_vae_is_trained()
 /// `true` if the stored codes of the first `epochs` are those that actors would compute with the
 /// present encoder.
 fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
-    let precision = trainer.config.vae.encoder_precision;
-    let network = Network::new(
-        &trainer.snapshot(PolicyVersion(epochs)),
-        &trainer.layout,
-        precision,
-    );
+    let network = Network::new(&trainer.snapshot(PolicyVersion(epochs)), &trainer.layout);
     let code = |(episode, step)| {
         network.encode(
             &[shade(episode, step); IMAGE_PIXELS],

@@ -1,7 +1,7 @@
 //! The policy: observation to action, by a squashed Gaussian (arXiv:1812.05905, appendix C) or with
-//! noise added (arXiv:1802.09477).
+//! added noise (arXiv:1802.09477).
 //!
-//! Three hidden layers with ReLU, then what [`PolicyHead`] says.
+//! Three hidden layers with ReLU, then a [`PolicyHead`].
 
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -11,7 +11,7 @@ use skein_protocol::{ACTION, LOG_STD};
 
 use crate::linear::Linear;
 
-/// The policy's parameters, arranged for [`Policy::distribution`].
+/// Parameters of the policy, arranged for [`Policy::distribution`].
 #[derive(Debug)]
 pub struct Policy {
     layers: [Linear; POLICY_LAYERS],
@@ -21,35 +21,35 @@ pub struct Policy {
 /// Working memory of one thread.
 #[derive(Debug, Default)]
 pub struct PolicyScratch {
-    /// Layers alternate between these two.
+    /// Inputs and outputs; layers alternate between the two.
     values: [Vec<f32>; 2],
 }
 
-/// What a policy would do.
+/// Distribution of a policy's action.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ActionDistribution {
-    /// A Gaussian that is squashed into an action, by its parameters before the squashing.
+    /// Gaussian that tanh squashes into an action; the parameters are those before tanh.
     SquashedGaussian {
-        /// `[2]`.
+        /// Mean, `[2]`.
         mean: [f32; ACTION],
         /// Natural logarithm of the standard deviation, `[2]`, within [-20, 2].
         log_std: [f32; ACTION],
     },
-    /// An action, and noise about it.
+    /// Action with added noise.
     Noisy {
-        /// `[2]`, inside (-1, 1).
+        /// Action without noise, `[2]`, inside (-1, 1).
         action: [f32; ACTION],
-        /// Standard deviation.
+        /// Standard deviation of the noise.
         std: f32,
     },
 }
 
 impl Policy {
-    /// Takes the parameters by their names in a snapshot (`policy.layer1.weight`, …), each a slice
+    /// `tensor` returns a parameter by its name in a snapshot (`policy.layer1.weight`, …), as a slice
     /// in PyTorch's order.
     ///
     /// # Panics
-    /// When a tensor has not the length its shape asks for.
+    /// If a tensor does not have the length of its shape.
     pub fn new<'a>(isa: Isa, head: PolicyHead, tensor: impl Fn(&str) -> &'a [f32]) -> Self {
         let layers = std::array::from_fn(|index| {
             let name = format!("policy.layer{}", index + 1);
@@ -62,10 +62,10 @@ impl Policy {
         Self { layers, head }
     }
 
-    /// The distribution of actions for an observation, `[View::len]`.
+    /// Returns the distribution of the action for an observation, `[View::len]`.
     ///
     /// # Panics
-    /// When `observation` has not the length the policy was trained on.
+    /// If `observation` does not have the length that the policy was trained on.
     pub fn distribution(
         &self,
         observation: &[f32],
@@ -98,7 +98,7 @@ impl Policy {
 }
 
 impl ActionDistribution {
-    /// The action without noise, each command in [-1, 1].
+    /// Returns the action without noise, each command in [-1, 1].
     pub fn mode(&self) -> [f32; ACTION] {
         match self {
             Self::SquashedGaussian { mean, .. } => mean.map(f32::tanh),
@@ -106,7 +106,7 @@ impl ActionDistribution {
         }
     }
 
-    /// An action drawn at random, each command in [-1, 1].
+    /// Draws an action, each command in [-1, 1].
     pub fn sample(&self, rng: &mut impl Rng) -> [f32; ACTION] {
         std::array::from_fn(|axis| {
             let noise: f32 = StandardNormal.sample(rng);
@@ -129,7 +129,7 @@ mod tests {
     const OBSERVATION: usize = 34;
     const WIDTH: usize = 5;
 
-    /// Parameters by a fixed rule; small, so that no unit is always off.
+    /// Returns parameters by a fixed rule; small, so that no unit is always off.
     fn parameters(name: &str) -> Vec<f32> {
         let sizes = [OBSERVATION, WIDTH, WIDTH, WIDTH, 2 * ACTION];
         let layer = usize::from(name.as_bytes()["policy.layer".len()] - b'0');
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn layers_are_those_written_out_by_hand() {
+    fn layers_match_a_calculation_by_hand() {
         let observation: Vec<f32> = (0..OBSERVATION).map(|index| (index as f32).cos()).collect();
         let mut values = observation.clone();
         for layer in 1..=POLICY_LAYERS {
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_have_the_stated_mean_and_spread_and_stay_within_bounds() {
+    fn samples_have_the_stated_mean_and_deviation_and_stay_within_bounds() {
         let distribution = ActionDistribution::SquashedGaussian {
             mean: [0.5, -3.0],
             log_std: [-1.0, 2.0],
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn an_extreme_spread_is_bounded() {
+    fn an_extreme_standard_deviation_is_bounded() {
         let wild = Policy::new(Isa::best(), PolicyHead::SquashedGaussian, |name| {
             let mut values = parameters(name);
             if name == "policy.layer4.bias" {
@@ -257,7 +257,7 @@ mod tests {
             "{mean} {variance}"
         );
         let at_the_bound = draws.iter().filter(|draw| draw[1] == 1.0).count() as f32 / count;
-        // Half a standard deviation away: 31 % of a Gaussian lie beyond.
+        // The bound is half a standard deviation away; 31 % of a Gaussian lie beyond it.
         assert!(
             draws.iter().all(|draw| draw[1] <= 1.0) && (at_the_bound - 0.309).abs() < 0.02,
             "{at_the_bound}"

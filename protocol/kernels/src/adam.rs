@@ -6,24 +6,24 @@ use crate::team::{Shared, Team};
 const BETA_1: f32 = 0.9;
 const BETA_2: f32 = 0.999;
 const EPSILON: f32 = 1e-8;
-/// Numbers that stay together: whole cache lines.
+/// Numbers that one member updates at least: whole cache lines.
 const GRAIN: usize = 1024;
 
-/// Adam with its usual constants, β₁ = 0.9, β₂ = 0.999, ε = 1e-8 (Kingma and Ba 2015,
-/// arXiv:1412.6980, algorithm 1), for one step.
+/// One step of Adam with its usual constants, β₁ = 0.9, β₂ = 0.999, ε = 1e-8 (Kingma and Ba 2015,
+/// arXiv:1412.6980, algorithm 1).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamStep {
     /// Learning rate.
     pub learning_rate: f64,
-    /// Number of this step, from 1.
+    /// Number of the step, from 1.
     pub number: u64,
 }
 
 impl AdamStep {
-    /// Moves `parameters` against `gradient`, both of the moments' length.
+    /// Moves `parameters` against `gradient`; all vectors have the same length.
     ///
     /// # Panics
-    /// When lengths differ.
+    /// If lengths differ.
     pub fn apply(
         self,
         team: &mut Team,
@@ -36,7 +36,7 @@ impl AdamStep {
         let [first, second] = moments;
         assert!(
             [gradient.len(), first.len(), second.len()] == [len; 3],
-            "parameters, gradient and moments are of one length"
+            "parameters, gradient and moments have the same length"
         );
         // θ ← θ - lr · m̂ / (√v̂ + ε), where m̂ = m / (1 - β₁ᵗ) and v̂ = v / (1 - β₂ᵗ).
         let bias = |beta: f32| 1.0 - f64::from(beta).powf(self.number as f64);
@@ -48,7 +48,7 @@ impl AdamStep {
             Shared::new(second),
         );
         team.split(len, GRAIN, |part| {
-            // SAFETY: `split` gives each member a part of its own.
+            // SAFETY: the parts of `split` do not overlap.
             let (parameters, first, second) = unsafe {
                 (
                     parameters.part(part.clone()),
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn two_steps_match_the_algorithm_done_by_hand() {
+    fn two_steps_match_a_calculation_by_hand() {
         let mut state = [vec![1.0], vec![0.0], vec![0.0]];
         let mut team = Team::new(1);
         // First step: m̂ = g and v̂ = g², so the parameter moves by lr · sign(g).

@@ -1,11 +1,10 @@
-//! Products and gradients against their definition, and every instruction set against every other,
-//! bit for bit.
+//! Products and gradients compared with their definition, bit for bit, for every instruction set.
 
 use proptest::prelude::*;
 
 use crate::*;
 
-/// Numbers of no pattern, in [-1, 1).
+/// Pseudo-random numbers in [-1, 1).
 fn numbers(len: usize, seed: u64) -> Vec<f32> {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     (0..len)
@@ -18,19 +17,11 @@ fn numbers(len: usize, seed: u64) -> Vec<f32> {
         .collect()
 }
 
-fn pairs(len: usize, seed: u64) -> Vec<Pair> {
-    let numbers = numbers(2 * len, seed);
-    numbers
-        .chunks(2)
-        .map(|two| Pair::of(two[0], two[1]))
-        .collect()
-}
-
 fn available() -> impl Iterator<Item = Isa> {
     Isa::ALL.into_iter().filter(|isa| isa.is_available())
 }
 
-/// The definition: every element's terms in order, one fused multiply-add each.
+/// The definition of a product: each element's terms in order, one fused multiply-add each.
 fn defined(
     rows: &[Vec<f32>],
     right: impl Fn(usize, usize) -> f32,
@@ -90,39 +81,6 @@ proptest! {
     }
 
     #[test]
-    fn a_product_of_pairs_is_its_definition_to_the_last_bit(
-        count in 0_usize..30, terms in 1_usize..400, columns in 1_usize..300, seed in 1_u64..1000,
-    ) {
-        let (left, right) = (pairs(count * terms, seed), pairs(terms * columns, seed + 1));
-        let bias = numbers(columns, seed + 2);
-        let expected: Vec<f32> = (0..count * columns)
-            .map(|element| {
-                let (row, column) = (element / columns, element % columns);
-                let sum = (0..terms).fold(bias[column], |sum, term| {
-                    let ([a, c], [b, d]) = (left[row * terms + term].numbers(), right[term * columns + column].numbers());
-                    a.mul_add(b, c.mul_add(d, sum))
-                });
-                sum.max(0.0)
-            })
-            .collect();
-        for isa in available() {
-            let panels = Panels::of(isa, Matrix::of_rows(&right, columns));
-            let mut output = vec![f32::NAN; count * columns];
-            product(Rows::Matrix(&left), &panels, Start::Bias(&bias), Finish::Rectified, &mut output);
-            prop_assert_eq!(&output, &expected, "{}", isa);
-            // Seen the other way, as weights lie; and a window that is the whole image.
-            let across: Vec<Pair> = (0..columns * terms).map(|at| right[at % terms * columns + at / terms]).collect();
-            let panels = Panels::of(isa, Matrix::of_rows(&across, terms).transposed());
-            let windows = Windows::new([1, terms], 1, [1, terms], 1);
-            for (row, expected) in left.chunks(terms).zip(expected.chunks(columns)) {
-                let mut output = vec![f32::NAN; columns];
-                product(Rows::Windows(&windows, row), &panels, Start::Bias(&bias), Finish::Rectified, &mut output);
-                prop_assert_eq!(&output[..], expected, "{}", isa);
-            }
-        }
-    }
-
-    #[test]
     fn a_convolution_is_its_definition_and_so_is_its_gradient(
         height in 1_usize..9, width in 1_usize..9, channels in 1_usize..20, kernel_height in 1_usize..4, kernel_width in 1_usize..4,
         stride in 1_usize..3, outputs in 1_usize..20, images in 1_usize..4, seed in 1_u64..1000,
@@ -160,8 +118,8 @@ proptest! {
             gradient(&mut Team::new(1), isa, grad, Terms::Windows(&windows, &input), &mut found);
             prop_assert_eq!(&found, &expected_gradient, "{}", isa);
 
-            // What is spread is what is added back of the product, up to the order of sums; and the
-            // same with all instructions.
+            // `spread` equals product and `add_back` up to the order of sums, and has the same bits
+            // with all instruction sets.
             let columns = defined(
                 &output.chunks(outputs).map(<[f32]>::to_vec).collect::<Vec<_>>(),
                 |term, number| weights[term * len + number],
@@ -171,7 +129,7 @@ proptest! {
             let panels = [Isa::Portable, isa].map(|isa| Panels::of(isa, Matrix::of_rows(&weights, len)));
             for (rows, columns) in output.chunks(windows.count() * outputs).zip(columns.chunks(windows.count() * len)) {
                 let mut added = vec![0.5; windows.image_len()];
-                windows.add_back(isa, columns, &mut added);
+                windows.add_back(isa, 0..windows.count(), columns, &mut added);
                 let [portable, found] = panels.each_ref().map(|panels| {
                     let mut image = vec![0.5; windows.image_len()];
                     spread(rows, panels, &windows, &mut Vec::new(), &mut image);
@@ -186,7 +144,7 @@ proptest! {
     }
 
     #[test]
-    fn what_is_spread_in_place_is_its_definition_to_the_last_bit(
+    fn spread_in_place_is_its_definition_to_the_last_bit(
         size in [1_usize..8, 1_usize..9], kernel in [1_usize..4, 1_usize..5], stride in 1_usize..4, registers in 1_usize..3,
         terms in prop_oneof![1_usize..40, 250_usize..300], seed in 1_u64..1000,
     ) {
@@ -196,8 +154,8 @@ proptest! {
         let (len, [_, across]) = (windows.window_len(), windows.positions());
         let (rows, weights) = (numbers(windows.count() * terms, seed), numbers(terms * len, seed + 1));
         let held = numbers(windows.image_len(), seed + 2);
-        // Number by number of a window: all windows' terms, one after the other, to what the image
-        // holds.
+        // For each number of a window: the terms of all windows in turn, added to the image's
+        // content.
         let mut expected = held.clone();
         for number in 0..len {
             let (y, x) = (number / channels / kernel[1], number / channels % kernel[1]);
@@ -217,11 +175,11 @@ proptest! {
 }
 
 #[test]
-fn a_single_row_is_its_definition_under_panels_that_are_met_at_once() {
+fn a_single_row_below_grouped_panels_is_its_definition() {
     for (terms, columns) in [(5, 64), (300, 65), (7, 128), (256, 200), (600, 256)] {
         let (left, right) = (numbers(terms, 1), numbers(terms * columns, 2));
         let (bias, mut gate) = (numbers(columns, 3), numbers(columns, 4));
-        // A ReLU that gave zero lets nothing back.
+        // A ReLU with output zero has no gradient.
         gate[..3].fill(0.0);
         let at = |term: usize, column: usize| right[term * columns + column];
         let rows = [left.clone()];
@@ -235,7 +193,7 @@ fn a_single_row_is_its_definition_under_panels_that_are_met_at_once() {
             .collect();
         for isa in available() {
             let panels = Panels::of(isa, Matrix::of_rows(&right, columns));
-            // One window on an image of one position is a single row, too.
+            // One window on an image with one position is a single row, too.
             let windows = Windows::new([1, terms], 1, [1, terms], 1);
             for rows in [Rows::Matrix(&left), Rows::Windows(&windows, &left)] {
                 for (start, finish, expected) in [
@@ -254,7 +212,7 @@ fn a_single_row_is_its_definition_under_panels_that_are_met_at_once() {
 
 #[test]
 fn a_gradient_is_its_definition_for_any_number_of_members() {
-    // More terms than are done at once, columns that fill no panel, rows that fill no tile.
+    // More terms than one block, columns that fill no panel, rows that fill no tile.
     for (terms, rows, columns) in [(600, 7, 70), (1, 13, 4), (300, 64, 33), (0, 3, 5)] {
         let (left, right) = (numbers(terms * rows, 1), numbers(terms * columns, 2));
         let by_column: Vec<Vec<f32>> = (0..rows)
@@ -284,7 +242,7 @@ fn a_gradient_is_its_definition_for_any_number_of_members() {
 }
 
 #[test]
-fn what_is_not_a_number_is_not_hidden() {
+fn nan_stays_nan_through_a_relu() {
     let weights = numbers(4 * 20, 1);
     for isa in available() {
         let mut output = [0.0; 20];
@@ -305,7 +263,7 @@ fn what_is_not_a_number_is_not_hidden() {
 }
 
 #[test]
-#[should_panic(expected = "a place for each")]
+#[should_panic(expected = "the output has")]
 fn an_output_that_is_too_short_is_refused() {
     let panels = Panels::of(Isa::best(), Matrix::of_rows(&[1.0; 6], 3));
     product(
@@ -331,7 +289,7 @@ fn a_bias_that_is_too_short_is_refused() {
 }
 
 #[test]
-#[should_panic(expected = "the image the windows are of")]
+#[should_panic(expected = "the image has the size that the windows are for")]
 fn an_image_of_another_size_is_refused() {
     let windows = Windows::new([3, 3], 1, [2, 2], 1);
     let panels = Panels::of(Isa::best(), Matrix::of_rows(&[1.0; 4], 1));

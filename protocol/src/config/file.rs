@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_for_libtorch_alone_is_computed_by_it_and_nothing_else_is() {
+    fn what_only_libtorch_computes_is_on_libtorch_and_the_rest_is_not() {
         let engines = |overrides: &[&str]| {
             let config = load("", overrides).unwrap();
             (config.policy_engine(), config.vae.engine(&config.run))
@@ -339,6 +339,7 @@ mod tests {
         let (native, libtorch) = (Engine::Native, Engine::Libtorch);
         assert_eq!(engines(&[]), (native, native));
         assert_eq!(engines(&["vae.decoder=u-net"]), (native, libtorch));
+        assert_eq!(engines(&["learning.algorithm=td3"]), (libtorch, native));
         for algorithm in ["sac", "td3"] {
             let algorithm = format!("learning.algorithm={algorithm}");
             assert_eq!(
@@ -645,6 +646,11 @@ mod tests {
                 "[learning]\nencoder = \"end-to-end\"",
                 vec!["run.engine=native"],
                 vec!["run.engine = native", "end-to-end", "leave run.engine out"],
+            ),
+            (
+                "[learning]\nalgorithm = \"td3\"",
+                vec!["run.engine=native"],
+                vec!["run.engine = native", "td3", "leave run.engine out"],
             ),
             (
                 "[vae]\ndecoder = \"u-net\"",

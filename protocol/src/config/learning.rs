@@ -21,9 +21,8 @@ pub struct LearningSection {
     /// the paper.
     pub algorithm: AlgorithmName,
     /// What trains the encoder that turns a depth image into the numbers the policy sees: `vae`, or
-    /// `end-to-end`, where the critic's loss does and `[vae]` has no say but in the code's length
-    /// and the encoder's precision. Every transition keeps its images then, 9 KiB each. Default
-    /// `vae`, as in the paper.
+    /// `end-to-end`, where the critic's loss does and `[vae]` has no say but in the code's length.
+    /// Every transition keeps its images then, 9 KiB each. Default `vae`, as in the paper.
     pub encoder: EncoderTraining,
     /// Episodes flown with one frozen snapshot before the networks are updated. 1 is the paper's
     /// delayed learning. Default 10.

@@ -31,7 +31,7 @@ pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};
 pub use td3::Td3Section;
 pub use transport::TransportSection;
-pub use vae::{DecoderName, Precision, VaeSection};
+pub use vae::{DecoderName, VaeSection};
 
 /// Everything that determines a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -84,12 +84,12 @@ impl Config {
         }
     }
 
-    /// What computes policy and critic: the run's engine, but what learns from images is written
-    /// for libtorch alone.
+    /// Engine of policy and critic: the run's engine, but libtorch for TD3 and for learning from
+    /// images, which the native engine lacks.
     pub fn policy_engine(&self) -> Engine {
-        match self.learning.encoder {
-            EncoderTraining::Vae => self.run.engine(),
-            EncoderTraining::EndToEnd => Engine::Libtorch,
+        match (self.learning.algorithm, self.learning.encoder) {
+            (AlgorithmName::Sac, EncoderTraining::Vae) => self.run.engine(),
+            (AlgorithmName::Td3, _) | (_, EncoderTraining::EndToEnd) => Engine::Libtorch,
         }
     }
 
@@ -156,7 +156,9 @@ impl Config {
             ),
         )?;
         let is_native = self.run.engine == Some(Engine::Native);
+        let td3 = self.learning.algorithm == AlgorithmName::Td3;
         for (asked, key) in [
+            (td3, "learning.algorithm = \"td3\""),
             (end_to_end, "learning.encoder = \"end-to-end\""),
             (decoder == DecoderName::UNet, "vae.decoder = \"u-net\""),
         ] {

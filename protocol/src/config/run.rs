@@ -19,8 +19,9 @@ pub struct RunSection {
     pub device: Device,
     /// What computes the learner's networks: `native` or `libtorch`. Part of the result: the two
     /// add in different orders. Default: `native` on the processor, `libtorch` on a CUDA device,
-    /// where there is no other. Convolutions that `learning.encoder = "end-to-end"` or `vae.decoder
-    /// = "u-net"` train are on `libtorch` in any case; asking for `native` is refused then.
+    /// where there is no other. Three settings need `libtorch` and refuse an explicit `native`:
+    /// `learning.algorithm = "td3"` and `learning.encoder = "end-to-end"` for policy and critic,
+    /// `vae.decoder = "u-net"` for the VAE. What they do not concern stays on the default engine.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub engine: Option<Engine>,
     /// Threads that the learner's networks are computed with. Of the engine `libtorch` part of the

@@ -10,7 +10,8 @@ use super::{
 /// `[td3]`: twin delayed deep deterministic policy gradient (Fujimoto et al. 2018,
 /// arXiv:1802.09477), which the paper compares with (its Fig. 11) without saying any of these
 /// values. Networks are as wide and minibatches as large as in `[sac]` by default, so that the two
-/// are compared on equal terms.
+/// are compared on equal terms. Policy and critic are computed by libtorch on any device, the VAE by
+/// `run.engine`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Td3Section {

@@ -1,7 +1,5 @@
 //! `[vae]`.
 
-use std::fmt;
-
 use serde::{Deserialize, Serialize};
 
 use super::{Engine, Invalid, RunSection, require, require_learning_rate};
@@ -38,12 +36,6 @@ pub struct VaeSection {
     /// feature maps beside the code (arXiv:1505.04597). The encoder that flies is the same. A U-Net
     /// is trained on libtorch, whatever trains the policy. Default `plain`, as in the paper.
     pub decoder: DecoderName,
-    /// In what precision depth images are encoded: `f32` or `bf16`. Part of the result. AVX-512's
-    /// instruction for bfloat16 is used where it is, AMX never: AMD's Zen 4 encodes nearly twice as
-    /// fast with it, Intel's Sapphire and Emerald Rapids more slowly than in `f32`; all processors
-    /// get the same numbers (those below 1.2e-38 apart). The VAE is trained in `f32` either way.
-    /// Default `f32`.
-    pub encoder_precision: Precision,
 }
 
 impl Default for VaeSection {
@@ -57,7 +49,6 @@ impl Default for VaeSection {
             learning_rate: 1e-3,
             kl_weight: 1.0,
             decoder: DecoderName::Plain,
-            encoder_precision: Precision::F32,
         }
     }
 }
@@ -123,23 +114,4 @@ pub enum DecoderName {
     Plain,
     /// The code, and the encoder's feature maps.
     UNet,
-}
-
-/// Precision of what is multiplied; sums are f32.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Precision {
-    /// 24 bits.
-    F32,
-    /// bfloat16, 8 bits.
-    Bf16,
-}
-
-impl fmt::Display for Precision {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::F32 => "f32",
-            Self::Bf16 => "bf16",
-        })
-    }
 }

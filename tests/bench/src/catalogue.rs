@@ -81,9 +81,6 @@ pub struct Row {
     pub baseline: Option<Baseline>,
     /// How many times better than the baseline it must be.
     pub ratio_at_least: Option<f64>,
-    /// Instruction set, as `/proc/cpuinfo` spells it, without which what is measured is emulated;
-    /// the row then says so.
-    pub native_with: Option<String>,
 }
 
 /// What a figure is compared with.
@@ -159,17 +156,6 @@ impl Catalogue {
 }
 
 impl Row {
-    /// The row on a machine with these instruction sets.
-    #[must_use]
-    pub fn on(mut self, instructions: &[&str]) -> Self {
-        if let Some(set) = &self.native_with
-            && !instructions.contains(&set.as_str())
-        {
-            self.stage.push_str(&format!(" (emulated: no {set})"));
-        }
-        self
-    }
-
     /// How a figure that its baseline is made of is shown, and in what unit. Times add up, rates do
     /// not.
     pub(super) fn part_shown(&self) -> (Show, &str) {
@@ -304,21 +290,5 @@ mod tests {
             .map(|bench| bench.name)
             .collect();
         assert_eq!(named, there);
-    }
-
-    #[test]
-    fn a_row_says_what_is_emulated() {
-        let catalogue = Catalogue::load();
-        let row = catalogue
-            .rows
-            .iter()
-            .find(|row| row.native_with.is_some())
-            .unwrap();
-        assert_eq!(row.clone().on(&["avx512_bf16"]), *row);
-        let emulated = row.clone().on(&["avx2"]);
-        assert_eq!(
-            emulated.stage,
-            format!("{} (emulated: no avx512_bf16)", row.stage)
-        );
     }
 }

@@ -16,18 +16,7 @@ const COPIED: usize = 128 << 20;
 const COPIES: usize = 4;
 
 /// Instruction sets that decide how fast kernels are, as `/proc/cpuinfo` spells them.
-const INSTRUCTIONS: [&str; 10] = [
-    "sse4_2",
-    "avx",
-    "avx2",
-    "fma",
-    "f16c",
-    "avx512f",
-    "avx512_vnni",
-    "avx512_bf16",
-    "amx_bf16",
-    "amx_int8",
-];
+const INSTRUCTIONS: [&str; 6] = ["sse4_2", "avx", "avx2", "fma", "f16c", "avx512f"];
 
 /// What one core can do at best, measured. A line of `machine.jsonl`, written between two
 /// benchmarks: what holds the core up then must not pass for all it can do, so the best of all

@@ -139,11 +139,7 @@ fn tell(
         );
     }
     let machine = Machine::with(Core::best_of(&directory.join("machine.jsonl")));
-    let rows: Vec<Row> = rows
-        .into_iter()
-        .filter(|row| wanted(&row.figure))
-        .map(|row| row.on(&machine.instructions))
-        .collect();
+    let rows: Vec<Row> = rows.into_iter().filter(|row| wanted(&row.figure)).collect();
     let table = Table::new(&rows, &figures, machine.core.f32_flops);
     let note = note(judging, &figures);
     println!("{machine}\n{}\n{note}", table.to_terminal(judging));

@@ -296,7 +296,6 @@ mod tests {
             at_most: None,
             baseline: None,
             ratio_at_least: None,
-            native_with: None,
         }
     }
 

@@ -2,7 +2,7 @@ use std::sync::Arc;
 
 use bytemuck::Zeroable;
 use skein_protocol::IMAGE_PIXELS;
-use skein_protocol::config::{Observation, Precision, View};
+use skein_protocol::config::{Observation, View};
 use skein_protocol::ids::{Attempt, EpisodeId, RunId};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::ticket::{CourseChoice, Exploration};
@@ -91,7 +91,7 @@ pub(super) fn network(change: impl Fn(&mut [f32])) -> Network {
     let layout = SnapshotLayout::new(&view(), 16);
     let mut snapshot = random_snapshot(&layout, NETWORK.0);
     change(&mut snapshot.values[layout.policy()]);
-    Network::new(&snapshot, &layout, Precision::F32)
+    Network::new(&snapshot, &layout)
 }
 
 pub(super) fn flown(
@@ -319,11 +319,7 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
         history_steps: vec![1, 3],
     };
     let layout = SnapshotLayout::new(&view, 16);
-    let network = Network::new(
-        &random_snapshot(&layout, NETWORK.0),
-        &layout,
-        Precision::F32,
-    );
+    let network = Network::new(&random_snapshot(&layout, NETWORK.0), &layout);
     let courses = Arc::new(Courses::of_run(&config("")).unwrap());
     let mut environment_loop = EnvironmentLoop::new(
         ACTOR,

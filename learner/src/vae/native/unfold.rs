@@ -31,25 +31,18 @@ const ROW: usize = (STRIDE * (INPUTS - 1) + KERNEL_WIDTH) * CHANNELS;
 /// Lengths of the input and of the image.
 pub(super) const INPUT_LEN: usize = INPUTS * INPUT_CHANNELS;
 pub(super) const IMAGE_LEN: usize = ROWS * ROW;
-/// Blocks that a run is cut into. One: [`super::order::ParameterOrder`] keeps the weights of a
-/// kernel row as `[1024, 7 · 128]`, so blocks of less would read them in the wrong order.
-pub(super) const PARTS: usize = 1;
-/// Numbers of a run in a block.
-const PART: usize = RUN / PARTS;
-/// Blocks of weights.
-const BLOCKS: usize = ROWS * PARTS;
-/// Weights in a block, `[1024, PART]`.
-const BLOCK: usize = INPUT_CHANNELS * PART;
+/// Weights in a block, `[1024, RUN]`. Each image row has a block.
+const BLOCK: usize = INPUT_CHANNELS * RUN;
 
 /// The layer's packed weights and the batch's columns.
 #[derive(Debug)]
 pub(super) struct Unfold {
     pub(super) place: LayerRanges,
-    /// Of each block, `[1024, PART]`.
-    panels: [Panels; BLOCKS],
+    /// Of each block, `[1024, RUN]`.
+    panels: [Panels; ROWS],
     /// The block weights seen as an image, so that a window holds all weights of one input channel.
     weights: Windows,
-    /// What each input pixel makes of each run, or what flows back to it: `[BLOCKS, 3 n, PART]`.
+    /// What each input pixel makes of each run, or what flows back to it: `[ROWS, 3 n, RUN]`.
     columns: Buffer,
 }
 
@@ -79,7 +72,7 @@ impl UnfoldScratch {
 #[derive(Debug)]
 pub(super) struct Block<'a> {
     panels: &'a mut Panels,
-    /// What flows back, `[3 n, PART]`.
+    /// What flows back, `[3 n, RUN]`.
     columns: &'a [f32],
     weights: &'a mut [f32],
     moments: [&'a mut [f32]; 2],
@@ -87,11 +80,11 @@ pub(super) struct Block<'a> {
 
 impl Unfold {
     pub(super) fn new(isa: Isa, place: LayerRanges) -> Self {
-        assert_eq!(place.weight.len(), BLOCKS * BLOCK, "the layer's weights");
+        assert_eq!(place.weight.len(), ROWS * BLOCK, "the layer's weights");
         Self {
             place,
             panels: std::array::from_fn(|_| Panels::new(isa)),
-            weights: Windows::new([BLOCKS, INPUT_CHANNELS], PART, [BLOCKS, 1], 1),
+            weights: Windows::new([ROWS, INPUT_CHANNELS], RUN, [ROWS, 1], 1),
             columns: Buffer::default(),
         }
     }
@@ -100,22 +93,21 @@ impl Unfold {
     pub(super) fn pack(&mut self, parameters: &[f32]) {
         let weights = parameters[self.place.weight.clone()].chunks_exact(BLOCK);
         for (panels, weights) in self.panels.iter_mut().zip(weights) {
-            panels.pack(Matrix::of_rows(weights, PART));
+            panels.pack(Matrix::of_rows(weights, RUN));
         }
     }
 
     /// First half of the forward pass: multiplies each input pixel, `[3 n, 1024]`, with all blocks.
     pub(super) fn multiply(&mut self, team: &mut Team, input: &[f32]) {
         let pixels = input.len() / INPUT_CHANNELS;
-        self.columns.resize(BLOCKS * pixels * PART);
+        self.columns.resize(ROWS * pixels * RUN);
         for (panels, columns) in self
             .panels
             .iter()
-            .zip(self.columns.chunks_exact_mut(pixels * PART))
+            .zip(self.columns.chunks_exact_mut(pixels * RUN))
         {
-            team.split_rows(columns, PART, 1, |first, columns| {
-                let rows =
-                    &input[first * INPUT_CHANNELS..][..columns.len() / PART * INPUT_CHANNELS];
+            team.split_rows(columns, RUN, 1, |first, columns| {
+                let rows = &input[first * INPUT_CHANNELS..][..columns.len() / RUN * INPUT_CHANNELS];
                 product(
                     Rows::Matrix(rows),
                     panels,
@@ -132,40 +124,36 @@ impl Unfold {
         fill(image, bias);
         for (row, image) in image.chunks_exact_mut(ROW).enumerate() {
             for pixel in 0..INPUTS {
-                let into = image[pixel * STRIDE * CHANNELS..][..RUN].chunks_exact_mut(PART);
-                for (part, into) in into.enumerate() {
-                    let from = self.column(row * PARTS + part, INPUTS * index + pixel);
-                    isa.vectorised(
-                        #[inline(always)]
-                        || {
-                            for (into, from) in into.iter_mut().zip(from) {
-                                *into += from;
-                            }
-                        },
-                    );
-                }
+                let into = &mut image[pixel * STRIDE * CHANNELS..][..RUN];
+                let from = self.column(row, INPUTS * index + pixel);
+                isa.vectorised(
+                    #[inline(always)]
+                    || {
+                        for (into, from) in into.iter_mut().zip(from) {
+                            *into += from;
+                        }
+                    },
+                );
             }
         }
     }
 
     fn column(&self, block: usize, pixel: usize) -> &[f32] {
-        let pixels = self.columns.len() / (BLOCKS * PART);
-        &self.columns[(block * pixels + pixel) * PART..][..PART]
+        let pixels = self.columns.len() / (ROWS * RUN);
+        &self.columns[(block * pixels + pixel) * RUN..][..RUN]
     }
 
     /// First half of the backward pass: gathers the columns of each input pixel from the gradient
     /// with respect to the images, `[n, 5, 11, 128]`.
     pub(super) fn gather(&mut self, grad: &[f32]) {
         let images = grad.len() / (ROWS * ROW);
-        self.columns.resize(BLOCKS * INPUTS * images * PART);
+        self.columns.resize(ROWS * INPUTS * images * RUN);
         for (index, image) in grad.chunks_exact(ROWS * ROW).enumerate() {
             for (row, image) in image.chunks_exact(ROW).enumerate() {
                 for pixel in 0..INPUTS {
-                    let from = image[pixel * STRIDE * CHANNELS..][..RUN].chunks_exact(PART);
-                    for (part, from) in from.enumerate() {
-                        let place = ((row * PARTS + part) * images + index) * INPUTS + pixel;
-                        self.columns[place * PART..][..PART].copy_from_slice(from);
-                    }
+                    let from = &image[pixel * STRIDE * CHANNELS..][..RUN];
+                    let place = (row * images + index) * INPUTS + pixel;
+                    self.columns[place * RUN..][..RUN].copy_from_slice(from);
                 }
             }
         }
@@ -192,13 +180,13 @@ impl Unfold {
             transposed,
             ..
         } = scratch;
-        seen.resize(pixels * BLOCKS * PART);
-        for (pixel, seen) in seen.chunks_exact_mut(BLOCKS * PART).enumerate() {
-            for (block, seen) in seen.chunks_exact_mut(PART).enumerate() {
+        seen.resize(pixels * ROWS * RUN);
+        for (pixel, seen) in seen.chunks_exact_mut(ROWS * RUN).enumerate() {
+            for (block, seen) in seen.chunks_exact_mut(RUN).enumerate() {
                 seen.copy_from_slice(self.column(block, INPUTS * first + pixel));
             }
         }
-        panels.pack(Matrix::of_rows(seen, BLOCKS * PART).transposed());
+        panels.pack(Matrix::of_rows(seen, ROWS * RUN).transposed());
         transposed.resize(input.len());
         let weights = Rows::Windows(&self.weights, &parameters[self.place.weight.clone()]);
         product(weights, panels, Start::Zero, Finish::Plain, transposed);
@@ -231,7 +219,7 @@ impl Unfold {
     ) -> Vec<Block<'a>> {
         let range = self.place.weight.clone();
         let [first, second] = moments.map(|moment| moment[range.clone()].chunks_exact_mut(BLOCK));
-        let columns = self.columns.chunks_exact(self.columns.len() / BLOCKS);
+        let columns = self.columns.chunks_exact(self.columns.len() / ROWS);
         let weights = parameters[range].chunks_exact_mut(BLOCK);
         let blocks = self
             .panels
@@ -251,12 +239,12 @@ impl Unfold {
 
     /// Operations of one pass per image.
     pub(super) fn operations() -> f64 {
-        2.0 * (INPUTS * BLOCKS * BLOCK) as f64
+        2.0 * (INPUTS * ROWS * BLOCK) as f64
     }
 }
 
 impl Block<'_> {
-    /// The gradient of this block's weights, `[1024, PART]`. `input`: `[3 n, 1024]`.
+    /// The gradient of this block's weights, `[1024, RUN]`. `input`: `[3 n, 1024]`.
     pub(super) fn gradient<'a>(
         &self,
         isa: Isa,
@@ -270,7 +258,7 @@ impl Block<'_> {
         } = scratch;
         found.resize(BLOCK);
         let left = Matrix::of_rows(input, INPUT_CHANNELS);
-        gradient(team, isa, left, Terms::Matrix(self.columns, PART), found);
+        gradient(team, isa, left, Terms::Matrix(self.columns, RUN), found);
         found
     }
 
@@ -284,6 +272,6 @@ impl Block<'_> {
             &scratch.gradient,
             [first, second],
         );
-        self.panels.pack(Matrix::of_rows(self.weights, PART));
+        self.panels.pack(Matrix::of_rows(self.weights, RUN));
     }
 }

@@ -1,6 +1,10 @@
-//! One TD3 update with libtorch's automatic gradients, in reading order.
+//! Twin delayed deep deterministic policy gradient (TD3; Fujimoto et al. 2018, arXiv:1802.09477),
+//! which the paper compares SAC with (its Fig. 11).
 //!
-//! Equation numbers are those of arXiv:1802.09477.
+//! It is a comparison, so it has one engine: libtorch, which also learns from images. The critic is
+//! that of SAC, with as many networks, so that the algorithms differ in nothing else. By default
+//! that is one network with two estimates; the second one only steadies the targets. Equation numbers
+//! are those of the article.
 
 use skein_kernels::Team;
 use skein_protocol::ACTION;
@@ -21,23 +25,23 @@ use crate::state::{StatePart, Stateful};
 
 /// Policy and critic, their target networks, and their optimizers.
 #[derive(Debug)]
-pub struct TorchTd3 {
+pub struct Td3 {
     inputs: Inputs,
     settings: Td3Section,
     device: Device,
     policy: Policy,
-    pub(super) policy_parameters: Parameters,
+    policy_parameters: Parameters,
     policy_optimizer: Adam,
-    pub(super) target_policy: Parameters,
+    target_policy: Parameters,
     /// Encoder trained end to end, if there is one: its parameters lie before the critic's.
     perception: Option<Perception>,
     critic: Critic,
-    pub(super) critic_parameters: Parameters,
+    critic_parameters: Parameters,
     critic_optimizer: Adam,
-    pub(super) target_critic: Parameters,
+    target_critic: Parameters,
 }
 
-impl TorchTd3 {
+impl Td3 {
     /// Returns untrained networks; their parameters depend on the run's seed alone.
     pub fn new(section: &Td3Section, inputs: Inputs, run_seed: u64, device: Device) -> Self {
         let width = section.hidden_width as i64;
@@ -117,8 +121,13 @@ impl TorchTd3 {
     }
 }
 
-impl Algorithm for TorchTd3 {
-    /// As [`super::NativeTd3`]'s. libtorch has threads of its own and leaves `team` alone.
+impl Algorithm for Td3 {
+    /// One step of the critic, and every `td3.policy_period` steps one of the policy and of both
+    /// targets. Both gradients are computed before any parameter moves. libtorch has its own threads
+    /// and does not use `team`.
+    ///
+    /// Source: arXiv:1802.09477, algorithm 1, which moves the critic before it computes the policy's
+    /// gradient.
     fn update(
         &mut self,
         _team: &mut Team,
@@ -194,7 +203,7 @@ impl Algorithm for TorchTd3 {
     }
 }
 
-impl Stateful for TorchTd3 {
+impl Stateful for Td3 {
     fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let own = [
             ("td3.policy.parameters", &self.policy_parameters),
@@ -214,3 +223,6 @@ impl Stateful for TorchTd3 {
         parts
     }
 }
+
+#[cfg(test)]
+mod tests;
