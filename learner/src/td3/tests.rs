@@ -60,7 +60,7 @@ fn it_learns_to_guess_and_a_restored_one_continues_bit_for_bit() {
         let mut algorithm = td3(&section, seed);
         let before = error(&algorithm);
         for _ in 0..1500 {
-            let transitions = Transitions::guessing(OBSERVATION, 64, &mut data);
+            let transitions = Transitions::one_step_task(OBSERVATION, 64, &mut data);
             update(&mut algorithm, &transitions, &mut noise);
         }
         let after = error(&algorithm);
@@ -68,7 +68,7 @@ fn it_learns_to_guess_and_a_restored_one_continues_bit_for_bit() {
 
         let mut resumed = td3(&section, seed + 10);
         resumed.load_named(&algorithm.named_tensors()).unwrap();
-        let transitions = Transitions::guessing(OBSERVATION, 64, &mut data);
+        let transitions = Transitions::one_step_task(OBSERVATION, 64, &mut data);
         for either in [&mut algorithm, &mut resumed] {
             update(either, &transitions, &mut Noise::new(5));
         }
@@ -78,7 +78,7 @@ fn it_learns_to_guess_and_a_restored_one_continues_bit_for_bit() {
 
 /// Mean squared error of the policy's guesses.
 fn error(algorithm: &Td3) -> f64 {
-    let asked = Transitions::guessing(OBSERVATION, 200, &mut Noise::new(77));
+    let asked = Transitions::one_step_task(OBSERVATION, 200, &mut Noise::new(77));
     let observations = Tensor::from_slice(&asked.observations).view([-1, OBSERVATION as i64]);
     let _guard = no_grad_guard();
     let actions = algorithm
