@@ -3,8 +3,8 @@
 //!
 //! It is a comparison, so it has one engine: libtorch, which also learns from images. The critic is
 //! that of SAC, with as many networks, so that the algorithms differ in nothing else. By default
-//! that is one network with two estimates; the second one only steadies the targets. Equation numbers
-//! are those of the article.
+//! that is one network with two estimates; the second one only steadies the targets. Equation
+//! numbers are those of the article.
 
 use skein_kernels::Team;
 use skein_protocol::ACTION;
@@ -123,11 +123,11 @@ impl Td3 {
 
 impl Algorithm for Td3 {
     /// One step of the critic, and every `td3.policy_period` steps one of the policy and of both
-    /// targets. Both gradients are computed before any parameter moves. libtorch has its own threads
-    /// and does not use `team`.
+    /// targets. Both gradients are computed before any parameter moves. libtorch has its own
+    /// threads and does not use `team`.
     ///
-    /// Source: arXiv:1802.09477, algorithm 1, which moves the critic before it computes the policy's
-    /// gradient.
+    /// Source: arXiv:1802.09477, algorithm 1, which moves the critic before it computes the
+    /// policy's gradient.
     fn update(
         &mut self,
         _team: &mut Team,

@@ -38,11 +38,12 @@ const BLOCK: usize = INPUT_CHANNELS * RUN;
 #[derive(Debug)]
 pub(super) struct Unfold {
     pub(super) place: LayerRanges,
-    /// Of each block, `[1024, RUN]`.
+    /// Packed weights of each block, `[1024, RUN]`.
     panels: [Panels; ROWS],
     /// The block weights seen as an image, so that a window holds all weights of one input channel.
     weights: Windows,
-    /// What each input pixel makes of each run, or what flows back to it: `[ROWS, 3 n, RUN]`.
+    /// Contribution of each input pixel to each run, or the gradient with respect to it:
+    /// `[ROWS, 3 n, RUN]`.
     columns: Buffer,
 }
 
@@ -70,9 +71,9 @@ impl UnfoldScratch {
 
 /// One block of weights, with all that its update needs.
 #[derive(Debug)]
-pub(super) struct Block<'a> {
+pub(super) struct WeightBlock<'a> {
     panels: &'a mut Panels,
-    /// What flows back, `[3 n, RUN]`.
+    /// Gradient with respect to the block's output, `[3 n, RUN]`.
     columns: &'a [f32],
     weights: &'a mut [f32],
     moments: [&'a mut [f32]; 2],
@@ -216,7 +217,7 @@ impl Unfold {
         &'a mut self,
         parameters: &'a mut [f32],
         moments: [&'a mut [f32]; 2],
-    ) -> Vec<Block<'a>> {
+    ) -> Vec<WeightBlock<'a>> {
         let range = self.place.weight.clone();
         let [first, second] = moments.map(|moment| moment[range.clone()].chunks_exact_mut(BLOCK));
         let columns = self.columns.chunks_exact(self.columns.len() / ROWS);
@@ -228,12 +229,14 @@ impl Unfold {
             .zip(weights)
             .zip(first.zip(second));
         blocks
-            .map(|(((panels, columns), weights), (first, second))| Block {
-                panels,
-                columns,
-                weights,
-                moments: [first, second],
-            })
+            .map(
+                |(((panels, columns), weights), (first, second))| WeightBlock {
+                    panels,
+                    columns,
+                    weights,
+                    moments: [first, second],
+                },
+            )
             .collect()
     }
 
@@ -243,7 +246,7 @@ impl Unfold {
     }
 }
 
-impl Block<'_> {
+impl WeightBlock<'_> {
     /// The gradient of this block's weights, `[1024, RUN]`. `input`: `[3 n, 1024]`.
     pub(super) fn gradient<'a>(
         &self,
@@ -262,7 +265,7 @@ impl Block<'_> {
         found
     }
 
-    /// Applies Adam with the gradient left by [`Block::gradient`], and packs the weights.
+    /// Applies Adam with the gradient left by [`WeightBlock::gradient`], and packs the weights.
     pub(super) fn step(&mut self, isa: Isa, adam: AdamStep, scratch: &mut UnfoldScratch) {
         let [first, second] = &mut self.moments;
         adam.apply(
