@@ -178,7 +178,7 @@ fn every_package_has_only_its_allowed_dependencies() {
             ],
             &[torch],
         ),
-        // Whoever judges a run trusts no program of it.
+        // The judge of a run trusts none of its programs.
         (
             "skein-chaos",
             &["skein-protocol", "skein-run"],

@@ -20,7 +20,7 @@ const RISEN: f64 = 0.9;
 pub struct Estimate {
     /// Interquartile mean or mean.
     pub value: f64,
-    /// 95 % bootstrap interval; `None` for a single value, which tells nothing about other seeds.
+    /// 95 % bootstrap interval; `None` for a single value, which is no evidence about other seeds.
     pub interval: Option<(f64, f64)>,
 }
 

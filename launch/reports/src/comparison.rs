@@ -9,7 +9,7 @@ use super::canvas::{Area, Canvas, GRID, INK, REFERENCE, STRONG, font, px};
 use super::curves::{legend_line, padded_range, thick_line};
 use super::growth::brief;
 
-/// More lines than this could not be told apart in one picture.
+/// Largest number of lines that can be distinguished in one picture.
 pub const MOST_LINES: usize = 8;
 
 const WIDTH: u32 = 1280;

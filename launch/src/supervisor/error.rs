@@ -30,7 +30,7 @@ pub enum SupervisorError {
     /// The learner ended unexpectedly and is not restarted.
     #[error("the learner {how}; its log {} ends with\n{tail}", log.display())]
     LearnerFailed {
-        /// How it ended.
+        /// End of its process.
         how: String,
         /// Its log file.
         log: PathBuf,

@@ -26,7 +26,7 @@ pub struct Catalogue {
 pub struct Bench {
     /// Its name for cargo, and the first part of the name of each of its figures.
     pub name: String,
-    /// How it is started.
+    /// Its kind, which decides how it is started.
     #[serde(default)]
     pub kind: BenchKind,
     /// Condition on which it runs.

@@ -78,8 +78,8 @@ fn a_learner_without_progress_fails_the_run() {
 
 #[test]
 fn a_learner_killed_any_number_of_times_is_always_restarted() {
-    let learner = "echo >> $dir/lives; report 1
-        if [ $(wc -l < $dir/lives) -le 12 ]; then kill -9 $$; fi; touch $dir/stop";
+    let learner = "echo >> $dir/starts; report 1
+        if [ $(wc -l < $dir/starts) -le 12 ]; then kill -9 $$; fi; touch $dir/stop";
     let mut scripted = ScriptedRun::new(learner, FAITHFUL_ACTOR);
     scripted.plan.deadlines.learner_pause = Duration::from_millis(10);
     let (result, seen) = scripted.run(never);
@@ -90,7 +90,7 @@ fn a_learner_killed_any_number_of_times_is_always_restarted() {
 #[test]
 fn an_actor_killed_before_it_is_useful_is_always_restarted() {
     let actor = format!(
-        "echo >> $dir/lives-$id; if [ $(wc -l < $dir/lives-$id) -le 5 ]; then kill -$((9 + 6 * \
+        "echo >> $dir/starts-$id; if [ $(wc -l < $dir/starts-$id) -le 5 ]; then kill -$((9 + 6 * \
          id)) $$; fi; touch $dir/up-$id; {FAITHFUL_ACTOR}"
     );
     let learner = "report 1; while [ ! -e $dir/up-0 ] || [ ! -e $dir/up-1 ]; do sleep 0.02; done; \

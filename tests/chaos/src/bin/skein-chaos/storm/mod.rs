@@ -323,7 +323,7 @@ impl<'a> Storm<'a> {
 /// Processes to continue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Thaw {
-    /// Those whose freeze is over.
+    /// Processes whose freeze is over.
     Due,
     /// All frozen processes.
     All,
