@@ -144,10 +144,7 @@ fn tabulate(
         );
     }
     let machine = Machine::with(Core::best_of(&directory.join("machine.jsonl")));
-    let rows: Vec<BenchmarkRow> = rows
-        .into_iter()
-        .filter(|row| wanted(&row.figure))
-        .collect();
+    let rows: Vec<BenchmarkRow> = rows.into_iter().filter(|row| wanted(&row.figure)).collect();
     let table = Table::new(&rows, &figures, machine.core.f32_flops);
     let note = note(judging, &figures);
     println!("{machine}\n{}\n{note}", table.to_terminal(judging));
