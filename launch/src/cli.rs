@@ -77,8 +77,8 @@ pub(crate) struct RunArguments {
 
 const RUN_NOTES: &str = "\
 Ctrl-C stops in order: episodes in the air are abandoned, the updates of the epoch are finished, \
-everything learned is saved. A second Ctrl-C stops at once; --resume then continues from the newest \
-checkpoint.
+everything learned is saved. A second Ctrl-C stops at once; --resume then continues from the \
+newest checkpoint.
 
 Environment:
   RUST_LOG          level of the logs in DIR/logs [default: info], for example debug
@@ -96,7 +96,12 @@ pub(crate) struct AttachArguments {
     #[arg(long, value_name = "DIR")]
     pub(crate) run: PathBuf,
     /// Actors to start.
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 1,
+        value_parser = clap::value_parser!(u32).range(1..)
+    )]
     pub(crate) count: u32,
 }
 
@@ -164,8 +169,8 @@ pub(crate) struct ExperimentArguments {
 }
 
 const EXPERIMENT_NOTES: &str = "\
-Ctrl-C stops in order: every training under way finishes the updates of its epoch and saves; a suite \
-under way is flown again the next time. A second Ctrl-C stops at once.
+Ctrl-C stops in order: every training under way finishes the updates of its epoch and saves; a \
+suite under way is flown again the next time. A second Ctrl-C stops at once.
 
 Exit status: 0 every run is complete, 1 a run failed or something was refused, 2 wrong arguments, \
 130 interrupted.";
@@ -193,7 +198,8 @@ impl RunArguments {
             _ => Cli::command()
                 .error(
                     ErrorKind::ArgumentConflict,
-                    "a run is resumed in its own directory, with the configuration it was started with: --config, --run-dir and --set cannot be given with --resume",
+                    "a run is resumed in its own directory, with the configuration it was started \
+                     with: --config, --run-dir and --set cannot be given with --resume",
                 )
                 .exit(),
         }

@@ -1,5 +1,4 @@
-//! What the user is told at the end of a run: the evaluation, where the time went, and where
-//! everything lies.
+//! Summary at the end of a run: its evaluation, where the time went, and where its files are.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -13,8 +12,8 @@ use skein_run::tables::{evaluation_table, stages_table};
 
 use skein_reports::Clock;
 
-/// The evaluation table, the run in one sentence, the table of where the time went, and the paths
-/// of everything it left, for standard output. What a run did not come to write is left out.
+/// Returns the evaluation table, a sentence on the run, the table of times per stage, and the paths
+/// of all files the run left, for standard output. Parts that the run did not write are left out.
 pub fn conclusion(run: &RunDirectory) -> String {
     let mut text = String::new();
     if let Some(report) = read::<EvaluationReport>(&run.evaluation_json()) {
@@ -58,7 +57,8 @@ fn read<T: DeserializeOwned>(path: &Path) -> Option<T> {
 
 fn trained_sentence(trained: &Trained) -> String {
     format!(
-        "Trained after {}: R {:.3} in evaluation episodes after {} episodes, {} steps, {} updates.",
+        "Trained after {}: R (share of walls passed) {:.3} in evaluation episodes, \
+         after {} episodes, {} steps, {} updates.",
         Clock(trained.wall_secs),
         trained.rate,
         trained.episodes,
@@ -73,7 +73,8 @@ fn sentence(summary: &Summary) -> String {
         Ending::Interrupted => "Interrupted",
     };
     format!(
-        "{ending} after {}: {} episodes, {} steps, {} updates, {} VAE updates. Final policy (version {}): {}.\n",
+        "{ending} after {}: {} episodes, {} steps, {} updates, {} VAE updates. \
+             Final policy (version {}): {}.\n",
         Clock(summary.wall_secs),
         summary.episodes,
         summary.steps,
@@ -87,37 +88,46 @@ fn sentence(summary: &Summary) -> String {
     )
 }
 
-/// What is there, and what it is.
+/// Returns the files that exist, each with its meaning.
 fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
     let plot = |name: &str| run.plots().join(name);
     [
         (run.config(), "the resolved configuration"),
-        (run.courses(), "the courses flown"),
+        (run.courses(), "courses of the run"),
         (run.episodes_csv(), "one row per training episode"),
         (run.evaluation_json(), "the evaluation above"),
-        (run.evaluation_trajectories_csv(), "where its episodes flew"),
-        (run.summary_json(), "counts, times above, policy_sha256"),
-        (plot("return.png"), "return over the training episodes"),
+        (
+            run.evaluation_trajectories_csv(),
+            "trajectories of the evaluation episodes",
+        ),
+        (run.summary_json(), "counts, times per stage, policy_sha256"),
+        (plot("return.png"), "return of the training episodes"),
         (
             plot("walls_passed.png"),
-            "walls passed over the training episodes",
+            "walls passed by the training episodes",
         ),
         (
             plot("reconstructions.png"),
-            "depth images and what the VAE makes of them",
+            "depth images and their VAE reconstructions",
         ),
         (
             plot("trajectories.png"),
-            "evaluation episodes through the walls",
+            "trajectories of the evaluation episodes",
         ),
         (
             run.best_snapshot(),
-            "the best snapshot: launch/evaluate.sh --run DIR",
+            "the best snapshot; fly it: launch/evaluate.sh --run DIR",
         ),
         (run.latest_snapshot(), "the last snapshot"),
-        (run.checkpoints(), "everything the learner knew"),
-        (run.tensorboard(), "curves: tensorboard --logdir DIR"),
-        (run.logs(), "a log for each process"),
+        (
+            run.checkpoints(),
+            "full state of the learner, to resume from",
+        ),
+        (
+            run.tensorboard(),
+            "training curves: tensorboard --logdir DIR",
+        ),
+        (run.logs(), "one log per process"),
     ]
     .into_iter()
     .filter(|(path, _)| path.exists())
@@ -137,7 +147,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_finished_run_is_told_with_its_table_and_paths() {
+    fn the_conclusion_of_a_finished_run_has_its_table_and_paths() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         let report = EvaluationReport {
@@ -187,7 +197,8 @@ mod tests {
         for part in [
             "version 42",
             "training",
-            "Trained after 1:01: R 0.930 in evaluation episodes after 90 episodes, 1800 steps",
+            "Trained after 1:01: R (share of walls passed) 0.930 in evaluation episodes, after 90 \
+             episodes, 1800",
             "Completed after 1:15: 100 episodes, 2000 steps",
             "│ actors, together    ┆ encoder ┆  2000 ┆ 1.50 s ┆ 750.00 µs ┆ 100.0 % │",
             "summary.json",
@@ -196,12 +207,12 @@ mod tests {
         }
         assert!(
             !text.contains("episodes.csv"),
-            "what is not there is not listed:\n{text}"
+            "a file that does not exist is not listed:\n{text}"
         );
     }
 
     #[test]
-    fn a_run_that_left_nothing_has_a_conclusion_still() {
+    fn a_run_that_left_nothing_still_has_a_conclusion() {
         let directory = tempfile::tempdir().unwrap();
         assert!(
             conclusion(&RunDirectory::new(directory.path()))

@@ -1,8 +1,8 @@
-//! The progress of a run, on a terminal or in a log.
+//! Progress of a run, on a terminal or in a log.
 //!
-//! A terminal gets a bar with the figures beneath that renew themselves; anything else gets a plain
-//! line every few seconds. Both go to standard error, so that what a run comes to stands alone on
-//! standard output.
+//! A terminal gets a progress bar with figures below it, updated in place. Any other output gets a
+//! plain line every few seconds. Both go to standard error, so that standard output holds only the
+//! results.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -15,14 +15,14 @@ use skein_reports::Clock;
 
 use crate::supervisor::{Restarts, Watcher};
 
-/// Between two plain lines.
+/// Time between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
-/// The pace of the last so many seconds says how long the rest will take: the VAE's part of a run
-/// is slower than what follows.
+/// Time window for the pace from which the remaining time is estimated. A short window matters
+/// because the VAE's part of a run is slower than what follows.
 const PACE_SECS: f64 = 60.0;
 
-/// Shows how a run gets on.
-pub struct Display {
+/// Display of a run's progress.
+pub struct ProgressDisplay {
     surface: Surface,
     pace: Pace,
 }
@@ -32,7 +32,7 @@ enum Surface {
     Plain { last: Option<(Instant, Phase)> },
 }
 
-/// A progress bar, if standard error is a terminal.
+/// Returns a progress bar if standard error is a terminal.
 pub fn bar_on_terminal() -> Option<ProgressBar> {
     std::io::stderr().is_terminal().then(|| {
         let style = ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}")
@@ -41,8 +41,8 @@ pub fn bar_on_terminal() -> Option<ProgressBar> {
     })
 }
 
-impl Display {
-    /// A display for this process's standard error.
+impl ProgressDisplay {
+    /// Returns a display for this process's standard error.
     pub fn new() -> Self {
         let surface = bar_on_terminal().map_or(Surface::Plain { last: None }, Surface::Terminal);
         Self {
@@ -51,13 +51,13 @@ impl Display {
         }
     }
 
-    /// Where the run is and how much longer it will take, and the figures that show whether it
-    /// learns.
+    /// Returns a head line (position in the run and remaining time) and a line of figures that show
+    /// whether the training makes progress.
     pub fn text(&mut self, progress: &Progress, restarts: Restarts) -> (String, String) {
         let left_secs = self.pace.secs_left(progress);
-        let figures = Figures { progress, restarts };
+        let figures = ProgressFigures { progress, restarts };
         (
-            Head {
+            ProgressHead {
                 progress,
                 left_secs,
             }
@@ -66,7 +66,7 @@ impl Display {
         )
     }
 
-    /// Removes the bar, so that other things can be printed.
+    /// Removes the bar, so that other text can be printed.
     pub fn finish(&self) {
         if let Surface::Terminal(bar) = &self.surface {
             bar.finish_and_clear();
@@ -74,13 +74,13 @@ impl Display {
     }
 }
 
-impl Default for Display {
+impl Default for ProgressDisplay {
     fn default() -> Self {
         Self::new()
     }
 }
 
-impl Watcher for Display {
+impl Watcher for ProgressDisplay {
     fn progress(&mut self, progress: &Progress, restarts: Restarts) {
         let (head, figures) = self.text(progress, restarts);
         match &mut self.surface {
@@ -116,13 +116,13 @@ impl Watcher for Display {
     }
 }
 
-/// Where the run is, and how much longer it will take.
-struct Head<'a> {
+/// Position in the run and remaining time.
+struct ProgressHead<'a> {
     progress: &'a Progress,
     left_secs: Option<f64>,
 }
 
-impl fmt::Display for Head<'_> {
+impl fmt::Display for ProgressHead<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Progress {
             episodes,
@@ -154,13 +154,13 @@ impl fmt::Display for Head<'_> {
     }
 }
 
-/// The figures that show whether it learns, and what it has been through.
-struct Figures<'a> {
+/// ProgressFigures of the training, and restarts of its processes.
+struct ProgressFigures<'a> {
     progress: &'a Progress,
     restarts: Restarts,
 }
 
-impl fmt::Display for Figures<'_> {
+impl fmt::Display for ProgressFigures<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let progress = self.progress;
         write!(
@@ -195,8 +195,8 @@ impl fmt::Display for Figures<'_> {
     }
 }
 
-/// `figures` on as many lines of at most `columns` as they take, parted where one figure ends: the
-/// terminal would part them anywhere, and the bar would not know how many lines to renew.
+/// Returns `figures` broken into lines of at most `columns`, at the separators between figures. A
+/// terminal would break them anywhere, and the bar would not know how many lines to redraw.
 fn wrapped(figures: &str, columns: usize) -> String {
     let mut lines: Vec<String> = Vec::new();
     for figure in figures.split(" · ") {
@@ -211,7 +211,7 @@ fn wrapped(figures: &str, columns: usize) -> String {
     lines.join("\n")
 }
 
-/// Columns of the terminal on standard error; of a small one when it does not say.
+/// Returns the width of the terminal on standard error, or that of a small terminal if unknown.
 fn terminal_columns() -> usize {
     rustix::termios::tcgetwinsize(std::io::stderr()).map_or(80, |size| match size.ws_col {
         0 => 80,
@@ -219,19 +219,19 @@ fn terminal_columns() -> usize {
     })
 }
 
-/// The pace of the training episodes over the last [`PACE_SECS`].
+/// Pace of the training episodes over the last [`PACE_SECS`].
 #[derive(Debug, Default)]
 struct Pace {
-    /// Elapsed seconds and episodes, oldest first.
+    /// Elapsed seconds and episode counts, oldest first.
     reports: VecDeque<(f64, u64)>,
 }
 
 impl Pace {
-    /// Seconds until all training episodes are flown at the present pace; `None` before there is a
-    /// pace.
+    /// Returns the seconds until all training episodes are flown at the present pace, or `None`
+    /// before a pace is known.
     fn secs_left(&mut self, progress: &Progress) -> Option<f64> {
         let (now_secs, episodes) = (progress.elapsed_secs, progress.episodes);
-        // A learner that was started again does some work anew, and is ahead of nobody by it.
+        // A restarted learner repeats some episodes; they say nothing about the pace.
         if self
             .reports
             .back()
@@ -276,11 +276,11 @@ mod tests {
         let progress = progress(3725.0, 512);
         let line = format!(
             "{} · {}",
-            Head {
+            ProgressHead {
                 progress: &progress,
                 left_secs: Some(61.0)
             },
-            Figures {
+            ProgressFigures {
                 progress: &progress,
                 restarts: Restarts {
                     learner: 2,
@@ -288,18 +288,19 @@ mod tests {
                 },
             }
         );
-        let expected = "episode 512/2000 · 1:02:05, 1:01 left · 152 steps/s · 63 updates/s · walls passed 1.23 · temperature 0.051 · 1 actor · learner restarted 2×";
+        let expected = "episode 512/2000 · 1:02:05, 1:01 left · 152 steps/s · 63 updates/s · \
+                        walls passed 1.23 · temperature 0.051 · 1 actor · learner restarted 2×";
         assert_eq!(line, expected);
     }
 
     #[test]
-    fn figures_never_exceed_the_width_of_the_terminal() {
+    fn figures_never_exceed_the_terminal_width() {
         let progress = Progress {
             mean_return: Some(-8.69),
             vae_loss: Some(150.1),
             ..progress(3725.0, 512)
         };
-        let figures = Figures {
+        let figures = ProgressFigures {
             progress: &progress,
             restarts: Restarts {
                 learner: 12,
@@ -319,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn a_learner_that_was_started_again_has_a_pace_of_its_own() {
+    fn the_pace_starts_afresh_with_a_restarted_learner() {
         let mut pace = Pace::default();
         for second in 0..100 {
             pace.secs_left(&progress(f64::from(second), 100 * second as u64 / 10));
@@ -329,11 +330,11 @@ mod tests {
     }
 
     #[test]
-    fn time_left_follows_the_present_pace() {
+    fn remaining_time_follows_the_present_pace() {
         let mut pace = Pace::default();
         assert_eq!(pace.secs_left(&progress(0.0, 0)), None);
         assert_eq!(pace.secs_left(&progress(10.0, 100)), Some(190.0));
-        // Ten times slower from here on: after a minute the first seconds are forgotten.
+        // Ten times slower from here on. After a minute the first seconds no longer count.
         for second in 11..=200 {
             pace.secs_left(&progress(f64::from(second), 100 + (second as u64 - 10)));
         }

@@ -1,16 +1,16 @@
-//! `skein experiment`: runs the experiments of `configs/experiments/`, and reports what they found.
+//! `skein experiment`: runs the experiments of `configs/experiments/` and reports their results.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::thread;
 
 use anyhow::{Context, Result, bail, ensure};
-use skein_experiments::board::Board;
+use skein_experiments::board::ExperimentDisplay;
 use skein_experiments::definition::{Experiment, names};
-use skein_experiments::plan::{Plan, State, root};
+use skein_experiments::plan::{ExperimentPlan, RunState, root};
 use skein_experiments::report::{Findings, Publication};
 use skein_experiments::results;
-use skein_experiments::runner::{self, Manner, Session};
+use skein_experiments::runner::{self, RunnerOptions, SessionOutcome};
 use skein_launch::display::bar_on_terminal;
 use skein_launch::interrupts::{interrupts, runtime};
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
@@ -18,7 +18,7 @@ use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
 use crate::beside_this;
 use crate::cli::ExperimentArguments;
 
-/// Does what `arguments` ask for; the status says whether every run is complete.
+/// Carries out the command. The exit status shows whether every run is complete.
 pub(crate) fn carry_out(arguments: &ExperimentArguments) -> Result<ExitCode> {
     match &arguments.name {
         Some(name) => arguments.carry_out(name),
@@ -26,7 +26,7 @@ pub(crate) fn carry_out(arguments: &ExperimentArguments) -> Result<ExitCode> {
     }
 }
 
-/// Prints what each experiment in `folder` is to find out.
+/// Prints the question of each experiment in `folder`.
 fn list(folder: &Path) -> Result<()> {
     let names = names(folder)?;
     let width = names
@@ -59,10 +59,11 @@ impl ExperimentArguments {
         let runs = self.runs.clone();
         let runs = runs.unwrap_or_else(|| self.repository.join("runs/experiments"));
         let root = root(&runs, &experiment, self.episodes);
-        // What would keep hours of work from being published is told before they begin.
+        // Refuse what would prevent publication before hours of work begin.
         if self.publish && (self.episodes.is_some() || seeds < experiment.seeds) {
             bail!(
-                "--publish puts the whole experiment into docs/results/{name}.md, and --episodes or fewer than {} would leave a part of it there: leave out the one or the other",
+                "--publish needs the whole experiment: \
+                     remove --publish, or --episodes and any --seeds below {}",
                 plural(experiment.seeds as usize, "seed")
             );
         }
@@ -76,31 +77,32 @@ impl ExperimentArguments {
             let session = self.run(&experiment, &root, seeds)?;
             if session.interruptions > 0 {
                 eprintln!(
-                    "skein: to go on with it: {}",
+                    "skein: to resume this experiment: {}",
                     self.command(&experiment, Options::All)
                 );
                 return Ok(ExitCode::from(EXIT_INTERRUPTED));
             }
             if !session.failed.is_empty() {
                 eprintln!(
-                    "skein: {} failed: {}; the same command tries them again and leaves alone what is complete",
+                    "skein: {} failed: {}; \
+                         the same command tries them again and leaves complete runs alone",
                     plural(session.failed.len(), "run"),
                     session.failed.join(", ")
                 );
                 status = ExitCode::FAILURE;
             }
         }
-        self.tell(&experiment, &root, seeds, publication.as_ref())?;
+        self.report_results(&experiment, &root, seeds, publication.as_ref())?;
         Ok(status)
     }
 
-    fn run(&self, experiment: &Experiment, root: &Path, seeds: u64) -> Result<Session> {
-        let _claim = Plan::claim(root)?;
-        let mut plan = Plan::new(experiment, root, seeds)?;
+    fn run(&self, experiment: &Experiment, root: &Path, seeds: u64) -> Result<SessionOutcome> {
+        let _claim = ExperimentPlan::claim(root)?;
+        let mut plan = ExperimentPlan::new(experiment, root, seeds)?;
         plan.check_idle()?;
-        for (run, other) in plan.take_over()? {
+        for (run, other) in plan.link_trained_runs()? {
             eprintln!(
-                "skein: {run} was trained already: it is {}",
+                "skein: {run} is trained already: linked to {}",
                 other.display()
             );
         }
@@ -110,8 +112,8 @@ impl ExperimentArguments {
         };
         let (skein, evaluate) = (beside_this("skein")?, beside_this("skein-evaluate")?);
         announce(experiment, &plan, jobs);
-        let mut board = Board::new(bar_on_terminal());
-        let manner = Manner {
+        let mut board = ExperimentDisplay::new(bar_on_terminal());
+        let manner = RunnerOptions {
             skein: &skein,
             evaluate: &evaluate,
             jobs,
@@ -128,17 +130,17 @@ impl ExperimentArguments {
         session
     }
 
-    /// Reports what there is, and publishes it if that was asked for.
-    fn tell(
+    /// Writes and prints the report, and publishes it if requested.
+    fn report_results(
         &self,
         experiment: &Experiment,
         root: &Path,
         seeds: u64,
         publication: Option<&Publication>,
     ) -> Result<()> {
-        // Looked at anew: a file that was changed while runs were under way has made two
-        // experiments of one.
-        let plan = Plan::new(experiment, root, seeds)?;
+        // Read the runs again: if the experiment's file changed meanwhile, they may belong to two
+        // experiments.
+        let plan = ExperimentPlan::new(experiment, root, seeds)?;
         let findings = Findings {
             experiment,
             plan: &plan,
@@ -147,13 +149,13 @@ impl ExperimentArguments {
         };
         let report = findings.write()?;
         println!("{}", report.text.trim_end());
-        eprintln!("skein: the report is in {}", report.document.display());
+        eprintln!("skein: report: {}", report.document.display());
         let Some(publication) = publication else {
             return Ok(());
         };
         if !findings.is_whole() {
             bail!(
-                "nothing was published: {} of {} runs are complete",
+                "not published: only {} of {} runs are complete",
                 findings.results.len(),
                 plan.runs.len()
             );
@@ -164,7 +166,7 @@ impl ExperimentArguments {
         Ok(())
     }
 
-    /// The command that does what this one does.
+    /// Returns the command that repeats this one.
     fn command(&self, experiment: &Experiment, options: Options) -> String {
         let mut command = format!("launch/experiment.sh {}", experiment.name);
         let mut option = |name: &str, value: Option<String>| {
@@ -194,20 +196,20 @@ impl ExperimentArguments {
     }
 }
 
-/// Which options of a command are told.
+/// Options shown in a command.
 #[derive(Clone, Copy, PartialEq)]
 enum Options {
     All,
-    /// Those that the result depends on.
+    /// Options that affect the result.
     OfTheResult,
 }
 
-fn announce(experiment: &Experiment, plan: &Plan, jobs: usize) {
+fn announce(experiment: &Experiment, plan: &ExperimentPlan, jobs: usize) {
     eprintln!("skein: {}", experiment.question);
     let there = [
-        (State::Complete, "complete"),
-        (State::Trained, "trained"),
-        (State::Begun, "begun"),
+        (RunState::Complete, "complete"),
+        (RunState::Trained, "trained"),
+        (RunState::Begun, "begun"),
     ]
     .map(|(state, what)| (plan.count(state), what))
     .into_iter()

@@ -15,10 +15,12 @@ use clap::Parser;
 use rustix::fs::Mode;
 use rustix::process::umask;
 use skein_launch::conclusion::conclusion;
-use skein_launch::display::Display;
+use skein_launch::display::ProgressDisplay;
 use skein_launch::interrupts::{interrupts, runtime};
 use skein_launch::resume::resume;
-use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, SupervisorError};
+use skein_launch::supervisor::{
+    self, Deadlines, Ended, Programs, SupervisionPlan, SupervisorError,
+};
 use skein_prepare::room::{check_shared_memory_for_more, scarce_disk};
 use skein_prepare::{Prepared, prepare};
 use skein_protocol::config::{Config, CoursesSection};
@@ -30,13 +32,13 @@ use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
 
 use cli::{AttachArguments, Cli, Command, EvaluateArguments, ReportArguments, RunArguments, Task};
 
-/// What the system may refuse.
+/// Contexts of errors that the operating system may return.
 const RUNTIME: &str = "cannot start the runtime";
 const SIGNALS: &str = "cannot listen for signals";
-/// How long a learner that nobody supervises may still be ending, before its run is resumed.
+/// Time that an unsupervised learner has to end before its run is resumed.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// A run that failed, and what is left of it.
+/// A run that failed, and its directory.
 #[derive(Debug, thiserror::Error)]
 #[error("{source}")]
 struct Unfinished {
@@ -57,11 +59,11 @@ fn main() -> ExitCode {
         Ok(status) => status,
         Err(error) => {
             eprintln!("skein: {}", with_causes(error.as_ref()));
-            // What keeps a learner from starting would keep it from going on, too.
+            // A learner that cannot start cannot be resumed either.
             if let Some(Unfinished { run, source }) = error.downcast_ref()
-                && !source.tells_all()
+                && !source.is_self_explanatory()
             {
-                tell_how_to_go_on(run);
+                print_resume_command(run);
             }
             ExitCode::FAILURE
         }
@@ -76,7 +78,7 @@ fn status(ended: Ended) -> ExitCode {
 }
 
 fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
-    // Whatever the processes of a run write is their user's alone.
+    // All files of a run are readable by its user alone.
     umask(Mode::RWXG | Mode::RWXO);
     let programs = Programs::beside_this()?;
     let actors = match arguments.actors {
@@ -101,14 +103,14 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     }
 
     let claims = claim_actors(run, actors)?;
-    let plan = Plan {
+    let plan = SupervisionPlan {
         run: run.clone(),
         programs,
         actors: claims.iter().map(ActorClaim::id).collect(),
         learner_threads: config.run.learner_threads,
         deadlines: Deadlines::of(config),
     };
-    let mut display = Display::new();
+    let mut display = ProgressDisplay::new();
     let outcome = runtime().context(RUNTIME)?.block_on(async {
         let mut interrupts = interrupts().context(SIGNALS)?;
         anyhow::Ok(supervisor::run(&plan, &mut interrupts, &mut display).await)
@@ -119,28 +121,28 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
 
     let outcome = outcome?;
     if let (Some(new), Err(error)) = (new, &outcome)
-        && error.tells_all()
+        && error.is_self_explanatory()
         && run.newest_checkpoint().is_none()
     {
-        // The run never began; its directory would only be in the way of the next attempt.
+        // The run never began: its directory would only block the next attempt.
         if let Err(error) = new.take_back() {
             eprintln!("skein: {} remains: {error}", run.root().display());
         }
         return Ok(outcome?);
     }
 
-    // Plots are a service: a run that failed may have left something worth looking at, and one that
-    // succeeded has, plots or not.
+    // Plots are optional: a run that failed may still have left something to draw, and a run that
+    // succeeded is a success without them.
     if let Err(error) = draw(run, config) {
-        eprintln!("skein: not all plots could be drawn: {error}");
+        eprintln!("skein: some plots could not be drawn: {error}");
     }
     let ended = outcome.map_err(|source| Unfinished {
         run: run.clone(),
         source,
     })?;
     print!("{}", conclusion(run));
-    // Whoever told the learner alone to stop has interrupted the run as well, and a run may be
-    // complete before it heeds an interruption.
+    // A user who stopped only the learner has interrupted the run as well. Conversely, a run may
+    // complete before it acts on an interruption.
     let ended = match run.summary().map(|summary| summary.ending) {
         Some(Ending::Completed) => Ended::Finished,
         Some(Ending::Interrupted) => Ended::Interrupted,
@@ -150,16 +152,16 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         if run.summary().is_none() {
             let newest = run.newest_checkpoint();
             let kept = newest.map_or("there is no checkpoint yet".to_owned(), |episodes| {
-                format!("the newest checkpoint is of episode {episodes}")
+                format!("the newest checkpoint was written after episode {episodes}")
             });
-            eprintln!("skein: stopped at once: {kept}");
+            eprintln!("skein: stopped immediately: {kept}");
         }
-        tell_how_to_go_on(run);
+        print_resume_command(run);
     }
     Ok(ended)
 }
 
-/// Tells what is about to be done.
+/// Prints what is about to start.
 fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
     let config = &prepared.config;
     eprintln!(
@@ -170,13 +172,14 @@ fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
     );
     let root = prepared.run.root().display();
     if arguments.resume.is_some() {
-        eprintln!("skein: going on with the run in {root}");
+        eprintln!("skein: resuming the run in {root}");
         return;
     }
-    eprintln!("skein: everything goes to {root}");
+    eprintln!("skein: run directory: {root}");
     if !config.courses.evaluation.contains(&config.courses.training) {
         eprintln!(
-            "skein: note: the training course is not among courses.evaluation; the best snapshot is chosen on {}",
+            "skein: note: the training course is not in courses.evaluation; \
+                 the best snapshot is chosen on {}",
             prepared
                 .config
                 .courses
@@ -187,27 +190,27 @@ fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
     }
 }
 
-/// The last line about a run that is not complete.
-fn tell_how_to_go_on(run: &RunDirectory) {
+/// Prints the command that resumes an incomplete run.
+fn print_resume_command(run: &RunDirectory) {
     let root = run.root().display().to_string();
     let is_plain = |character: char| character.is_alphanumeric() || "/._-+=:,@".contains(character);
     let root = match root.chars().all(is_plain) {
         true => root,
         false => format!("'{}'", root.replace('\'', r"'\''")),
     };
-    eprintln!("skein: to go on with it: launch/run_local.sh --resume {root}");
+    eprintln!("skein: to resume this run: launch/run_local.sh --resume {root}");
 }
 
 fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let programs = Programs::beside_this()?;
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
-    // Between two incarnations of its learner, a run is under way as long as somebody sees to it
-    // that there will be another.
+    // While the learner restarts, its supervisor keeps the run under way.
     if !run.is_under_way()? {
         let root = run.root().display();
         bail!(
-            "the run in {root} is not under way on this machine; one that is not complete is gone on with by launch/run_local.sh --resume {root}"
+            "the run in {root} is not under way on this machine; \
+              if it is incomplete, resume it with launch/run_local.sh --resume {root}"
         );
     }
     umask(Mode::RWXG | Mode::RWXO);
@@ -215,27 +218,25 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let claims = claim_actors(&run, arguments.count as usize)?;
     let actors: Vec<_> = claims.iter().map(ActorClaim::id).collect();
     let most = config.transport.max_actors;
-    // The lowest free numbers were claimed: with those from the limit on, there would be too many.
+    // The lowest free ids were claimed. Ids at or above the limit exceed the allowed number.
     let too_many = actors.iter().filter(|id| id.0 as usize >= most).count();
     if too_many > 0 {
-        bail!(
-            "that is {too_many} more than transport.max_actors = {most} of this run allows: attach fewer"
-        );
+        bail!("this run allows transport.max_actors = {most} actors: attach {too_many} fewer");
     }
     let names: Vec<_> = actors.iter().map(ToString::to_string).collect();
     eprintln!(
-        "skein: adding actor {} to {}; Ctrl-C takes them away again",
+        "skein: adding actor {} to {}; Ctrl-C removes them again",
         names.join(", "),
         run.root().display()
     );
-    let plan = Plan {
+    let plan = SupervisionPlan {
         run: run.clone(),
         programs,
         actors,
         learner_threads: config.run.learner_threads,
         deadlines: Deadlines::of(&config),
     };
-    let mut display = Display::new();
+    let mut display = ProgressDisplay::new();
     runtime().context(RUNTIME)?.block_on(async {
         let mut interrupts = interrupts().context(SIGNALS)?;
         let is_under_way = || run.is_under_way().unwrap_or(false);
@@ -282,18 +283,18 @@ fn beside_this(name: &str) -> anyhow::Result<PathBuf> {
     Ok(program)
 }
 
-/// Removes what runs of this user left whose processes were all killed.
+/// Removes the remains of this user's runs whose processes were all killed.
 fn sweep() {
     for failure in sweep_leftovers().failures {
-        eprintln!("skein: not removed: {failure}");
+        eprintln!("skein: could not remove: {failure}");
     }
 }
 
-/// The run in `directory`, by its absolute path: processes of a run compare paths.
+/// Returns the run in `directory`, by its absolute path, because processes of a run compare paths.
 fn open(directory: &Path) -> anyhow::Result<RunDirectory> {
     let root = directory
         .canonicalize()
-        .with_context(|| format!("{} is no directory of a run", directory.display()))?;
+        .with_context(|| format!("{} is not a run directory", directory.display()))?;
     Ok(RunDirectory::new(root))
 }
 

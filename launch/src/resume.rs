@@ -1,4 +1,4 @@
-//! What must hold for a run to be gone on with, and who may do it.
+//! Checks that a run can be resumed, and claims it.
 
 use std::path::{Path, PathBuf};
 use std::thread::sleep;
@@ -10,69 +10,75 @@ use skein_run::{LockError, PlaceError, RunDirectory, RunError, SupervisorLock};
 use skein_prepare::room::{check_folders, check_shared_memory};
 use skein_prepare::{PrepareError, Prepared, check};
 
-/// Between two looks whether an earlier learner is gone.
+/// Time between two checks whether an earlier learner has ended.
 const LOOK: Duration = Duration::from_millis(100);
 
-/// Why a run cannot be gone on with.
+/// Reason why a run cannot be resumed.
 #[derive(Debug, thiserror::Error)]
 pub enum ResumeError {
-    /// There is no run in the directory.
+    /// The directory holds no run.
     #[error(
-        "{} is not the directory of a run, it holds no {}: give the one that the run's first lines named",
+        "{} is not a run directory: it holds no {}. \
+             Give the directory that the run printed when it started",
         directory.display(),
         missing.display()
     )]
     NotARun {
         /// The directory.
         directory: PathBuf,
-        /// What it should hold.
+        /// The file it should hold.
         missing: PathBuf,
     },
-    /// All of it is done.
+    /// All its training episodes are done.
     #[error(
-        "the run in {} is complete, all {episodes} episodes of it: there is nothing to go on with; start a new one for more. target/release/skein report --run {} draws its plots again, launch/evaluate.sh --run {} flies its best snapshot again",
+        "the run in {} is complete (all {episodes} episodes), so it cannot be resumed; \
+             start a new run to train more. \
+             target/release/skein report --run {} draws its plots again, \
+             launch/evaluate.sh --run {} flies its best snapshot again",
         directory.display(),
         directory.display(),
         directory.display()
     )]
     Complete {
-        /// Its directory.
+        /// The run directory.
         directory: PathBuf,
-        /// Its training episodes.
+        /// Number of its training episodes.
         episodes: u64,
     },
-    /// Somebody is at it.
+    /// Another supervisor or learner runs it.
     #[error(
-        "the run in {} is under way: give it more actors with launch/attach_actor.sh --run {}, or stop it first",
+        "the run in {} is under way: add actors with launch/attach_actor.sh --run {}, \
+             or stop it first",
         .0.display(),
         .0.display()
     )]
     UnderWay(PathBuf),
-    /// It is of another version, was changed, or cannot be started on this machine.
+    /// Another version made the run, it was changed, or this machine cannot start it.
     #[error(transparent)]
     Prepare(#[from] PrepareError),
-    /// Its files cannot be used.
+    /// Its files cannot be read or written.
     #[error(transparent)]
     Run(#[from] RunError),
-    /// Its transport cannot be looked at: it is another user's.
+    /// Its transport belongs to another user.
     #[error(transparent)]
     Place(#[from] PlaceError),
-    /// It is under way in another directory, of which this one is a copy.
-    #[error("the run in {} is under way in another directory, of which this one is a copy: {source}", directory.display())]
+    /// The run is under way in another directory, of which this one is a copy.
+    #[error("the run in {} is under way in another directory, of which this one is a copy: \
+             {source}", directory.display())]
     Copy {
         /// The directory.
         directory: PathBuf,
-        /// Who is at it.
+        /// Process that holds the run's lock.
         #[source]
         source: LockError,
     },
 }
 
-/// Checks that the run in `directory` can be gone on with by `actors` actors, and claims it. A
-/// learner that nobody supervises is given `patience` to end.
+/// Checks that `actors` actors can resume the run in `directory`, and claims it. An unsupervised
+/// learner that is still running gets `patience` to end.
 ///
 /// # Errors
-/// [`ResumeError`]; nothing was changed then.
+/// Returns [`ResumeError`]; in this case nothing was changed.
 pub fn resume(
     directory: &Path,
     actors: usize,
@@ -92,7 +98,7 @@ pub fn resume(
     }
     let (identity, config) = run.open()?;
     let under_way = || ResumeError::UnderWay(run.root().to_owned());
-    // Whoever only looks whether it is taken holds it for a moment.
+    // A process that only checks whether the lock is taken holds it for a moment.
     let lock = in_time(LOOK * 5, || match SupervisorLock::take(&run, &identity) {
         Err(LockError::Taken { lock, .. }) if lock == run.root() => Ok(None),
         Err(LockError::Place(error)) => Err(error.into()),
@@ -129,7 +135,7 @@ pub fn resume(
     ))
 }
 
-/// Looks again and again for what `look` may find, for so long.
+/// Calls `look` repeatedly until it finds something or `patience` is over.
 fn in_time<T, E>(
     patience: Duration,
     look: impl Fn() -> Result<Option<T>, E>,
@@ -165,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unfinished_run_can_be_gone_on_with_by_one_supervisor() {
+    fn an_unfinished_run_can_be_resumed_by_one_supervisor() {
         let directory = tempfile::tempdir().unwrap();
         let prepared = prepared_run(directory.path());
         let (resumed, lock) = resume(prepared.run.root(), 3, Duration::ZERO).unwrap();
@@ -179,11 +185,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_run_is_refused_with_what_to_give_instead() {
+    fn a_directory_without_a_run_is_refused_with_a_remedy() {
         let directory = tempfile::tempdir().unwrap();
         for path in [directory.path(), Path::new("/nowhere")] {
             let error = refusal(path);
-            assert!(error.contains("not the directory of a run"), "{error}");
+            assert!(error.contains("is not a run directory"), "{error}");
         }
     }
 

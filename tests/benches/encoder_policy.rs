@@ -1,5 +1,5 @@
-//! An actor's thinking, one image and one action at a time: native, and by libtorch, which only the
-//! learner has. The one benchmark that needs both.
+//! Inference of an actor, one image and one action at a time: native, and by libtorch, which only
+//! the learner has. This benchmark is the only one that needs both.
 
 use std::hint::black_box;
 
@@ -17,7 +17,7 @@ use skein_protocol::snapshot::{
 use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LONGEST_LATENT, LatentCode};
 use tch::Device;
 
-/// As in `local.toml`.
+/// Settings of `local.toml`.
 const OBSERVATION: Observation = Observation::LatentVelocity;
 const STRIDE: usize = 2;
 
@@ -67,8 +67,8 @@ fn main() {
     criterion.final_summary();
 }
 
-/// Floating-point operations of the products of both networks, a multiplication and an addition
-/// counted as two; nothing else is counted.
+/// Returns the floating-point operations of the matrix products of both networks. A multiplication
+/// and an addition count as two; nothing else counts.
 fn operations(view: &View, width: usize) -> u64 {
     let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
     let mut products = 0;

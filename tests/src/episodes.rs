@@ -1,4 +1,4 @@
-//! `episodes.csv`, read as its user reads it, and what makes two runs the same.
+//! Rows of `episodes.csv`, read as a user reads them, and the results that two runs share.
 
 use std::fs;
 
@@ -6,11 +6,11 @@ use serde::Deserialize;
 use skein_protocol::summary::Summary;
 use skein_run::RunDirectory;
 
-/// A row of `episodes.csv`.
+/// Row of `episodes.csv`.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)] // the columns, under their names
-pub struct Episode {
+#[allow(missing_docs)] // the columns, by their names
+pub struct EpisodeRow {
     pub episode: u64,
     pub epoch: u64,
     pub policy_version: u64,
@@ -18,17 +18,16 @@ pub struct Episode {
     pub level: u8,
     pub steps: u64,
     pub walls_passed: u8,
-    /// As written, to the last digit.
+    /// Text as written, to the last digit.
     pub r#return: String,
     pub outcome: String,
 }
 
-/// The rows of a run's `episodes.csv` so far; none before there is a file. A row that is still
-/// being written is left out.
+/// Returns the complete rows of a run's `episodes.csv`; none before the file exists.
 ///
 /// # Panics
-/// When a row is malformed.
-pub fn episodes(run: &RunDirectory) -> Vec<Episode> {
+/// Panics if a row is malformed.
+pub fn episodes(run: &RunDirectory) -> Vec<EpisodeRow> {
     let text = fs::read_to_string(run.episodes_csv()).unwrap_or_default();
     let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
     csv::Reader::from_reader(whole.as_bytes())
@@ -37,17 +36,17 @@ pub fn episodes(run: &RunDirectory) -> Vec<Episode> {
         .unwrap()
 }
 
-/// What a run came to, apart from who flew which episode: two runs of one configuration and seed
-/// have it in common.
+/// Results of a run, without the actor that flew each episode. Two runs with the same configuration
+/// and seed share them.
 #[derive(Debug, Clone)]
-pub struct Learned {
+pub struct LearnedResults {
     policy_sha256: String,
-    episodes: Vec<Episode>,
+    episodes: Vec<EpisodeRow>,
 }
 
-impl Learned {
+impl LearnedResults {
     pub(crate) fn of(run: &RunDirectory, summary: &Summary) -> Self {
-        let nobody = |episode| Episode {
+        let nobody = |episode| EpisodeRow {
             actor: 0,
             ..episode
         };
@@ -57,26 +56,26 @@ impl Learned {
         }
     }
 
-    /// Requires that both runs flew the same episodes and learned the same parameters, bit for bit.
+    /// Asserts that both runs flew the same episodes and learned the same parameters, bit for bit.
     ///
     /// # Panics
-    /// When they did not; the message names the first episode that differs.
+    /// Panics if they did not; the message names the first episode that differs.
     pub fn assert_same(&self, other: &Self, whose: &str) {
         for (mine, others) in self.episodes.iter().zip(&other.episodes) {
-            assert_eq!(mine, others, "{whose}: another episode");
+            assert_eq!(mine, others, "{whose}: an episode differs");
         }
         assert_eq!(
             self.episodes.len(),
             other.episodes.len(),
-            "{whose}: another number of episodes"
+            "{whose}: the number of episodes differs"
         );
         assert_eq!(
             self.policy_sha256, other.policy_sha256,
-            "{whose}: other parameters after the same episodes"
+            "{whose}: parameters differ after the same episodes"
         );
     }
 
-    /// SHA-256 of the final parameters.
+    /// Returns the SHA-256 of the final parameters.
     pub fn policy_sha256(&self) -> &str {
         &self.policy_sha256
     }

@@ -1,5 +1,5 @@
-//! Who may depend on whom. A package exists where a heavy dependency is fenced in; here is the
-//! fence.
+//! Allowed dependencies between packages. A package exists where a heavy dependency is confined;
+//! this test holds the confinement.
 
 #![allow(
     clippy::unwrap_used,
@@ -12,19 +12,19 @@ use std::fs;
 use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, PackageId};
 use skein_tests::repository;
 
-/// The folders a reader finds, and no others.
+/// The folders at the top level, complete.
 const FOLDERS: [&str; 7] = [
     "actor", "configs", "docs", "launch", "learner", "protocol", "tests",
 ];
 
-/// Whether programs alone are asked, or their tests too.
+/// Dependencies to consider: those of programs, or also those of tests.
 #[derive(Clone, Copy, PartialEq)]
 enum Of {
     Programs,
     Tests,
 }
 
-/// Names of everything that `package` depends on, directly or not.
+/// Returns the names of all direct and indirect dependencies of `package`.
 fn dependencies(metadata: &Metadata, package: &str, of: Of) -> BTreeSet<String> {
     let resolve = metadata.resolve.as_ref().unwrap();
     let nodes: BTreeMap<&PackageId, _> =
@@ -38,7 +38,7 @@ fn dependencies(metadata: &Metadata, package: &str, of: Of) -> BTreeSet<String> 
     let mut to_see = vec![&start.id];
     while let Some(id) = to_see.pop() {
         for dependency in &nodes[id].deps {
-            // A dependency's own tests are nobody's business.
+            // Tests of a dependency do not matter.
             let for_tests = id == &start.id && of == Of::Tests;
             let counts = dependency
                 .dep_kinds
@@ -57,8 +57,7 @@ fn dependencies(metadata: &Metadata, package: &str, of: Of) -> BTreeSet<String> 
 fn metadata() -> Metadata {
     MetadataCommand::new()
         .manifest_path(repository().join("Cargo.toml"))
-        // What this machine builds is all here already; what other platforms would build may not
-        // be.
+        // This machine's dependencies are all downloaded; those of other platforms may not be.
         .other_options(
             [
                 "--locked",
@@ -73,7 +72,7 @@ fn metadata() -> Metadata {
 }
 
 #[test]
-fn every_package_keeps_to_its_side_of_the_fence() {
+fn every_package_has_only_its_allowed_dependencies() {
     let metadata = metadata();
     let of_ours: BTreeSet<String> = metadata
         .workspace_packages()
@@ -179,7 +178,7 @@ fn every_package_keeps_to_its_side_of_the_fence() {
             ],
             &[torch],
         ),
-        // Whoever judges a run trusts no program of it.
+        // The judge of a run trusts none of its programs.
         (
             "skein-chaos",
             &["skein-protocol", "skein-run"],
@@ -189,7 +188,10 @@ fn every_package_keeps_to_its_side_of_the_fence() {
         for of in [Of::Programs, Of::Tests] {
             let found = dependencies(&metadata, package, of);
             let ours: Vec<_> = found.intersection(&of_ours).map(String::as_str).collect();
-            assert_eq!(ours, allowed, "packages of ours that {package} depends on");
+            assert_eq!(
+                ours, allowed,
+                "workspace packages that {package} depends on"
+            );
             for fenced in forbidden.iter().copied().flatten() {
                 assert!(!found.contains(*fenced), "{package} depends on {fenced}");
             }
@@ -198,7 +200,7 @@ fn every_package_keeps_to_its_side_of_the_fence() {
 }
 
 #[test]
-fn what_is_fenced_in_is_found_where_it_belongs() {
+fn confined_dependencies_are_found_where_they_belong() {
     let metadata = metadata();
     for (package, inside) in [
         ("skein-learner", "tch"),
@@ -213,20 +215,20 @@ fn what_is_fenced_in_is_found_where_it_belongs() {
     ] {
         assert!(
             dependencies(&metadata, package, Of::Programs).contains(inside),
-            "{package} does not depend on {inside}: the test of the fence sees nothing"
+            "{package} does not depend on {inside}: this test would find nothing"
         );
     }
 }
 
 #[test]
-fn the_top_level_has_the_fixed_folders_and_no_others() {
+fn the_top_level_has_exactly_the_fixed_folders() {
     let target = metadata().target_directory;
     let found: BTreeSet<String> = fs::read_dir(repository())
         .unwrap()
         .map(|entry| entry.unwrap())
         .filter(|entry| entry.path().is_dir() && entry.path() != target.as_std_path())
         .map(|entry| entry.file_name().into_string().unwrap())
-        // Where runs go, and builds that went elsewhere; neither is in the repository.
+        // Folders of runs and builds are not in the repository.
         .filter(|name| !name.starts_with('.') && name != "runs" && name != "target")
         .collect();
     assert_eq!(found, FOLDERS.map(str::to_owned).into_iter().collect());

@@ -1,5 +1,5 @@
-//! Whoever dies, freezes or is cut off, and however often: the run comes to what it would have come
-//! to, and leaves nothing behind.
+//! A run has the same results and leaves nothing behind, whichever of its processes die, freeze or
+//! are cut off, and however often.
 
 #![allow(
     clippy::unwrap_used,
@@ -16,17 +16,17 @@ use std::time::{Duration, Instant};
 use rustix::process::Signal;
 use skein_chaos::{Footprint, footprint};
 use skein_run::RunIdentity;
-use skein_tests::{Ended, Recipe, Role, Running, episodes, run_program};
+use skein_tests::{EndedRun, Role, RunRecipe, RunningRun, episodes, run_program};
 
-/// Long enough to be disturbed several times.
-fn recipe() -> Recipe {
-    Recipe::small().set("run.episodes=100")
+/// A run long enough to be disturbed several times.
+fn recipe() -> RunRecipe {
+    RunRecipe::small().set("run.episodes=100")
 }
 
-/// What it comes to when nobody disturbs it. Run once for all tests that are under way at a time;
-/// to be asked for before one's own run is started, which would be waited for.
-fn calm() -> Arc<Ended> {
-    static CALM: Mutex<Weak<Ended>> = Mutex::new(Weak::new());
+/// Returns the undisturbed run, shared by all tests that run at the same time. A test must request
+/// it before it starts its own run, which would block it.
+fn calm() -> Arc<EndedRun> {
+    static CALM: Mutex<Weak<EndedRun>> = Mutex::new(Weak::new());
     let mut known = CALM.lock().unwrap_or_else(PoisonError::into_inner);
     known.upgrade().unwrap_or_else(|| {
         let ended = Arc::new(recipe().finish());
@@ -36,7 +36,7 @@ fn calm() -> Arc<Ended> {
 }
 
 #[test]
-fn a_learner_killed_three_times_goes_on_from_its_checkpoints() {
+fn a_learner_killed_three_times_resumes_from_its_checkpoints() {
     let calm = calm();
     let mut run = recipe().start();
     for episodes in [10, 30, 70] {
@@ -44,12 +44,12 @@ fn a_learner_killed_three_times_goes_on_from_its_checkpoints() {
     }
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
-    let told = disturbed
+    let deaths = disturbed
         .output
         .stderr
         .matches("killed by signal 9")
         .count();
-    assert_eq!(told, 3, "{}", disturbed.output.stderr);
+    assert_eq!(deaths, 3, "{}", disturbed.output.stderr);
 }
 
 #[test]
@@ -81,20 +81,20 @@ fn after_a_power_cut_a_damaged_checkpoint_is_named_and_the_one_before_it_used() 
     resumed.assert_same_as(&calm);
     let name = newest.file_name().unwrap().to_str().unwrap();
     let terminal = &resumed.output.stderr;
-    let told = |words: [&str; 2]| {
+    let printed = |words: [&str; 2]| {
         terminal
             .lines()
             .any(|line| words.iter().all(|word| line.contains(word)))
     };
     assert!(
-        told([name, "damaged"]),
-        "nobody was warned of {name}:\n{terminal}"
+        printed([name, "damaged"]),
+        "no warning about {name}:\n{terminal}"
     );
-    assert!(told(["resuming after episode", ""]), "{terminal}");
+    assert!(printed(["resuming after episode", ""]), "{terminal}");
 }
 
-/// The checkpoints that are in their place, oldest first.
-fn checkpoints(run: &Running) -> Vec<PathBuf> {
+/// Returns the complete checkpoints, oldest first.
+fn checkpoints(run: &RunningRun) -> Vec<PathBuf> {
     let number = |path: &PathBuf| -> Option<u64> {
         path.file_name()?
             .to_str()?
@@ -112,8 +112,8 @@ fn checkpoints(run: &Running) -> Vec<PathBuf> {
     found
 }
 
-/// Lets `remove` take something of the transport from under a run.
-fn goes_on_without(remove: impl Fn(&Running, &RunIdentity)) {
+/// Asserts that a run survives the loss of a part of its transport, removed by `remove`.
+fn survives_loss_of(remove: impl Fn(&RunningRun, &RunIdentity)) {
     let calm = calm();
     let mut run = recipe().start();
     run.until_episodes(30);
@@ -130,21 +130,21 @@ fn goes_on_without(remove: impl Fn(&Running, &RunIdentity)) {
 
 #[test]
 fn a_run_whose_folder_is_removed_makes_another() {
-    goes_on_without(|_, identity| fs::remove_dir_all(identity.transport_folder()).unwrap());
+    survives_loss_of(|_, identity| fs::remove_dir_all(identity.transport_folder()).unwrap());
 }
 
 #[test]
 fn a_run_whose_shared_memory_is_removed_makes_another() {
-    goes_on_without(|run, identity| {
+    survives_loss_of(|run, identity| {
         let prefix = format!("skein_{:016x}_", identity.run.0);
         for entry in fs::read_dir("/dev/shm").unwrap() {
             let entry = entry.unwrap();
             if entry.file_name().to_str().unwrap().starts_with(&prefix) {
-                // An actor's may go by itself.
+                // An actor may remove its own at any time.
                 let _ = fs::remove_file(entry.path());
             }
         }
-        // Who has mapped it goes on with it; who comes then finds nothing.
+        // Processes that have mapped it continue; new ones find nothing.
         run.processes(Role::Actor)
             .iter()
             .for_each(|actor| actor.signal(Signal::KILL));
@@ -158,14 +158,14 @@ fn a_copy_of_a_runs_directory_is_not_resumed_while_the_run_is_under_way() {
     run.until_episodes(30);
     let copies = tempfile::tempdir().unwrap();
     let copy = copies.path().join("copy");
-    // It complains of files that a living run replaces meanwhile, and copies the rest.
+    // cp complains about files that a live run replaces meanwhile, and copies the rest.
     let copied = Command::new("cp")
         .arg("-r")
         .arg(run.directory().root())
         .arg(&copy)
         .status();
     assert!(copied.is_ok(), "{copied:?}");
-    // Between two incarnations of the learner, too.
+    // The copy is refused even between two incarnations of the learner.
     run.process("skein-learner").signal(Signal::KILL);
     let refused = run_program(
         "skein",
@@ -176,13 +176,13 @@ fn a_copy_of_a_runs_directory_is_not_resumed_while_the_run_is_under_way() {
 }
 
 #[test]
-fn an_actor_that_was_frozen_too_long_is_not_mixed_in_when_it_wakes() {
+fn late_records_of_an_actor_frozen_too_long_are_refused() {
     let calm = calm();
     let mut run = recipe().set("transport.actor_silence_secs=0.5").start();
     run.until_episodes(10);
     let sleeper = run.processes(Role::Actor).remove(0);
     sleeper.signal(Signal::STOP);
-    // Whatever it was about to fly is flown by the other: else there would be no further epoch.
+    // The other actor flies its tickets; otherwise no further epoch would follow.
     run.until_episodes(30);
     sleeper.signal(Signal::CONT);
     let disturbed = run.finish();
@@ -195,7 +195,7 @@ fn an_actor_that_was_frozen_too_long_is_not_mixed_in_when_it_wakes() {
 }
 
 #[test]
-fn a_frozen_learner_goes_on_where_it_was() {
+fn a_frozen_learner_continues_where_it_was() {
     let calm = calm();
     let mut run = recipe()
         .set("transport.learner_silence_secs=2")
@@ -225,7 +225,10 @@ fn a_learner_slowed_down_ten_times_holds_the_actors_back_and_nothing_is_lost() {
         learner.signal(Signal::CONT);
         sleep(Duration::from_millis(5));
     }
-    assert!(learner.is_alive(), "it was over before it was slow");
+    assert!(
+        learner.is_alive(),
+        "the run ended before the learner was slowed down"
+    );
     let slowed = run.finish();
     slowed.assert_same_as(&calm);
     let summary = slowed.summary();
@@ -239,7 +242,7 @@ fn a_learner_slowed_down_ten_times_holds_the_actors_back_and_nothing_is_lost() {
 #[test]
 fn sixty_four_actors_lose_nothing_and_take_bounded_memory() {
     let calm = calm();
-    // Far more than this machine has cores for: patience is all they need.
+    // More actors than this machine has cores for; long deadlines allow for that.
     let mut run = recipe()
         .actors(64)
         .set("transport.actor_silence_secs=60")
@@ -266,7 +269,7 @@ fn sixty_four_actors_lose_nothing_and_take_bounded_memory() {
     assert!(most.segment_bytes < 64 * 5_200_000 + 64_000_000, "{most:?}");
 }
 
-fn episodes_begun(run: &Running) -> bool {
+fn episodes_begun(run: &RunningRun) -> bool {
     !episodes(run.directory()).is_empty()
 }
 
@@ -289,7 +292,7 @@ fn two_runs_side_by_side_never_meet() {
 }
 
 #[test]
-fn a_second_learner_of_a_run_is_refused_and_the_first_goes_on() {
+fn a_second_learner_of_a_run_is_refused_and_the_first_continues() {
     let calm = calm();
     let mut run = recipe().start();
     run.until_episodes(10);

@@ -1,17 +1,18 @@
-//! Delayed learning: an epoch's episodes all follow the one snapshot that its number and the policy
-//! lag name, and no episode is flown with two.
+//! Delayed learning: all episodes of an epoch follow the snapshot determined by the epoch's number
+//! and the policy lag, and no episode follows two.
 //!
-//! That a record of another version within an episode is refused is tested beside the assembler.
+//! A test beside the assembly shows that a record with another version within an episode is
+//! refused.
 
-use skein_tests::Recipe;
+use skein_tests::RunRecipe;
 
-/// Episodes of an epoch in the configuration used here.
+/// Episodes per epoch in the configuration used here.
 const EPISODES_PER_EPOCH: u64 = 10;
 
 #[test]
 fn every_episode_of_an_epoch_follows_the_snapshot_that_the_lag_names() {
     for lag in [0, 1] {
-        let run = Recipe::small()
+        let run = RunRecipe::small()
             .actors(3)
             .set(&format!("learning.policy_lag={lag}"))
             .finish();
@@ -31,7 +32,7 @@ fn every_episode_of_an_epoch_follows_the_snapshot_that_the_lag_names() {
 
 #[test]
 fn one_episode_an_epoch_is_one_snapshot_an_episode() {
-    let run = Recipe::small()
+    let run = RunRecipe::small()
         .set("learning.episodes_per_epoch=1")
         .set("run.episodes=15")
         .finish();

@@ -1,5 +1,5 @@
-//! Direct updates: the weights are refreshed in the middle of an episode, and what is learned is a
-//! function of configuration and seed all the same.
+//! Direct updates: the weights are refreshed within an episode, and the result is still a function
+//! of configuration and seed.
 
 #![allow(
     clippy::unwrap_used,
@@ -8,22 +8,22 @@
 
 use rustix::process::Signal;
 use skein_protocol::summary::Ending;
-use skein_tests::{Ended, Recipe, Role};
+use skein_tests::{EndedRun, Role, RunRecipe};
 
-/// Updated after every step, checkpoints every five episodes.
-fn direct() -> Recipe {
+/// A run with an update after every step, and a checkpoint every five episodes.
+fn direct() -> RunRecipe {
     in_segments_of(1).set("checkpoints.every_episodes=5")
 }
 
-fn in_segments_of(steps: u64) -> Recipe {
-    Recipe::small()
+fn in_segments_of(steps: u64) -> RunRecipe {
+    RunRecipe::small()
         .set(&format!("learning.segment_steps={steps}"))
         .set("learning.episodes_per_epoch=1")
         .set("run.episodes=40")
 }
 
-/// That the policy was updated in the middle of episodes.
-fn assert_direct(run: &Ended) {
+/// Asserts that the policy was updated within episodes.
+fn assert_direct(run: &EndedRun) {
     let (episodes, summary) = (run.episodes(), run.summary());
     assert_eq!(episodes.len(), 40);
     let versions: Vec<_> = episodes
@@ -44,7 +44,7 @@ fn assert_direct(run: &Ended) {
 }
 
 #[test]
-fn one_actor_three_and_one_that_is_killed_twice_learn_the_same_bit_for_bit() {
+fn one_actor_three_actors_and_an_actor_killed_twice_learn_the_same_bit_for_bit() {
     let alone = direct().actors(1).finish();
     assert_direct(&alone);
     direct().actors(3).finish().assert_same_as(&alone);
@@ -52,7 +52,7 @@ fn one_actor_three_and_one_that_is_killed_twice_learn_the_same_bit_for_bit() {
     let mut run = direct().actors(2).start();
     for episodes in [8, 20] {
         run.until_episodes(episodes);
-        // The one that flies: the other is in reserve, and has to repeat what was flown.
+        // The victim is the flying actor. The other is in reserve and must repeat what was flown.
         let flyer = run
             .processes(Role::Actor)
             .into_iter()
@@ -64,17 +64,17 @@ fn one_actor_three_and_one_that_is_killed_twice_learn_the_same_bit_for_bit() {
         });
     }
     let disturbed = run.finish();
-    let told = disturbed
+    let deaths = disturbed
         .output
         .stderr
         .matches("killed by signal 9")
         .count();
-    assert_eq!(told, 2, "{}", disturbed.output.stderr);
+    assert_eq!(deaths, 2, "{}", disturbed.output.stderr);
     disturbed.assert_same_as(&alone);
 }
 
 #[test]
-fn a_learner_killed_in_the_middle_of_an_episode_goes_back_to_one_that_had_ended() {
+fn a_learner_killed_within_an_episode_resumes_after_a_complete_one() {
     let calm = direct().finish();
     let mut run = direct().start();
     for episodes in [7, 18, 29] {
@@ -84,7 +84,7 @@ fn a_learner_killed_in_the_middle_of_an_episode_goes_back_to_one_that_had_ended(
 }
 
 #[test]
-fn a_run_that_is_stopped_flies_its_episode_to_the_end_and_loses_nothing() {
+fn a_stopped_run_completes_its_episode_and_loses_nothing() {
     let calm = direct().finish();
     let mut run = direct().set("checkpoints.every_episodes=1000").start();
     run.until_episodes(25);

@@ -1,5 +1,5 @@
-//! `skein-evaluate` on a run's snapshot gives the numbers that the run itself gave, and records
-//! what it flew.
+//! `skein-evaluate` reproduces the numbers of a run from its snapshot, and records the flown
+//! episodes.
 
 #![allow(
     clippy::unwrap_used,
@@ -14,7 +14,7 @@ use std::process::Command;
 use skein_protocol::config::Config;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::snapshot::Snapshot;
-use skein_tests::{Ended, Recipe, program, repository, run_program};
+use skein_tests::{EndedRun, RunRecipe, program, repository, run_program};
 
 /// Evaluates with `arguments` and returns the report.
 fn evaluate(folder: &Path, arguments: &[&str]) -> EvaluationReport {
@@ -29,7 +29,7 @@ fn evaluate(folder: &Path, arguments: &[&str]) -> EvaluationReport {
 
 #[test]
 fn a_runs_snapshot_flies_later_as_it_flew_in_the_run() {
-    let run = Recipe::small().set("evaluation.episodes=8").finish();
+    let run = RunRecipe::small().set("evaluation.episodes=8").finish();
     let in_the_run = run.evaluation();
     let directory = run.directory.root().to_str().unwrap();
     let best = run.directory.best_snapshot();
@@ -48,9 +48,9 @@ fn a_runs_snapshot_flies_later_as_it_flew_in_the_run() {
 }
 
 #[test]
-fn a_code_of_another_length_is_learned_flown_and_recorded() {
+fn a_latent_code_of_another_length_is_learned_flown_and_recorded() {
     for latent in [8, 64] {
-        let run = Recipe::small()
+        let run = RunRecipe::small()
             .set(&format!("vae.latent={latent}"))
             .set("evaluation.episodes=8")
             .finish();
@@ -67,7 +67,7 @@ fn a_code_of_another_length_is_learned_flown_and_recorded() {
     }
 }
 
-/// Trained once and shipped: whatever changes since, it has to fly as its evaluation says.
+/// The shipped snapshot must still fly as its shipped evaluation states.
 #[test]
 fn the_shipped_generalist_flies_courses_that_it_never_saw() {
     let folder = tempfile::tempdir().unwrap();
@@ -78,11 +78,11 @@ fn the_shipped_generalist_flies_courses_that_it_never_saw() {
     let (_, config) = Snapshot::load(&snapshots.join("generalist.safetensors")).unwrap();
     let shipped = Config::load(&repository().join("configs/generalist.toml"), &[]).unwrap();
     let mut differences = shipped.differences(&config.portable()).unwrap();
-    // The simulator's defaults, which the snapshot writes out and the file does not.
+    // The snapshot writes out the simulator's defaults; the file does not.
     differences.retain(|difference| !difference.ends_with("nothing here"));
     assert_eq!(differences, ["run.learner_threads = 1 there, 2 here"]);
 
-    // By a bare name, from where it lies.
+    // By a file name without folder, from its own folder.
     let json = folder.path().join("report.json");
     let output = Command::new(program("skein-evaluate"))
         .args([
@@ -109,8 +109,8 @@ fn the_shipped_generalist_flies_courses_that_it_never_saw() {
     }
 }
 
-/// Read as NumPy documents its format, without any of our code.
-fn a_recording_holds_every_step_of_every_episode(run: &Ended, latent: usize, folder: &Path) {
+/// Reads the recording by NumPy's documentation of its format, without any of Skein's code.
+fn a_recording_holds_every_step_of_every_episode(run: &EndedRun, latent: usize, folder: &Path) {
     let file = folder.join("episodes.npz");
     evaluate(
         folder,
@@ -146,12 +146,12 @@ fn a_recording_holds_every_step_of_every_episode(run: &Ended, latent: usize, fol
     let last = codes.words().skip(latent - 1).step_by(latent);
     assert!(
         last.map(f32::from_le_bytes).any(|number| number != 0.0),
-        "no code is as long as that"
+        "the largest code is implausible"
     );
     let episodes = closing.data.iter().filter(|&&closing| closing == 1).count();
     assert_eq!(episodes, 16, "eight episodes on each of two courses");
 
-    // The rewards of all episodes on the first course are those of the report.
+    // The rewards of all episodes on the first course equal those of the report.
     let evaluation = run.evaluation();
     let (course, reward) = (array(&file, "course", "<i4"), array(&file, "reward", "<f4"));
     let total: f64 = course
@@ -174,7 +174,7 @@ struct Array {
 }
 
 impl Array {
-    /// Its values of four bytes.
+    /// Returns its values, of four bytes each.
     fn words(&self) -> impl Iterator<Item = [u8; 4]> {
         self.data
             .chunks_exact(4)
@@ -183,6 +183,7 @@ impl Array {
 }
 
 /// Reads `name` from a `.npz` file: a zip of `.npy` files, whose header is a Python dictionary.
+///
 /// Source: numpy.lib.format, version 1.0.
 fn array(file: &Path, name: &str, kind: &str) -> Array {
     let mut zip = zip::ZipArchive::new(File::open(file).unwrap()).unwrap();

@@ -1,5 +1,5 @@
-//! An experiment from its file to its report: interrupted, gone on with, told, published, and
-//! refused once it is another.
+//! An experiment from its file to its report: interrupted, resumed, reported, published, and
+//! refused after changes.
 
 #![allow(
     clippy::unwrap_used,
@@ -17,14 +17,16 @@ use skein_chaos::compare;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::summary::Ending;
 use skein_run::RunDirectory;
-use skein_tests::{Output, Recipe, episodes, leftovers, program, repository, run_program};
+use skein_tests::{
+    ProgramOutput, RunRecipe, episodes, leftovers, program, repository, run_program,
+};
 
-/// An experiment of four runs takes a tenth of it on an idle machine.
+/// Time limit. On an idle machine, an experiment of four runs takes a tenth of it.
 const LIMIT: Duration = Duration::from_secs(300);
-/// Beside `tests/small.toml`, in both arms.
+/// Settings of both arms beyond `tests/small.toml`.
 const SETTINGS: [&str; 2] = ["run.episodes=60", "evaluation.window_episodes=10"];
 
-/// A repository with one experiment, and no other content than it needs.
+/// A repository with one experiment and its inputs.
 struct Scene {
     folder: tempfile::TempDir,
 }
@@ -40,24 +42,27 @@ impl Scene {
         scene
     }
 
-    /// Writes the experiment's file, whose second arm has this share of success experience.
+    /// Writes the experiment's file, with this share of success experience in the second arm.
     fn write(&self, share: &str) {
         let base = repository().join("tests/small.toml");
         let text = format!(
-            "question = \"What for?\"\nbase = {base:?}\nseeds = 2\nsuite = \"../few.toml\"\ntables = [\"evaluation\", \"outcomes\", \"suite\", \"learning\", \"cost\"]\n\
-             curves = [{{ measure = \"walls_passed\", over = \"episodes\" }}]\nsettings.run.episodes = 60\nsettings.evaluation.window_episodes = 10\n\
-             [[arm]]\nname = \"one-part\"\nlabel = \"one part\"\nsettings.replay.success_share = 0.0\n\
-             [[arm]]\nname = \"half\"\nlabel = \"half\"\nsettings.replay.success_share = {share}\n"
+            "question = \"What for?\"\nbase = {base:?}\nseeds = 2\nsuite = \"../few.toml\"\n\
+             tables = [\"evaluation\", \"outcomes\", \"suite\", \"learning\", \"cost\"]\ncurves = \
+             [{{ measure = \"walls_passed\", over = \"episodes\" }}]\nsettings.run.episodes = 60\n\
+             settings.evaluation.window_episodes = 10\n[[arm]]\nname = \"one-part\"\nlabel = \
+             \"one part\"\nsettings.replay.success_share = 0.0\n[[arm]]\nname = \"half\"\nlabel = \
+             \"half\"\nsettings.replay.success_share = {share}\n"
         );
         fs::write(self.path("configs/experiments/tiny.toml"), text).unwrap();
     }
 
-    /// Writes the experiment's suite: this many episodes of each entry.
+    /// Writes the experiment's suite, with this many episodes per entry.
     fn write_suite(&self, episodes: u64) {
         let course = repository().join("configs/courses/training.toml");
         let text = format!(
-            "name = \"few\"\nepisodes = {episodes}\n[[entry]]\nname = \"as it is\"\ncourse = {course:?}\n\
-             [[entry]]\nname = \"in any order\"\norders_of = {course:?}\ndisturbances.latency_periods = 1\n"
+            "name = \"few\"\nepisodes = {episodes}\n[[entry]]\nname = \"as it is\"\ncourse = \
+             {course:?}\n[[entry]]\nname = \"in any order\"\norders_of = {course:?}\n\
+             disturbances.latency_periods = 1\n"
         );
         fs::write(self.path("configs/few.toml"), text).unwrap();
     }
@@ -81,8 +86,8 @@ impl Scene {
         all.iter().chain(more).map(ToString::to_string).collect()
     }
 
-    /// Runs it to its end.
-    fn finish(&self, more: &[&str]) -> Output {
+    /// Runs the experiment to its end.
+    fn finish(&self, more: &[&str]) -> ProgramOutput {
         run_program("skein", &self.arguments(more))
     }
 
@@ -114,7 +119,7 @@ fn completed(run: &RunDirectory) -> bool {
 }
 
 #[test]
-fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
+fn an_experiment_is_interrupted_resumed_reported_and_published() {
     let scene = Scene::new();
     let runs: Vec<_> = [1, 2]
         .iter()
@@ -134,7 +139,7 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
     assert_eq!(status.code(), Some(130));
     assert!(
         !runs.iter().all(completed),
-        "nothing was left to go on with"
+        "all runs were complete before the interruption"
     );
     for run in &runs {
         assert!(
@@ -147,7 +152,10 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
     let output = scene.finish(&[]);
     assert_eq!(output.code, Some(0), "{}", output.stderr);
     assert!(runs.iter().all(completed));
-    assert!(!scene.path("docs").exists(), "nothing is published unasked");
+    assert!(
+        !scene.path("docs").exists(),
+        "nothing is published without --publish"
+    );
     let report = scene.path("runs/experiments/tiny/report");
     let text = fs::read_to_string(report.join("report.md")).unwrap();
     assert!(output.stdout.contains(text.trim_end()));
@@ -167,9 +175,9 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
     let picture = fs::read(report.join("walls_passed_over_episodes.png")).unwrap();
     assert!(picture.starts_with(b"\x89PNG"));
 
-    // What was interrupted came to the same as a run of a user who set the same and was left in
-    // peace.
-    let mut alone = Recipe::small()
+    // The interrupted run has the same results as an uninterrupted run that a user starts with the
+    // same settings.
+    let mut alone = RunRecipe::small()
         .set("replay.success_share=0.0")
         .set("run.learner_threads=1");
     for setting in SETTINGS {
@@ -187,7 +195,7 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
 }
 
 #[test]
-fn an_experiment_that_cannot_be_run_does_not_hide_the_others() {
+fn an_invalid_experiment_does_not_hide_the_others() {
     let scene = Scene::new();
     fs::write(
         scene.path("configs/experiments/broken.toml"),
@@ -206,13 +214,13 @@ fn an_experiment_that_cannot_be_run_does_not_hide_the_others() {
         output.stdout
     );
     assert!(
-        output.stderr.contains("broken.toml is no experiment"),
+        output.stderr.contains("broken.toml is not an experiment"),
         "{}",
         output.stderr
     );
 }
 
-/// Telling it again runs nothing, gives the same report, and replaces what was published before.
+/// A repeated report runs nothing, is identical, and replaces the published one.
 fn assert_published(scene: &Scene, report: &str) {
     for answer in ["Because.\n", ""] {
         let output = scene.finish(&["--report", "--publish"]);
@@ -248,7 +256,7 @@ fn assert_published(scene: &Scene, report: &str) {
         heading == "# What for?" && published.contains(body),
         "{published}\n---\n{report}"
     );
-    // A part of it is no result to replace that by.
+    // An incomplete experiment must not replace a complete one.
     for part in [["--seeds", "1"], ["--episodes", "20"]] {
         let output = scene.finish(&[&part[..], &["--report", "--publish"]].concat());
         output.assert_refused(&["--publish", "2 seeds"]);
@@ -256,7 +264,7 @@ fn assert_published(scene: &Scene, report: &str) {
     }
 }
 
-/// What came of the suites of a run.
+/// Returns the suite results of a run.
 fn suite_results(run: &RunDirectory) -> Vec<PathBuf> {
     let folder = run.suite_json("any");
     let entries = fs::read_dir(folder.parent().unwrap()).unwrap();
@@ -265,8 +273,8 @@ fn suite_results(run: &RunDirectory) -> Vec<PathBuf> {
     results
 }
 
-/// A run that is trained flies its suite and nothing else, whatever kept it from that before: it
-/// failed, was interrupted, or is another suite now.
+/// Asserts that a trained run only flies its suite, whether the suite failed before, was
+/// interrupted, or has changed.
 fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     let files = |run: &RunDirectory| {
         [run.summary_json(), run.episodes_csv()]
@@ -283,7 +291,7 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
         .collect();
     assert_eq!(entries, [("as it is", 5), ("in any order", 5)]);
 
-    // It fails, as a run does.
+    // A suite may fail, like a run.
     fs::remove_file(&result).unwrap();
     let snapshots = [runs[1].snapshots(), runs[1].root().join("aside")];
     fs::rename(&snapshots[0], &snapshots[1]).unwrap();
@@ -304,7 +312,7 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     assert!(
         output
             .stdout
-            .contains("**Not all of it**: 3 of 4 runs are complete.")
+            .contains("**Incomplete**: 3 of 4 runs are complete.")
     );
     fs::rename(&snapshots[1], &snapshots[0]).unwrap();
     let output = scene.finish(&[]);
@@ -324,11 +332,11 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     assert_eq!(
         fs::read(&result).unwrap(),
         flown,
-        "the same episodes came to something else"
+        "the same episodes have other results"
     );
 
-    // Another suite of the same name, too long to be flown to its end, is interrupted; the results
-    // of the first are as good as they were.
+    // Interrupts another suite of the same name, too long to complete. The results of the first
+    // stay valid.
     scene.write_suite(1_000_000);
     let mut experiment = scene.start();
     until("a suite is flown", || {
@@ -357,7 +365,7 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     );
 }
 
-/// And that is another result, beside the suite's own.
+/// A different number of episodes is another result, beside the suite's own.
 fn assert_a_suite_is_flown_as_often_as_the_experiment_says(scene: &Scene, runs: &[RunDirectory]) {
     let file = scene.path("configs/experiments/tiny.toml");
     let text = fs::read_to_string(&file).unwrap();
@@ -390,7 +398,7 @@ fn assert_a_suite_is_flown_as_often_as_the_experiment_says(scene: &Scene, runs: 
     }
 }
 
-/// What was learned from another configuration is never mixed with what the file says now, and
+/// Asserts that runs with another configuration than the file's are never mixed with its runs, and
 /// never removed.
 fn assert_refused_when_changed(scene: &Scene) {
     scene.write("0.25");
@@ -406,7 +414,7 @@ fn assert_refused_when_changed(scene: &Scene) {
     }
     scene
         .finish(&["--episodes", "60"])
-        .assert_refused(&["tiny.toml", "--episodes = 60 shortens nothing"]);
+        .assert_refused(&["tiny.toml", "--episodes = 60 does not shorten the run"]);
     let nothing: &Path = &scene.path("runs/experiments/tiny_20_episodes");
     scene
         .finish(&["--episodes", "20", "--report"])

@@ -1,5 +1,4 @@
-//! How a run ends before its time: in order, at once, or with its supervisor; and that nothing is
-//! left behind.
+//! Early ends of a run: in order, immediately, or with its supervisor. Nothing is left behind.
 
 #![allow(
     clippy::unwrap_used,
@@ -11,14 +10,14 @@ use std::time::{Duration, Instant};
 use rustix::process::Signal;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::summary::Ending;
-use skein_tests::{Recipe, Running, leftovers, processes_of};
+use skein_tests::{RunRecipe, RunningRun, leftovers, processes_of};
 
-/// What a shell reports of a program that Ctrl-C ended: 128 + SIGINT.
+/// Exit status that a shell reports for a program ended by Ctrl-C: 128 + SIGINT.
 const INTERRUPTED: i32 = 130;
 
-/// A run that would go on for hours, some way into it.
-fn long_run() -> Running {
-    let mut run = Recipe::small().set("run.episodes=1000000").start();
+/// Starts a run of many hours and lets it proceed a little.
+fn long_run() -> RunningRun {
+    let mut run = RunRecipe::small().set("run.episodes=1000000").start();
     run.until_episodes(20);
     run
 }
@@ -44,7 +43,7 @@ fn the_first_interruption_saves_everything_learned() {
     assert_eq!(
         ended.episodes().len() as u64,
         summary.episodes,
-        "episodes that were not learned from are listed, or the reverse"
+        "the listed episodes are not those learned from"
     );
     let checkpoint = ended
         .directory
@@ -68,9 +67,9 @@ fn the_first_interruption_saves_everything_learned() {
 }
 
 #[test]
-fn the_second_interruption_ends_the_run_at_once() {
+fn the_second_interruption_ends_the_run_immediately() {
     let mut run = long_run();
-    // A learner that cannot stop in order, now or ever.
+    // A frozen learner cannot stop in order.
     let processes = processes_of(run.directory());
     let learner = processes
         .iter()
@@ -78,8 +77,8 @@ fn the_second_interruption_ends_the_run_at_once() {
         .unwrap();
     learner.signal(Signal::STOP);
     run.signal(Signal::INT);
-    run.until("the first interruption was heeded", |run| {
-        run.stderr().contains("stopping in order").then_some(())
+    run.until("the first interruption was handled", |run| {
+        run.stderr().contains("stopping: finishing").then_some(())
     });
     run.signal(Signal::INT);
     let begun = Instant::now();
@@ -115,7 +114,7 @@ fn no_process_outlives_a_killed_supervisor_not_even_a_frozen_one() {
     while !processes_of(&directory).is_empty() {
         assert!(
             begun.elapsed() < Duration::from_secs(5),
-            "still there: {:?}",
+            "still running: {:?}",
             leftovers(&directory)
         );
         std::thread::sleep(Duration::from_millis(10));
@@ -131,9 +130,9 @@ fn a_run_between_two_incarnations_of_its_learner_stops_in_order() {
         .find(|process| process.runs("skein-learner"))
         .unwrap();
     learner.signal(Signal::KILL);
-    run.until("the learner was started again", |run| {
+    run.until("the learner was restarted", |run| {
         run.stderr()
-            .contains("the learner was killed by signal 9; it is started again at once")
+            .contains("the learner was killed by signal 9; restarting it now")
             .then_some(())
     });
     run.signal(Signal::INT);

@@ -1,5 +1,5 @@
-//! What `learning.mirror` takes for granted: flown with mirrored commands through a mirrored
-//! course, an episode is the mirror image of the episode, image by image.
+//! The assumption of `learning.mirror`: mirrored commands in a mirrored course give the mirror
+//! image of the episode, image by image.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ use skein_simulator::simulator::{GroundTruth, OpeningAhead, Simulator, Simulator
 
 const STEPS: usize = 15;
 
-/// Two openings without any symmetry, or their mirror images.
+/// Returns a course with two asymmetric openings, or its mirror image.
 fn course(side: f32) -> Course {
     let wall = |label, x_m, centre_m: [f32; 2], points: [[f32; 2]; 5]| {
         let mut points_m: Vec<_> = points.map(|[y_m, z_m]| [side * y_m, z_m]).into();
@@ -137,13 +137,13 @@ fn the_mirror_image_of_an_episode_is_the_episode_through_the_mirrored_course() {
     let off = images
         .filter(|(one, other)| one.abs_diff(*other) > 1)
         .count();
-    // Silhouettes may come to lie on the other side of a pixel's centre.
+    // Silhouettes may fall on the other side of a pixel's centre.
     let pixels = (STEPS + 1) * IMAGE_PIXELS;
     assert!(off < pixels / 200, "{off} of {pixels} pixels differ");
 }
 
 #[test]
-fn all_that_points_to_the_left_points_to_the_right_in_the_mirror_and_nothing_else_is_turned() {
+fn mirroring_swaps_left_and_right_and_nothing_else() {
     // `side` is 1 for the episode, -1 for its mirror image.
     let truth = |side: f32| {
         let ahead = |distance_m: f32| OpeningAhead {

@@ -1,5 +1,5 @@
-//! The actor's networks are the learner's: the same parameters give the same numbers, to 1e-5 by
-//! libtorch and to the last bit by the native engine's encoder.
+//! The actor's networks equal the learner's: the same parameters give the same numbers, to 1e-5
+//! with libtorch and to the last bit with the native engine's encoder.
 
 #![allow(
     clippy::unwrap_used,
@@ -40,7 +40,8 @@ fn with_latent(latent: usize) -> Config {
     config
 }
 
-/// What the learner would publish, with the policy's parameters written by `policy`.
+/// Returns the network that the learner would publish, with the policy's parameters written by
+/// `policy`.
 fn network(config: &Config, vae: &Vae, policy: impl Fn(&mut [f32])) -> Network {
     let layout = SnapshotLayout::of(config);
     let mut values = vec![0.0; layout.values()];
@@ -76,7 +77,7 @@ fn assert_close(what: &str, native: &[f32], learner: &[f32]) {
 fn assert_alive(what: &str, values: &[f32]) {
     assert!(
         values.iter().any(|value| value.abs() > 1e-3),
-        "{what} is all noughts: nothing was compared"
+        "{what} is all zeros, so the comparison shows nothing"
     );
 }
 
@@ -88,7 +89,7 @@ fn gaussian(network: &Network, observed: &[f32]) -> [[f32; ACTION]; 2] {
 }
 
 #[test]
-fn the_native_encoder_is_the_learners() {
+fn the_native_encoder_equals_the_learners() {
     for (seed, latent) in SEEDS.zip([32, 8, 64]) {
         let config = with_latent(latent);
         let vae = vae(&config, seed);
@@ -107,7 +108,7 @@ fn the_native_encoder_is_the_learners() {
 }
 
 #[test]
-fn the_native_policy_is_the_learners() {
+fn the_native_policy_equals_the_learners() {
     for (seed, observation) in SEEDS.zip(OBSERVATIONS) {
         let config = config(observation);
         let mut layout = Layout::default();
@@ -135,7 +136,7 @@ fn the_native_policy_is_the_learners() {
 }
 
 #[test]
-fn both_bound_an_extreme_spread_alike() {
+fn both_bound_an_extreme_standard_deviation_alike() {
     let config = config(Observation::Latent);
     let mut layout = Layout::default();
     let policy = Policy::describe(
@@ -165,7 +166,7 @@ fn both_bound_an_extreme_spread_alike() {
 }
 
 #[test]
-fn what_the_learner_publishes_flies_as_the_learner_says() {
+fn a_published_policy_acts_as_in_the_learner() {
     for observation in OBSERVATIONS {
         let config = config(observation);
         let (inputs, observed) = (Inputs::of(&config), vec![0.3; config.view().len()]);
@@ -195,7 +196,7 @@ fn the_native_engine_encodes_as_the_actor_does_bit_for_bit() {
             .map(|_| std::array::from_fn(|_| rng.random()))
             .collect();
         let learner = native.encode(&images.concat());
-        // Both engines begin with the same parameters.
+        // Both engines start with the same parameters.
         let network = network(&config, &torch, |_| {});
         let mut scratch = Scratch::default();
         for (image, learner) in images.iter().zip(learner.chunks_exact(latent)) {

@@ -1,5 +1,4 @@
-//! What cannot be done is refused with one line that says what to change, and nothing is left of
-//! the attempt.
+//! Invalid requests are refused with one line that names the remedy, and leave nothing behind.
 
 #![allow(
     clippy::unwrap_used,
@@ -10,16 +9,16 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use skein_tests::{Output, Recipe, program, repository, run_program};
+use skein_tests::{ProgramOutput, RunRecipe, program, repository, run_program};
 use tempfile::TempDir;
 
-/// `skein run` with a configuration of its own, which must not come to incarnation.
+/// A `skein run` with a configuration of its own, which must be refused.
 struct Attempt {
     folder: TempDir,
 }
 
 impl Attempt {
-    /// With `tests/small.toml`, and `more` behind it.
+    /// Prepares `tests/small.toml` with `more` appended.
     fn new(more: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let courses = repository().join("configs/courses");
@@ -34,7 +33,7 @@ impl Attempt {
         self.folder.path()
     }
 
-    fn run(&self, arguments: &[&str]) -> Output {
+    fn run(&self, arguments: &[&str]) -> ProgramOutput {
         let (config, run) = (self.path().join("mine.toml"), self.path().join("run"));
         let basic = [
             "run",
@@ -52,13 +51,13 @@ impl Attempt {
         self.run(arguments).assert_refused(parts);
         assert!(
             !self.path().join("run").exists(),
-            "a directory was made for a run that cannot be"
+            "a directory was created for an impossible run"
         );
     }
 }
 
 #[test]
-fn a_directory_that_is_not_empty() {
+fn a_directory_that_is_not_empty_is_refused() {
     let attempt = Attempt::new("");
     let run = attempt.path().join("run");
     fs::create_dir(&run).unwrap();
@@ -69,12 +68,12 @@ fn a_directory_that_is_not_empty() {
     assert_eq!(
         fs::read_dir(&run).unwrap().count(),
         1,
-        "something was put beside it"
+        "something was written into the directory"
     );
 }
 
 #[test]
-fn an_unknown_key_section_or_setting() {
+fn an_unknown_key_section_or_setting_is_refused() {
     Attempt::new("[replay]\ncapcity = 1000\n")
         .assert_refused(&[], &["mine.toml", "[replay]", "capcity"]);
     Attempt::new("[replays]\n").assert_refused(&[], &["mine.toml", "[replays]"]);
@@ -91,7 +90,7 @@ fn an_unknown_key_section_or_setting() {
 }
 
 #[test]
-fn a_configuration_or_course_that_is_not_there() {
+fn a_missing_configuration_or_course_is_refused() {
     let attempt = Attempt::new("");
     attempt.assert_refused(&["--config", "/nowhere/mine.toml"], &["/nowhere/mine.toml"]);
     attempt.assert_refused(
@@ -101,7 +100,7 @@ fn a_configuration_or_course_that_is_not_there() {
 }
 
 #[test]
-fn a_course_that_cannot_be_flown() {
+fn a_course_that_cannot_be_flown_is_refused() {
     let attempt = Attempt::new("");
     let shipped = fs::read_to_string(repository().join("configs/courses/training.toml")).unwrap();
     let bent = attempt.path().join("bent.toml");
@@ -123,7 +122,7 @@ fn a_course_that_cannot_be_flown() {
         &["wall 1", "centre_m"],
     );
 
-    // An unknown key is shown where it stands, on lines of its own.
+    // An unknown key is shown in its context, on several lines.
     fs::write(&bent, shipped.replacen("width_m = 2.2", "girth_m = 2.2", 1)).unwrap();
     let output = attempt.run(&["--set", &set]);
     output.assert_refused(&["bent.toml", "wall 1"]);
@@ -135,36 +134,37 @@ fn a_course_that_cannot_be_flown() {
 }
 
 #[test]
-fn a_device_that_this_machine_does_not_have() {
-    let run = Recipe::small().set("run.device=cuda:7").start().wait();
+fn a_device_that_this_machine_does_not_have_is_refused() {
+    let run = RunRecipe::small().set("run.device=cuda:7").start().wait();
     assert_eq!(run.output.code, Some(1));
     run.output.assert_refused(&["cuda:7", "cpu"]);
     assert!(
         !run.directory.root().exists(),
-        "the directory of a run that never began is left"
+        "the directory of a run that never began remains"
     );
     run.assert_nothing_is_left();
 }
 
 #[test]
-fn an_actor_for_a_run_that_is_not_there_or_over() {
+fn an_actor_for_a_missing_or_complete_run_is_refused() {
     run_program("skein", &["attach", "--run", "/nowhere/run"]).assert_refused(&["/nowhere/run"]);
     let empty = tempfile::tempdir().unwrap();
     let directory = empty.path().to_str().unwrap();
     run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory]);
-    let over = Recipe::small().set("run.episodes=1").finish();
+    let over = RunRecipe::small().set("run.episodes=1").finish();
     let directory = over.directory.root().to_str().unwrap();
     run_program("skein", &["attach", "--run", directory])
         .assert_refused(&[directory, "not under way"]);
 }
 
 #[test]
-fn shared_memory_that_is_too_small() {
-    // A mount of our own, which nobody else sees: not every machine lets us.
+fn too_little_shared_memory_is_refused() {
+    // A private mount, which not every machine allows.
     let attempt = Attempt::new("");
     let (config, run) = (attempt.path().join("mine.toml"), attempt.path().join("run"));
     let script = format!(
-        "mount -t tmpfs -o size=8m tmpfs /dev/shm || exit 77; exec {} run --config {} --run-dir {} --actors 2",
+        "mount -t tmpfs -o size=8m tmpfs /dev/shm || exit 77; exec {} run --config {} --run-dir \
+         {} --actors 2",
         program("skein").display(),
         config.display(),
         run.display()
@@ -173,12 +173,12 @@ fn shared_memory_that_is_too_small() {
         .args(["--mount", "--map-root-user", "sh", "-c", &script])
         .output();
     let Ok(output) = output else {
-        eprintln!("skipped: there is no unshare");
+        eprintln!("skipped: unshare is not installed");
         return;
     };
     let stderr = String::from_utf8_lossy(&output.stderr);
     if output.status.code() == Some(77) || stderr.contains("unshare") {
-        eprintln!("skipped: nothing can be mounted here: {stderr}");
+        eprintln!("skipped: this user may not mount: {stderr}");
         return;
     }
     assert_eq!(output.status.code(), Some(1), "{stderr}");
@@ -195,7 +195,7 @@ fn shared_memory_that_is_too_small() {
 }
 
 #[test]
-fn a_resumption_of_what_cannot_be_gone_on_with() {
+fn an_impossible_resumption_is_refused() {
     let empty = tempfile::tempdir().unwrap();
     let directory = empty.path().to_str().unwrap();
     run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "run.json"]);
@@ -207,12 +207,12 @@ fn a_resumption_of_what_cannot_be_gone_on_with() {
     assert!(
         with_config
             .stderr
-            .contains("with the configuration it was started with"),
+            .contains("the configuration stored in it"),
         "{}",
         with_config.stderr
     );
 
-    let mut running = Recipe::small().start();
+    let mut running = RunRecipe::small().start();
     running.until_episodes(1);
     let root = running.directory().root().to_owned();
     let directory = root.to_str().unwrap();
@@ -230,7 +230,7 @@ fn a_resumption_of_what_cannot_be_gone_on_with() {
 }
 
 #[test]
-fn an_evaluation_of_nothing() {
+fn an_evaluation_without_a_run_or_snapshot_is_refused() {
     run_program("skein-evaluate", &["--run", "/nowhere/run"]).assert_refused(&["/nowhere/run"]);
     run_program(
         "skein-evaluate",

@@ -1,4 +1,4 @@
-//! Runs that are cut off, and what becomes of them and of what they left.
+//! Runs that are cut off, resumed, and cleared away.
 
 #![allow(
     clippy::unwrap_used,
@@ -11,14 +11,14 @@ use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use skein_run::RunDirectory;
-use skein_tests::{Recipe, episodes, leftovers, processes_of, program, repository};
+use skein_tests::{RunRecipe, episodes, leftovers, processes_of, program, repository};
 
-fn recipe() -> Recipe {
-    Recipe::small().set("run.episodes=80")
+fn recipe() -> RunRecipe {
+    RunRecipe::small().set("run.episodes=80")
 }
 
 #[test]
-fn a_run_cut_off_and_resumed_with_other_numbers_of_actors_comes_to_the_same() {
+fn a_run_cut_off_and_resumed_with_other_numbers_of_actors_has_the_same_result() {
     let calm = recipe().finish();
 
     let mut run = recipe().start();
@@ -41,12 +41,12 @@ fn a_run_cut_off_and_resumed_with_other_numbers_of_actors_comes_to_the_same() {
     }
     assert!(
         !ended.directory.logs().join("actor-3.log").exists(),
-        "numbers of dead actors were not used again"
+        "ids of dead actors were not reused"
     );
 }
 
 #[test]
-fn a_run_whose_processes_die_one_after_the_other_comes_to_the_same() {
+fn a_run_whose_processes_die_one_after_another_has_the_same_result() {
     let calm = recipe().finish();
 
     let mut run = recipe().start();
@@ -55,7 +55,7 @@ fn a_run_whose_processes_die_one_after_the_other_comes_to_the_same() {
     run.until_episodes(30);
     run.process("skein-actor").signal(Signal::KILL);
     run.until_episodes(50);
-    // Noticed by nobody but the learner: its tickets go to the other one.
+    // Only the learner notices: its tickets go to the other actor.
     run.process("skein-actor").signal(Signal::STOP);
     run.until_episodes(60);
     run.process("skein-learner").signal(Signal::KILL);
@@ -74,8 +74,8 @@ fn a_run_whose_processes_die_one_after_the_other_comes_to_the_same() {
 }
 
 #[test]
-fn the_next_start_removes_what_a_killed_run_left_and_nothing_of_a_run_beside_it() {
-    let mut beside = Recipe::small().set("run.episodes=1000000").start();
+fn the_next_start_removes_the_remains_of_a_killed_run_and_nothing_of_a_live_one() {
+    let mut beside = RunRecipe::small().set("run.episodes=1000000").start();
     beside.until_episodes(1);
 
     let folder = tempfile::tempdir().unwrap();
@@ -114,7 +114,7 @@ fn the_next_start_removes_what_a_killed_run_left_and_nothing_of_a_run_beside_it(
     }
     assert!(
         !leftovers(&killed).is_empty(),
-        "a killed run leaves something, or this shows nothing"
+        "without remains of the killed run the test shows nothing"
     );
 
     let flown = episodes(beside.directory()).len();

@@ -1,4 +1,4 @@
-//! The configurations that are shipped can be run, and the faithful one is the paper's.
+//! The shipped configurations can run, and `paper.toml` has the paper's values.
 
 #![allow(
     clippy::unwrap_used,
@@ -30,7 +30,7 @@ fn load(name: &str) -> Config {
 }
 
 #[test]
-fn the_configurations_are_there() {
+fn the_shipped_configurations_exist() {
     let names: Vec<_> = shipped()
         .iter()
         .map(|path| path.file_name().unwrap().to_str().unwrap().to_owned())
@@ -42,7 +42,7 @@ fn the_configurations_are_there() {
 }
 
 #[test]
-fn every_shipped_configuration_can_be_flown_as_it_stands() {
+fn every_shipped_configuration_can_be_flown_unchanged() {
     for file in shipped() {
         let config = Config::load(&file, &[]).unwrap();
         let settings: SimulatorSettings = toml::Value::Table(config.simulator)
@@ -69,7 +69,7 @@ fn every_shipped_configuration_can_be_flown_as_it_stands() {
 }
 
 #[test]
-fn the_faithful_configuration_is_the_papers() {
+fn the_paper_configuration_has_the_papers_values() {
     let paper = load("paper.toml");
     assert_eq!(paper.run.episodes, 4000);
     assert_eq!(paper.learning.episodes_per_epoch, 1);
@@ -94,7 +94,7 @@ fn the_faithful_configuration_is_the_papers() {
 }
 
 #[test]
-fn every_shipped_suite_can_be_flown_and_one_tells_every_family_of_shapes_apart() {
+fn every_shipped_suite_can_be_flown_and_one_has_an_entry_per_family_of_shapes() {
     let suite =
         |name: &str| Suite::load(repository().join("configs/evaluations").join(name)).unwrap();
     let [generalist, shapes, untried] =
@@ -103,7 +103,7 @@ fn every_shipped_suite_can_be_flown_and_one_tells_every_family_of_shapes_apart()
     for entry in all.into_iter().flat_map(|suite| &suite.entries) {
         entry.courses.of_episode(0).unwrap();
     }
-    let told: Vec<&str> = shapes
+    let named: Vec<&str> = shapes
         .entries
         .iter()
         .map(|entry| entry.name.as_str())
@@ -111,5 +111,8 @@ fn every_shipped_suite_can_be_flown_and_one_tells_every_family_of_shapes_apart()
     let families = GeneratedShape::HELD_OUT
         .into_iter()
         .chain(GeneratedShape::TRAINED);
-    assert_eq!(told, families.map(GeneratedShape::name).collect::<Vec<_>>());
+    assert_eq!(
+        named,
+        families.map(GeneratedShape::name).collect::<Vec<_>>()
+    );
 }

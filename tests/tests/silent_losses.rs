@@ -1,5 +1,5 @@
-//! The ways in which iceoryx2 loses data without a word when a peer dies, each reproduced, and that
-//! no episode is lost or mixed up by any of them.
+//! Reproduces each way in which iceoryx2 silently loses data when a peer dies, and shows that none
+//! of them loses or mixes up an episode.
 
 #![allow(
     clippy::unwrap_used,
@@ -27,15 +27,15 @@ use skein_protocol::transition::{Outcome, RecordKind};
 use skein_run::{LearnerLock, Presence, RunDirectory, RunIdentity};
 use skein_transport::{ActorPorts, LearnerPorts};
 
-/// Steps of every episode here.
+/// Steps of every episode in these tests.
 const STEPS: u32 = 4;
 const INCARNATION: ActorIncarnation = ActorIncarnation(1);
-/// Longer than anything here takes.
+/// Time limit, longer than any of these tests takes.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Names the run's directory to a process that is this test's peer.
+/// Environment variable that passes the run's directory to a peer process.
 const RUN_DIRECTORY: &str = "SKEIN_TEST_RUN";
 
-/// A run, and this process as one of its processes.
+/// A run with this process as one of its processes.
 struct Run {
     directory: RunDirectory,
     identity: RunIdentity,
@@ -74,13 +74,13 @@ impl Run {
         ActorPorts::join(&self.identity, &self.config).unwrap()
     }
 
-    /// Files of the transport, and segments in shared memory.
+    /// Returns the number of the transport's files, and of segments in shared memory.
     fn files(&self) -> (u64, u64) {
         let footprint = footprint(self.identity.run);
         (footprint.transport_entries, footprint.segments)
     }
 
-    /// A dispatcher with one order.
+    /// Returns a dispatcher with one order.
     fn dispatcher(&self) -> Dispatcher {
         let mut dispatcher = Dispatcher::new(
             self.identity.run,
@@ -110,8 +110,8 @@ impl Run {
         }
     }
 
-    /// This test's program again, as the process that the ignored test `role` is; returned once it
-    /// has said that it is ready.
+    /// Starts this test program as the peer of the ignored test `role`; returns once the peer is
+    /// ready.
     fn peer(&self, role: &str) -> Peer {
         let mut process = Command::new(std::env::current_exe().unwrap())
             .args(["--exact", role, "--ignored", "--nocapture"])
@@ -126,7 +126,7 @@ impl Run {
     }
 }
 
-/// A process to be killed.
+/// A peer process to be killed.
 struct Peer(Child);
 
 impl Peer {
@@ -143,7 +143,7 @@ impl Drop for Peer {
     }
 }
 
-/// The run that this process was started for.
+/// Returns the run for which this process was started.
 fn run_of_peer() -> (RunDirectory, RunIdentity, Config, Presence) {
     let directory = RunDirectory::new(std::env::var_os(RUN_DIRECTORY).unwrap());
     let (identity, config) = directory.open().unwrap();
@@ -164,7 +164,7 @@ fn status(actor: ActorId, incarnation: ActorIncarnation) -> ActorStatus {
 }
 
 impl Run {
-    /// Attaches `actor` to `dispatcher`, and returns the ticket that it is given.
+    /// Attaches `actor` to `dispatcher`, and returns its ticket.
     fn issued(&self, dispatcher: &mut Dispatcher, actor: ActorId, now: Instant) -> Ticket {
         dispatcher.on_status(&status(actor, INCARNATION), now);
         let messages = dispatcher.issue(now);
@@ -174,7 +174,7 @@ impl Run {
             .unwrap();
         match message.read(self.identity.run) {
             Ok(Control::Fly(ticket)) => ticket,
-            other => panic!("{other:?} is no ticket"),
+            other => panic!("{other:?} is not a ticket"),
         }
     }
 }
@@ -200,7 +200,7 @@ fn send(
     }
 }
 
-/// What the dispatcher makes of everything that has arrived.
+/// Passes everything that has arrived to the dispatcher, and returns its result.
 fn take_in(
     learner: &LearnerPorts,
     dispatcher: &mut Dispatcher,
@@ -218,7 +218,7 @@ fn take_in(
     committed
 }
 
-/// Requires that the first order is flown by `actor` after all, once.
+/// Asserts that `actor` flies the first order after all, once.
 fn assert_flown(
     run: &Run,
     learner: &LearnerPorts,
@@ -253,7 +253,7 @@ fn learner_that_reads_nothing() {
     }
 }
 
-/// iceoryx2's default is to wait until there is room, for ever if its reader is dead.
+/// By default, iceoryx2 waits until there is room, for ever if its reader is dead.
 #[test]
 fn an_actor_whose_learner_reads_nothing_and_is_killed_is_not_held_up() {
     let (say, heard) = mpsc::channel();
@@ -261,7 +261,7 @@ fn an_actor_whose_learner_reads_nothing_and_is_killed_is_not_held_up() {
         let run = Run::new();
         let mut learner = run.peer("learner_that_reads_nothing");
         let ports = run.actor();
-        // Several times what the learner has room for.
+        // Several times the learner's capacity.
         let flood = || {
             (0..50).for_each(|episode| {
                 send(&ports, &run.ticket(episode), FIRST, INCARNATION, 0..=STEPS)
@@ -277,9 +277,10 @@ fn an_actor_whose_learner_reads_nothing_and_is_killed_is_not_held_up() {
     heard.recv_timeout(2 * PATIENCE).unwrap();
 }
 
-/// A send succeeds whether or not the learner knows the sender yet, and is lost if it never does.
+/// A send succeeds even if the learner does not know the sender yet. The data is lost if it never
+/// does.
 #[test]
-fn an_episode_begun_over_a_line_that_the_learner_never_knew_has_a_hole_and_is_flown_again() {
+fn an_episode_begun_over_a_connection_unknown_to_the_learner_is_flown_again() {
     let run = Run::new();
     let (learner, _lock) = run.learner();
     let mut dispatcher = run.dispatcher();
@@ -296,7 +297,7 @@ fn an_episode_begun_over_a_line_that_the_learner_never_knew_has_a_hole_and_is_fl
     assert_flown(&run, &learner, &mut dispatcher, FIRST, now);
 }
 
-/// What a sender sends just before it ends arrives only if the learner knew it before.
+/// Data sent just before the sender ends arrives only if the learner knew the sender before.
 #[test]
 fn an_episode_whose_actor_ends_at_once_is_flown_by_another() {
     let run = Run::new();
@@ -309,16 +310,16 @@ fn an_episode_whose_actor_ends_at_once_is_flown_by_another() {
     drop(ports);
     assert!(
         take_in(&learner, &mut dispatcher, now).is_empty(),
-        "all of it was lost"
+        "everything was lost"
     );
     let later = now + Duration::from_secs(2);
     dispatcher.on_time(later);
     assert_flown(&run, &learner, &mut dispatcher, SECOND, later);
 }
 
-/// With a learner, everything that it has not read is gone.
+/// A dead learner takes all its unread data with it.
 #[test]
-fn what_a_killed_learner_had_not_read_is_flown_for_its_next_incarnation() {
+fn episodes_unread_by_a_killed_learner_are_flown_for_its_next_incarnation() {
     let run = Run::new();
     let mut former = run.peer("learner_that_reads_nothing");
     let ports = run.actor();
@@ -332,14 +333,14 @@ fn what_a_killed_learner_had_not_read_is_flown_for_its_next_incarnation() {
     learner.maintain().unwrap();
     assert!(
         take_in(&learner, &mut dispatcher, now).is_empty(),
-        "nothing that is meant for another incarnation arrives"
+        "nothing meant for another incarnation arrives"
     );
     assert_flown(&run, &learner, &mut dispatcher, FIRST, now);
 }
 
-/// Sending without a learner succeeds, and is lost.
+/// Sending without a learner succeeds, and the data is lost.
 #[test]
-fn what_is_sent_to_no_learner_is_flown_for_the_next_one() {
+fn episodes_sent_without_a_learner_are_flown_for_the_next_one() {
     let run = Run::new();
     let former = run.learner();
     let ports = run.actor();
@@ -352,7 +353,7 @@ fn what_is_sent_to_no_learner_is_flown_for_the_next_one() {
     assert_flown(&run, &learner, &mut dispatcher, FIRST, now);
 }
 
-/// Joins, says so, and flies its tickets until it is killed in the middle of that.
+/// Joins, reports readiness, and flies its tickets until it is killed.
 #[test]
 #[ignore = "a process that other tests start and kill"]
 fn actor_that_flies() {
@@ -363,11 +364,12 @@ fn actor_that_flies() {
         let Ok(ports) = ActorPorts::join(&identity, &config) else {
             continue;
         };
-        // Whoever waits for this word hears only the first one.
+        // The waiting test reads only the first of these lines.
         if !std::mem::replace(&mut is_ready, true) {
             println!("ready");
         }
-        // Another incarnation at each joining: tickets for the one before are lost with its line.
+        // Each join is another incarnation. Tickets for the previous one are lost with its
+        // connection.
         let incarnation = ActorIncarnation(
             SystemTime::now()
                 .duration_since(UNIX_EPOCH)
@@ -390,10 +392,10 @@ fn actor_that_flies() {
     }
 }
 
-/// Killed actors leave half-made connections, half-made files, and slots of which there are few:
+/// Killed actors leave half-made connections, half-made files, and occupied slots. Slots are few:
 /// here four for two actors.
 #[test]
-fn many_actors_killed_in_the_middle_of_anything_cost_no_slot_no_file_and_no_episode() {
+fn many_actors_killed_at_any_moment_cost_no_slot_no_file_and_no_episode() {
     const EPISODES: u64 = 30;
     let run = Run::new();
     let lock = LearnerLock::take(&run.directory, &run.identity).unwrap();
@@ -409,18 +411,18 @@ fn many_actors_killed_in_the_middle_of_anything_cost_no_slot_no_file_and_no_epis
         peer = run.peer("actor_that_flies");
     }
     let stop = Arc::new(AtomicBool::new(false));
-    let told = Arc::clone(&stop);
+    let stop_request = Arc::clone(&stop);
     std::thread::spawn(move || {
         sleep(PATIENCE);
-        told.store(true, Ordering::Relaxed);
+        stop_request.store(true, Ordering::Relaxed);
     });
     let mut flown = Vec::new();
     while let Some(episode) = batch.next(&stop).unwrap() {
         flown.push(episode.episode.0);
     }
     assert_eq!(flown, (0..EPISODES).collect::<Vec<_>>());
-    // Four slots, of which the learner's own waker has one: if a dead actor kept another, these
-    // would be too many.
+    // The learner's own waker has one of the four slots. If a dead actor kept another, one of these
+    // would be refused.
     drop(peer);
     let deadline = Instant::now() + PATIENCE;
     let mut actors = Vec::new();
@@ -438,7 +440,7 @@ fn many_actors_killed_in_the_middle_of_anything_cost_no_slot_no_file_and_no_epis
         }
     }
     drop(actors);
-    // What died before it could be told from what is being made is left alone for some seconds.
+    // Remains that cannot be distinguished from files in creation are kept for some seconds.
     let deadline = Instant::now() + PATIENCE;
     while run.files() != files {
         assert!(

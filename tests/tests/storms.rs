@@ -1,5 +1,5 @@
-//! What `skein-chaos` does to a run, at the size of a test: a storm of everything at once, and a
-//! death at every named point.
+//! Runs `skein-chaos` at the size of a test: a storm of all disturbances, and a death at every
+//! fault point.
 
 #![allow(
     clippy::unwrap_used,
@@ -8,8 +8,8 @@
 
 use skein_tests::{repository, run_program};
 
-/// Runs `skein-chaos` over `tests/small.toml` with `settings`; requires that all was done, nothing
-/// differs and nothing is left.
+/// Runs `skein-chaos` over `tests/small.toml` with `settings`. Asserts that all disturbances
+/// happened, nothing differs and nothing is left.
 fn storm(settings: &[&str], arguments: &[&str]) -> String {
     let folder = tempfile::tempdir().unwrap();
     let config = repository().join("tests/small.toml");
@@ -32,8 +32,8 @@ fn storm(settings: &[&str], arguments: &[&str]) -> String {
 }
 
 #[test]
-fn kills_freezes_and_comings_and_goings_change_nothing() {
-    // Silences that the freezes of a short run can exceed.
+fn kills_freezes_and_attachments_change_nothing() {
+    // Silences short enough to be exceeded by the freezes of a short run.
     let settings = [
         "run.episodes=200",
         "transport.actor_silence_secs=1",
@@ -53,7 +53,7 @@ fn kills_freezes_and_comings_and_goings_change_nothing() {
 }
 
 #[test]
-fn kills_change_nothing_where_episodes_are_flown_while_the_learner_updates() {
+fn kills_change_nothing_with_policy_lag() {
     let settings = ["run.episodes=120", "learning.policy_lag=1"];
     let kills = [
         "--actor-kills",
@@ -70,7 +70,7 @@ fn kills_change_nothing_where_episodes_are_flown_while_the_learner_updates() {
 }
 
 #[test]
-fn a_death_at_any_named_point_changes_nothing() {
-    // Enough episodes that every point is passed again after all deaths before it.
+fn a_death_at_any_fault_point_changes_nothing() {
+    // Enough episodes to reach every point again after all previous deaths.
     storm(&["run.episodes=400"], &["--points"]);
 }

@@ -1,4 +1,4 @@
-//! What a run leaves in its directory, file by file, as it was promised; and nothing anywhere else.
+//! Contents of a run's directory, file by file, as documented; and nothing anywhere else.
 
 #![allow(
     clippy::unwrap_used,
@@ -14,13 +14,13 @@ use skein_protocol::config::Config;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::{Stage, Thread};
 use skein_protocol::summary::Ending;
-use skein_tests::{Ended, Recipe};
+use skein_tests::{EndedRun, RunRecipe};
 
 #[test]
-fn a_completed_run_leaves_what_it_promises() {
-    let run = Recipe::small().set("run.seed=7").finish();
+fn a_completed_run_leaves_all_documented_files() {
+    let run = RunRecipe::small().set("run.seed=7").finish();
     the_configuration_is_resolved(&run);
-    the_episodes_have_the_promised_columns(&run);
+    the_episodes_have_the_documented_columns(&run);
     the_summary_agrees_with_the_episodes(&run);
     the_stages_agree_with_the_counts(&run);
     the_snapshots_are_those_of_the_summary(&run);
@@ -32,7 +32,7 @@ fn a_completed_run_leaves_what_it_promises() {
     the_conclusion_shows_the_tables_and_the_paths(&run);
 }
 
-fn the_configuration_is_resolved(run: &Ended) {
+fn the_configuration_is_resolved(run: &EndedRun) {
     let text = fs::read_to_string(run.directory.config()).unwrap();
     let config: toml::Table = toml::from_str(&text).unwrap();
     assert_eq!(config["run"]["seed"].as_integer(), Some(7));
@@ -44,7 +44,7 @@ fn the_configuration_is_resolved(run: &Ended) {
     for [section, key] in [["sac", "discount"], ["vae", "kl_weight"]] {
         assert!(
             config[section][key].is_float(),
-            "{section}.{key} is a default that nobody set"
+            "the default of {section}.{key} is missing"
         );
     }
     let vehicle = &config["simulator"]["vehicle"];
@@ -57,7 +57,7 @@ fn the_configuration_is_resolved(run: &Ended) {
         text.contains(env!("CARGO_PKG_VERSION")),
         "the version is missing:\n{text}"
     );
-    // What it names is in the directory too.
+    // The courses that it names are in the directory too.
     let config = Config::load(&run.directory.config(), &[]).unwrap();
     for course in config
         .courses
@@ -72,7 +72,7 @@ fn the_configuration_is_resolved(run: &Ended) {
     }
 }
 
-fn the_episodes_have_the_promised_columns(run: &Ended) {
+fn the_episodes_have_the_documented_columns(run: &EndedRun) {
     let text = fs::read_to_string(run.directory.episodes_csv()).unwrap();
     assert_eq!(
         text.lines().next(),
@@ -81,7 +81,7 @@ fn the_episodes_have_the_promised_columns(run: &Ended) {
     let episodes = run.episodes();
     assert_eq!(episodes.len(), 40);
     for (number, episode) in (0u64..).zip(&episodes) {
-        // Ten episodes from each level in turn.
+        // Ten episodes start from each level in turn.
         assert_eq!(u64::from(episode.level), number / 10 % 5 + 1, "{episode:?}");
         assert!((1..=160).contains(&episode.steps), "{episode:?}");
         assert!(episode.walls_passed <= 5, "{episode:?}");
@@ -96,7 +96,7 @@ fn the_episodes_have_the_promised_columns(run: &Ended) {
     }
 }
 
-/// That changed what the learner is made of; empty outside a clone.
+/// Returns the last commit that changed the learner's sources; empty outside a clone.
 fn last_commit() -> String {
     if !Path::new("../.git").exists() {
         return String::new();
@@ -110,9 +110,9 @@ fn last_commit() -> String {
     String::from_utf8(output.stdout).unwrap().trim().to_owned()
 }
 
-fn the_summary_agrees_with_the_episodes(run: &Ended) {
+fn the_summary_agrees_with_the_episodes(run: &EndedRun) {
     let (summary, episodes) = (run.summary(), run.episodes());
-    // In a clone with the commit behind it.
+    // In a clone, the commit follows the version.
     let (version, commit) = summary
         .skein_version
         .split_once('+')
@@ -139,23 +139,23 @@ fn the_summary_agrees_with_the_episodes(run: &Ended) {
     assert!(summary.evaluation_episodes > 6, "{summary:?}");
 }
 
-/// Each thread's stages are its whole time, and each was gone through as often as there was
-/// something to do.
-fn the_stages_agree_with_the_counts(run: &Ended) {
+/// Asserts that each thread's stages add up to its time, and that each stage was counted as often
+/// as there was work for it.
+fn the_stages_agree_with_the_counts(run: &EndedRun) {
     let summary = run.summary();
     let count = |stage| summary.stages.of(stage).count;
     let secs = |thread| summary.stages.total_nanos(thread) as f64 / 1e9;
     let evaluated = fs::read_to_string(run.directory.evaluation_trajectories_csv()).unwrap();
-    // A header, and a row for each observation of six episodes.
+    // A header, and a row per observation of six episodes.
     let evaluation_steps = evaluated.lines().count() as u64 - 1 - 6;
     let (episodes, steps) = (count(Stage::Reset), count(Stage::Physics));
     let flown = summary.episodes + summary.evaluation_episodes;
-    // The last episode's end may not have been heard of yet.
+    // The last episode's end may not have arrived yet.
     assert!(
         (flown - 1..=flown).contains(&episodes),
         "{episodes} episodes of {summary:?}"
     );
-    // Those that confirmed the best snapshot were flown besides.
+    // Confirmation episodes come in addition.
     assert!(
         steps > summary.steps + evaluation_steps,
         "{steps} steps of {summary:?}"
@@ -177,7 +177,7 @@ fn the_stages_agree_with_the_counts(run: &Ended) {
         [Stage::SampleImages, Stage::VaeStep].map(count),
         [summary.vae_updates; 2]
     );
-    // One for the parameters it began with.
+    // One for the initial parameters.
     assert_eq!(count(Stage::Publish), summary.final_version.0 + 1);
     assert_eq!(count(Stage::Recode), 1);
     let (training, receiving) = (secs(Thread::Training), secs(Thread::Receiving));
@@ -196,7 +196,7 @@ fn the_stages_agree_with_the_counts(run: &Ended) {
     );
 }
 
-fn the_snapshots_are_those_of_the_summary(run: &Ended) {
+fn the_snapshots_are_those_of_the_summary(run: &EndedRun) {
     let summary = run.summary();
     let (latest, _) = Snapshot::load(&run.directory.latest_snapshot()).unwrap();
     assert_eq!(latest.version, summary.final_version);
@@ -206,7 +206,7 @@ fn the_snapshots_are_those_of_the_summary(run: &Ended) {
     assert_eq!(config.run.seed, 7, "a snapshot carries its configuration");
 }
 
-fn the_evaluation_is_of_the_best_snapshot(run: &Ended) {
+fn the_evaluation_is_of_the_best_snapshot(run: &EndedRun) {
     let evaluation = run.evaluation();
     let (best, _) = Snapshot::load(&run.directory.best_snapshot()).unwrap();
     assert_eq!(evaluation.policy_version, best.version);
@@ -227,16 +227,16 @@ fn the_evaluation_is_of_the_best_snapshot(run: &Ended) {
     }
 }
 
-fn the_newest_checkpoint_is_of_the_end(run: &Ended) {
+fn the_newest_checkpoint_is_of_the_end(run: &EndedRun) {
     assert_eq!(
         names_in(&run.directory.checkpoints()),
         BTreeSet::from(["episode-20".to_owned(), "episode-40".to_owned()])
     );
 }
 
-/// A record of an event file is its length, a checksum, the event, and a checksum. The first event
-/// names the format; curves go by their names.
-fn the_curves_are_in_an_event_file(run: &Ended) {
+/// An event file's record is a length, a checksum, the event, and a checksum. The first event names
+/// the format; the others hold named curves.
+fn the_curves_are_in_an_event_file(run: &EndedRun) {
     let folder = run.directory.tensorboard();
     let names = names_in(&folder);
     assert!(
@@ -271,7 +271,7 @@ fn the_curves_are_in_an_event_file(run: &Ended) {
     }
 }
 
-fn the_plots_show_something(run: &Ended) {
+fn the_plots_show_something(run: &EndedRun) {
     let plots = [
         "trajectories.png",
         "reconstructions.png",
@@ -293,24 +293,24 @@ fn the_plots_show_something(run: &Ended) {
         let colours: BTreeSet<_> = pixels.chunks_exact(info.color_type.samples()).collect();
         assert!(
             colours.len() > 20,
-            "{plot} has {} colours: it is as good as empty",
+            "{plot} has {} colours: it is almost empty",
             colours.len()
         );
     }
 }
 
-fn every_process_has_its_log(run: &Ended) {
+fn every_process_has_its_log(run: &EndedRun) {
     for log in ["learner.log", "actor-0.log", "actor-1.log"] {
         let text = fs::read_to_string(run.directory.logs().join(log)).unwrap();
-        assert!(text.contains("INFO"), "{log} says nothing:\n{text}");
+        assert!(text.contains("INFO"), "{log} has no information:\n{text}");
         assert!(
             !text.contains("ERROR") && !text.contains("WARN"),
-            "{log} complains:\n{text}"
+            "{log} has warnings:\n{text}"
         );
     }
 }
 
-fn the_conclusion_shows_the_tables_and_the_paths(run: &Ended) {
+fn the_conclusion_shows_the_tables_and_the_paths(run: &EndedRun) {
     for part in [
         "non_rectangular",
         &skein_run::tables::stages_table(&run.summary().stages),
@@ -334,8 +334,8 @@ fn names_in(folder: &Path) -> BTreeSet<String> {
 }
 
 #[test]
-fn logs_are_as_verbose_and_of_the_format_that_was_asked_for() {
-    let run = Recipe::small()
+fn logs_have_the_requested_level_and_format() {
+    let run = RunRecipe::small()
         .set("run.episodes=10")
         .actors(1)
         .environment("RUST_LOG", "debug")

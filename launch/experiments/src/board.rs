@@ -1,7 +1,8 @@
-//! The progress of all runs of an experiment in one place.
+//! Progress of all runs of an experiment.
 //!
-//! A terminal gets one bar for the whole experiment with a line for each run under way; anything
-//! else a plain line now and then. What a run itself says goes to a file beside its directory.
+//! A terminal gets one bar for the whole experiment, with a line for each active run. Any other
+//! output gets a plain line every half minute. Output of the runs themselves goes to files beside
+//! their directories.
 
 use std::fmt::Write;
 use std::time::{Duration, Instant};
@@ -10,53 +11,53 @@ use indicatif::ProgressBar;
 
 use skein_reports::Clock;
 
-/// Between two plain lines.
+/// Time between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
 
-/// What is done for a run, in order.
+/// Stages of a run, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Stage {
-    /// It is trained, and flies its evaluation courses.
+pub enum RunStage {
+    /// The run is trained and flies its evaluation courses.
     Training,
     /// Its best snapshot flies the experiment's suite.
     Suite,
 }
 
-/// How far one run has come.
+/// Progress of one run.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Standing {
-    /// The run.
+pub struct RunProgress {
+    /// Name of the run.
     pub name: String,
-    /// What is done for it.
-    pub stage: Stage,
-    /// Training episodes learned from.
+    /// Current stage.
+    pub stage: RunStage,
+    /// Number of training episodes learned from.
     pub episodes: u64,
-    /// Training episodes of the whole run.
+    /// Number of training episodes of the complete run.
     pub total_episodes: u64,
-    /// Walls passed an episode over the last window; `None` before there is an episode.
+    /// Walls passed per episode over the last window; `None` before the first episode.
     pub walls_passed: Option<f64>,
 }
 
-/// How far an experiment has come.
+/// Progress of an experiment.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Progress {
-    /// Runs that are complete.
+pub struct ExperimentProgress {
+    /// Number of complete runs.
     pub complete: usize,
-    /// Runs in the whole experiment.
+    /// Number of runs.
     pub runs: usize,
-    /// Training episodes learned from, in all runs.
+    /// Number of training episodes learned from, over all runs.
     pub episodes: u64,
-    /// Training episodes of the whole experiment.
+    /// Number of training episodes of the experiment.
     pub total_episodes: u64,
-    /// The runs under way.
-    pub under_way: Vec<Standing>,
+    /// Active runs.
+    pub under_way: Vec<RunProgress>,
 }
 
-/// Shows how an experiment gets on.
-pub struct Board {
+/// Display of an experiment's progress.
+pub struct ExperimentDisplay {
     surface: Surface,
     started: Instant,
-    /// Episodes that were there when it started.
+    /// Number of episodes when this session started.
     first_episodes: Option<u64>,
 }
 
@@ -65,8 +66,8 @@ enum Surface {
     Plain { last: Option<Instant> },
 }
 
-impl Board {
-    /// A board on `bar`, which is on a terminal; without one, on this process's standard error.
+impl ExperimentDisplay {
+    /// Returns a display on `bar`, or on this process's standard error if there is none.
     pub fn new(bar: Option<ProgressBar>) -> Self {
         Self {
             surface: bar.map_or(Surface::Plain { last: None }, Surface::Terminal),
@@ -75,8 +76,8 @@ impl Board {
         }
     }
 
-    /// Shows where the experiment is.
-    pub fn show(&mut self, progress: &Progress) {
+    /// Shows the progress.
+    pub fn show(&mut self, progress: &ExperimentProgress) {
         let first = *self.first_episodes.get_or_insert(progress.episodes);
         let head = head(progress, self.started.elapsed().as_secs_f64(), first);
         match &mut self.surface {
@@ -88,14 +89,14 @@ impl Board {
             Surface::Plain { last } => {
                 if last.is_none_or(|when| when.elapsed() >= LINE_INTERVAL) {
                     *last = Some(Instant::now());
-                    let runs: Vec<_> = progress.under_way.iter().map(Standing::brief).collect();
+                    let runs: Vec<_> = progress.under_way.iter().map(RunProgress::brief).collect();
                     eprintln!("{}", [&[head], runs.as_slice()].concat().join(" · "));
                 }
             }
         }
     }
 
-    /// Says something that stays.
+    /// Prints a line that stays visible.
     pub fn say(&self, text: &str) {
         match &self.surface {
             Surface::Terminal(bar) => bar.suspend(|| eprintln!("skein: {text}")),
@@ -103,7 +104,7 @@ impl Board {
         }
     }
 
-    /// Removes the bar, so that other things can be printed.
+    /// Removes the bar, so that other text can be printed.
     pub fn finish(&self) {
         if let Surface::Terminal(bar) = &self.surface {
             bar.finish_and_clear();
@@ -111,8 +112,8 @@ impl Board {
     }
 }
 
-fn head(progress: &Progress, elapsed_secs: f64, first_episodes: u64) -> String {
-    let Progress {
+fn head(progress: &ExperimentProgress, elapsed_secs: f64, first_episodes: u64) -> String {
+    let ExperimentProgress {
         complete,
         runs,
         episodes,
@@ -126,29 +127,29 @@ fn head(progress: &Progress, elapsed_secs: f64, first_episodes: u64) -> String {
     let pace = episodes.saturating_sub(first_episodes) as f64 / elapsed_secs;
     let left = total_episodes.saturating_sub(episodes) as f64;
     if pace > 0.0 && left > 0.0 {
-        let _ = write!(text, ", some {} left", Clock(left / pace));
+        let _ = write!(text, ", about {} left", Clock(left / pace));
     }
     text
 }
 
-/// A line for each run, under the bar.
-fn lines(under_way: &[Standing]) -> String {
+/// Returns a line per run, for display below the bar.
+fn lines(under_way: &[RunProgress]) -> String {
     let width = under_way
         .iter()
         .map(|run| run.name.chars().count())
         .max()
         .unwrap_or(0);
-    let line = |run: &Standing| format!("\n  {:width$}  {}", run.name, run.figures());
+    let line = |run: &RunProgress| format!("\n  {:width$}  {}", run.name, run.figures());
     under_way.iter().map(line).collect()
 }
 
-impl Standing {
+impl RunProgress {
     fn brief(&self) -> String {
         format!("{} {}", self.name, self.figures())
     }
 
     fn figures(&self) -> String {
-        if self.stage == Stage::Suite {
+        if self.stage == RunStage::Suite {
             return "flying the suite".to_owned();
         }
         let mut text = match self.episodes >= self.total_episodes {
@@ -167,45 +168,46 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_left_follows_from_the_episodes_of_this_session() {
-        let progress = Progress {
+    fn remaining_time_follows_from_the_episodes_of_this_session() {
+        let progress = ExperimentProgress {
             complete: 3,
             runs: 12,
             episodes: 600,
             total_episodes: 1100,
             under_way: vec![
-                Standing {
+                RunProgress {
                     name: "none/seed-2".to_owned(),
-                    stage: Stage::Training,
+                    stage: RunStage::Training,
                     episodes: 50,
                     total_episodes: 100,
                     walls_passed: Some(1.234),
                 },
-                Standing {
+                RunProgress {
                     name: "half/seed-10".to_owned(),
-                    stage: Stage::Training,
+                    stage: RunStage::Training,
                     episodes: 100,
                     total_episodes: 100,
                     walls_passed: None,
                 },
-                Standing {
+                RunProgress {
                     name: "half/seed-9".to_owned(),
-                    stage: Stage::Suite,
+                    stage: RunStage::Suite,
                     episodes: 100,
                     total_episodes: 100,
                     walls_passed: Some(4.5),
                 },
             ],
         };
-        // 300 episodes were there before; the other 300 took 60 s.
+        // 300 episodes existed before; the other 300 took 60 s.
         assert_eq!(
             head(&progress, 60.0, 300),
-            "3 of 12 runs complete · 1:00, some 1:40 left"
+            "3 of 12 runs complete · 1:00, about 1:40 left"
         );
         assert_eq!(head(&progress, 60.0, 600), "3 of 12 runs complete · 1:00");
         assert_eq!(
             lines(&progress.under_way),
-            "\n  none/seed-2   episode 50/100, walls passed 1.23\n  half/seed-10  evaluating\n  half/seed-9   flying the suite"
+            "\n  none/seed-2   episode 50/100, walls passed 1.23\n  half/seed-10  evaluating\n  \
+             half/seed-9   flying the suite"
         );
     }
 }

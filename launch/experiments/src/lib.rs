@@ -1,12 +1,13 @@
-//! Experiments: a question, the runs that answer it, and what they came to, with its uncertainty.
+//! Experiments: a question, the runs that answer it, and a report of the results with their
+//! uncertainty.
 //!
-//! An experiment is a file ([`definition`]): a base configuration and *arms*, settings that differ
-//! from it. Each arm is trained with several seeds ([`plan`]), every one an ordinary run of `skein
-//! run`, side by side, and may then fly an evaluation suite ([`runner`]); what another experiment
-//! has trained already is taken over ([`sharing`]). What the runs left is read ([`results`]),
-//! summed up over the seeds ([`statistics`]) and told ([`report`]). Nothing but the runs'
-//! directories is kept from one call to the next, so that an experiment can be interrupted, gone on
-//! with and reported again at any time.
+//! An experiment is a file ([`definition`]): a base configuration and *arms*, which are settings
+//! that differ from it. Each arm is trained with several seeds ([`plan`]). Every seed is an
+//! ordinary run of `skein run`; runs share the machine, and may then fly an evaluation suite
+//! ([`runner`]). Runs that another experiment has already trained are copied ([`sharing`]). The
+//! runs' files are read ([`results`]), summarised over the seeds ([`statistics`]) and reported
+//! ([`report`]). Only the runs' directories are kept between calls, so an experiment can be
+//! interrupted, resumed and reported at any time.
 
 pub mod board;
 pub mod definition;

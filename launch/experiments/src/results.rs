@@ -1,4 +1,4 @@
-//! What the runs of an experiment came to, read from their directories.
+//! Results of an experiment's runs, read from their directories.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,23 +9,23 @@ use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::summary::Summary;
 
 use super::definition::{Axis, Measure};
-use super::plan::{Plan, PlannedRun, State};
+use super::plan::{ExperimentPlan, PlannedRun, RunState};
 use super::statistics::{dispersion_across_time, drawdowns, level, volatility};
 use skein_reports::ReportError;
 use skein_reports::curves::{EpisodeRow, read_episodes, trailing_mean};
 
-/// A run that is complete.
+/// A complete run.
 #[derive(Debug)]
 pub struct RunResult {
-    /// Its arm's place in the experiment.
+    /// Index of its arm in the experiment.
     pub arm: usize,
     /// Its seed.
     pub seed: u64,
-    /// Its counts.
+    /// Its counts and times.
     pub summary: Summary,
-    /// How its best snapshot flew.
+    /// Evaluation of its best snapshot.
     pub evaluation: EvaluationReport,
-    /// How it flew the experiment's suite, if it has one and this was flown.
+    /// Evaluation of its best snapshot in the experiment's suite, if there is one and it was flown.
     pub suite: Option<EvaluationReport>,
     /// Its training episodes, in order.
     pub(super) episodes: Vec<EpisodeRow>,
@@ -33,44 +33,44 @@ pub struct RunResult {
     warmup_steps: u64,
 }
 
-/// Why a complete run cannot be reported.
+/// Reason why a complete run cannot be reported.
 #[derive(Debug, thiserror::Error)]
 pub enum ResultError {
-    /// A file is not there, or not what it should be.
-    #[error("{}: {problem}; to have the run done again, move its directory away", path.display())]
+    /// A file is missing or invalid.
+    #[error("{}: {problem}; to train the run again, move its directory away", path.display())]
     File {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Problem of the file.
         problem: String,
     },
-    /// The result of the suite is not there, or not what it should be.
-    #[error("{}: {problem}; to have the suite flown again, move this file away", path.display())]
+    /// The result of the suite is missing or invalid.
+    #[error("{}: {problem}; to fly the suite again, move this file away", path.display())]
     Suite {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Problem of the file.
         problem: String,
     },
-    /// Its episodes cannot be read.
+    /// The file of its episodes cannot be read.
     #[error(transparent)]
     Episodes(#[from] ReportError),
 }
 
-/// The runs of `plan` that are complete, in its order.
+/// Reads the complete runs of `plan`, in its order.
 ///
 /// # Errors
 /// [`ResultError`] names the file.
-pub fn read(plan: &Plan) -> Result<Vec<RunResult>, ResultError> {
+pub fn read(plan: &ExperimentPlan) -> Result<Vec<RunResult>, ResultError> {
     plan.runs
         .iter()
-        .filter(|run| run.state == State::Complete)
+        .filter(|run| run.state == RunState::Complete)
         .map(|run| RunResult::trained(run)?.with_suite(run))
         .collect()
 }
 
 impl RunResult {
-    /// What its training came to.
+    /// Reads the results of its training.
     pub(super) fn trained(run: &PlannedRun) -> Result<Self, ResultError> {
         let Config {
             evaluation,
@@ -89,7 +89,7 @@ impl RunResult {
         })
     }
 
-    /// The same with what came of the experiment's suite, if it has one.
+    /// Adds the result of the experiment's suite, if there is one.
     fn with_suite(mut self, run: &PlannedRun) -> Result<Self, ResultError> {
         if let Some(path) = &run.suite_json {
             self.suite = Some(of_suite(path)?);
@@ -97,20 +97,21 @@ impl RunResult {
         Ok(self)
     }
 
-    /// Walls passed an episode over the last window of training episodes; `None` if there were
-    /// none.
+    /// Returns the walls passed per episode over the last window of training episodes; `None` if
+    /// there were none.
     pub fn final_walls_passed(&self) -> Option<f64> {
         trailing_mean(&self.values(Measure::WallsPassed), self.window).pop()
     }
 
-    /// Return of an episode over the last window of training episodes; `None` if there were none.
+    /// Returns the mean return over the last window of training episodes; `None` if there were
+    /// none.
     pub fn final_return(&self) -> Option<f64> {
         trailing_mean(&self.values(Measure::Return), self.window).pop()
     }
 
-    /// Training episodes until the average over a window of them first came to one wall passed;
-    /// `None` if it never did. The rise itself: whether the agent is trained is looked at in
-    /// confirmations alone, which are far apart.
+    /// Returns the number of training episodes until the average over a window first reached one
+    /// wall passed; `None` if it never did. This dates the rise itself. Confirmations, which decide
+    /// when the agent is trained, are far apart.
     pub fn one_wall_after(&self) -> Option<f64> {
         let mut curve = self.curve(Measure::WallsPassed, Axis::Episodes).into_iter();
         curve
@@ -118,30 +119,30 @@ impl RunResult {
             .map(|(episodes, _)| episodes)
     }
 
-    /// Walls passed an episode that training came to; see [`level`].
+    /// Returns the level of walls passed per episode that training reached; see [`level`].
     pub fn level(&self) -> Option<f64> {
         level(&self.values(Measure::WallsPassed), self.window)
     }
 
-    /// How restless its walls passed were once they had risen; see [`volatility`].
+    /// Returns the volatility of its walls passed after their rise; see [`volatility`].
     pub fn volatility(&self) -> Option<f64> {
         volatility(&self.values(Measure::WallsPassed), self.window)
     }
 
-    /// How restless its walls passed usually were; see [`dispersion_across_time`].
+    /// Returns the dispersion across time of its walls passed; see [`dispersion_across_time`].
     pub fn dispersion_across_time(&self) -> Option<f64> {
         dispersion_across_time(&self.values(Measure::WallsPassed), self.window)
     }
 
-    /// How far the walls passed over a window of training episodes ever fell below the most they
-    /// had been; `None` if there was no whole window.
+    /// Returns the largest drop of the window average of walls passed below its previous maximum;
+    /// `None` without a whole window.
     pub fn largest_drawdown(&self) -> Option<f64> {
         let fallen = self.curve(Measure::Drawdown, Axis::Episodes).into_iter();
         fallen.map(|(_, below)| below).max_by(f64::total_cmp)
     }
 
-    /// The average of `measure` over each whole window of training episodes, at the episodes, steps
-    /// or updates that were behind it then.
+    /// Returns the average of `measure` over each whole window of training episodes, against the
+    /// number of episodes, steps or updates completed at its end.
     pub fn curve(&self, measure: Measure, over: Axis) -> Vec<(f64, f64)> {
         let partial = self.window.saturating_sub(1);
         let means = trailing_mean(&self.values(measure), self.window);
@@ -167,8 +168,8 @@ impl RunResult {
             .collect()
     }
 
-    /// What was behind the run after each of its episodes. Updates follow from steps: each step
-    /// after the warm-up brings the same number of them.
+    /// Returns the number of episodes, steps or updates completed after each episode. Updates
+    /// follow from steps: each step after the warm-up has the same number of updates.
     fn places(&self, over: Axis) -> Vec<f64> {
         let mut steps = 0;
         let learned_steps = self.summary.steps.saturating_sub(self.warmup_steps).max(1);
@@ -197,7 +198,7 @@ fn of_training<T: DeserializeOwned>(path: &Path) -> Result<T, ResultError> {
     })
 }
 
-/// How a suite was flown.
+/// Reads the evaluation of a suite.
 pub(super) fn of_suite(path: &Path) -> Result<EvaluationReport, ResultError> {
     json(path).map_err(|problem| ResultError::Suite {
         path: path.to_owned(),

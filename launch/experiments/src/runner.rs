@@ -1,10 +1,10 @@
-//! Runs side by side: as many at a time as there are cores for, each by a `skein run` of its own,
-//! exactly as a user would start it. Once one is trained, its best snapshot flies the experiment's
-//! suite, by a `skein-evaluate` of its own.
+//! Carries out the runs of an experiment: as many at a time as there are cores, each as a separate
+//! `skein run`, exactly as a user would start it. Once a run is trained, its best snapshot flies
+//! the experiment's suite in a separate `skein-evaluate`.
 //!
-//! A run that fails is told and the others go on. An interruption is passed on to every run under
-//! way, which stops in order and can be gone on with; no other is begun then. A suite that was not
-//! flown to its end is flown from its beginning the next time.
+//! A run that fails is reported, and the others continue. An interruption is forwarded to every
+//! active run, which stops in order and can be resumed; no further run starts. An incomplete suite
+//! is flown again from its beginning the next time.
 
 use std::collections::VecDeque;
 use std::fs::{self, OpenOptions};
@@ -21,78 +21,79 @@ use tokio::process::{Child, Command};
 use tokio::sync::mpsc;
 use tokio::time::sleep;
 
-use super::board::{Board, Progress, Stage, Standing};
+use super::board::{ExperimentDisplay, ExperimentProgress, RunProgress, RunStage};
 use super::definition::{Experiment, FlownSuite};
-use super::plan::{ACTORS, Plan, PlannedRun, State};
+use super::plan::{ACTORS, ExperimentPlan, PlannedRun, RunState};
 use crate::results::{RunResult, of_suite};
 use skein_reports::Clock;
 use skein_reports::curves::{EpisodeRow, trailing_mean};
 use skein_run::log_tail::log_tail;
 use skein_run::orphans::signal_when_orphaned;
 
-/// Between two looks at the runs under way.
+/// Time between two checks of the active runs.
 const LOOK: Duration = Duration::from_millis(200);
-/// Looks between two updates of the board.
+/// Number of checks between two updates of the display.
 const LOOKS_A_UPDATE: u32 = 5;
 
-/// How the runs of an experiment are carried out.
+/// Programs and parallelism for the runs of an experiment.
 #[derive(Debug, Clone, Copy)]
-pub struct Manner<'a> {
+pub struct RunnerOptions<'a> {
     /// The program `skein`.
     pub skein: &'a Path,
     /// The program `skein-evaluate`.
     pub evaluate: &'a Path,
-    /// Runs at a time.
+    /// Number of simultaneous runs.
     pub jobs: usize,
 }
 
-/// How it went.
+/// Outcome of a session.
 #[derive(Debug, Default)]
-pub struct Session {
-    /// Runs that failed, by name.
+pub struct SessionOutcome {
+    /// Names of the runs that failed.
     pub failed: Vec<String>,
-    /// Times the user asked to end it.
+    /// Number of interruptions by the user.
     pub interruptions: u32,
 }
 
-struct UnderWay<'a> {
-    /// Its place in the plan.
+struct ActiveRun<'a> {
+    /// Index in the plan.
     place: usize,
     run: &'a PlannedRun,
-    stage: Stage,
+    stage: RunStage,
     child: Child,
 }
 
-/// Carries out what is not complete of `plan`. Each message on `interrupts` is one interruption by
-/// the user: the first stops every run in order, the second at once; should a `skein run` not heed
-/// it, the third kills it.
+/// Carries out the incomplete runs of `plan`. Each message on `interrupts` is an interruption by
+/// the user: the first stops every run in order, the second immediately. If a `skein run` ignores
+/// these, the third kills it.
 pub async fn run(
     experiment: &Experiment,
-    plan: &Plan,
-    manner: Manner<'_>,
+    plan: &ExperimentPlan,
+    manner: RunnerOptions<'_>,
     interrupts: &mut mpsc::Receiver<()>,
-    board: &mut Board,
-) -> Session {
-    let mut session = Session::default();
-    // Of an earlier session that was killed before it came to it.
-    let is_trained = |run: &&PlannedRun| [State::Trained, State::Complete].contains(&run.state);
+    board: &mut ExperimentDisplay,
+) -> SessionOutcome {
+    let mut session = SessionOutcome::default();
+    // An earlier session may have been killed before it removed them.
+    let is_trained =
+        |run: &&PlannedRun| [RunState::Trained, RunState::Complete].contains(&run.state);
     for run in plan.runs.iter().filter(is_trained) {
         remove_checkpoints(run, board);
     }
     let mut waiting = waiting(plan);
-    let mut under_way: Vec<UnderWay<'_>> = Vec::new();
-    let mut tally = Tally::of(plan);
+    let mut under_way: Vec<ActiveRun<'_>> = Vec::new();
+    let mut tally = RunTally::of(plan);
     for look in 0_u32.. {
         while under_way.len() < manner.jobs
             && session.interruptions == 0
             && let Some((place, run, stage)) = waiting.pop_front()
         {
             let (what, started) = match (stage, &experiment.suite) {
-                (Stage::Suite, Some(suite)) => ("its suite", fly(suite, run, manner.evaluate)),
+                (RunStage::Suite, Some(suite)) => ("its suite", fly(suite, run, manner.evaluate)),
                 _ => ("it", train(experiment, run, manner.skein)),
             };
             match started {
-                Ok(child) => under_way.push(UnderWay {
+                Ok(child) => under_way.push(ActiveRun {
                     place,
                     run,
                     stage,
@@ -115,8 +116,8 @@ pub async fn run(
             Ok(Some(status)) => {
                 let ending = session.ended(one, status.code(), board);
                 tally.ended(one, ending);
-                if (one.stage, ending) == (Stage::Training, State::Trained) {
-                    waiting.push_front((one.place, one.run, Stage::Suite));
+                if (one.stage, ending) == (RunStage::Training, RunState::Trained) {
+                    waiting.push_front((one.place, one.run, RunStage::Suite));
                 }
                 false
             }
@@ -132,24 +133,24 @@ pub async fn run(
     session
 }
 
-/// What is to be done, in the order of `plan`. What is trained needs the suite alone.
-fn waiting(plan: &Plan) -> VecDeque<(usize, &PlannedRun, Stage)> {
+/// Returns the open work in the order of `plan`. A trained run only needs its suite.
+fn waiting(plan: &ExperimentPlan) -> VecDeque<(usize, &PlannedRun, RunStage)> {
     let stage = |run: &PlannedRun| match run.state {
-        State::Complete => None,
-        State::Trained => Some(Stage::Suite),
-        State::New | State::Begun | State::UnderWay => Some(Stage::Training),
+        RunState::Complete => None,
+        RunState::Trained => Some(RunStage::Suite),
+        RunState::New | RunState::Begun | RunState::UnderWay => Some(RunStage::Training),
     };
     let runs = plan.runs.iter().enumerate();
     runs.filter_map(|(place, run)| Some((place, run, stage(run)?)))
         .collect()
 }
 
-/// Starts a run, or goes on with it.
+/// Starts or resumes a run.
 fn train(experiment: &Experiment, run: &PlannedRun, skein: &Path) -> io::Result<Child> {
     let mut command = Command::new(skein);
     command.arg("run");
     let mut log = OpenOptions::new();
-    if run.state == State::Begun {
+    if run.state == RunState::Begun {
         command.arg("--resume").arg(run.directory.root());
         log.append(true);
     } else {
@@ -162,14 +163,14 @@ fn train(experiment: &Experiment, run: &PlannedRun, skein: &Path) -> io::Result<
     spawn(command, &log, run)
 }
 
-/// Flies the suite with the best snapshot of a run. What comes of it is brought to its place when
-/// it is whole: see [`Session::flown`].
+/// Flies the suite with the best snapshot of a run. The result is moved to its final path once it
+/// is complete: see [`SessionOutcome::flown`].
 fn fly(suite: &FlownSuite, run: &PlannedRun, evaluate: &Path) -> io::Result<Child> {
-    // It is read again by the other program, and training takes hours.
+    // The other program reads the file again, possibly hours later.
     if FlownSuite::load(&suite.path, suite.each).as_ref() != Ok(suite) {
         let file = suite.path.display();
         return Err(io::Error::other(format!(
-            "{file} is not what it was when the experiment was begun: begin it again"
+            "{file} has changed since the experiment started: start the experiment again"
         )));
     }
     let result = run.directory.suite_json(&suite.result_name);
@@ -187,22 +188,23 @@ fn fly(suite: &FlownSuite, run: &PlannedRun, evaluate: &Path) -> io::Result<Chil
     spawn(command, OpenOptions::new().append(true), run)
 }
 
-/// What `skein-evaluate` writes, before it is known to be whole. Another experiment may fly the
-/// same suite for the same run, to which it has a link.
+/// Returns the path of an incomplete suite result. It contains the process id because another
+/// experiment may fly the same suite for the same run, to which it has a link.
 fn unfinished(result: &Path) -> PathBuf {
     result.with_extension(format!("part-{}", process::id()))
 }
 
-/// Starts a program for a run. Whatever it says goes to the file beside the run's directory.
+/// Starts a program for a run. Its output goes to the log beside the run's directory.
 ///
-/// It leads a process group of its own: Ctrl-C in the terminal reaches this process alone, which
-/// passes it on once. Should this process die, the kernel interrupts it, and it stops in order.
-fn spawn(mut command: Command, log: &OpenOptions, run: &PlannedRun) -> io::Result<Child> {
-    let said = run.said();
-    if let Some(folder) = said.parent() {
+/// It leads a process group of its own, so that Ctrl-C in the terminal reaches only this process,
+/// which forwards it once. If this process dies, the kernel interrupts the program, which then
+/// stops in order.
+fn spawn(mut command: Command, options: &OpenOptions, run: &PlannedRun) -> io::Result<Child> {
+    let path = run.log();
+    if let Some(folder) = path.parent() {
         fs::create_dir_all(folder)?;
     }
-    let log = log.clone().create(true).open(said)?;
+    let log = options.clone().create(true).open(path)?;
     command
         .stdin(Stdio::null())
         .stdout(log.try_clone()?)
@@ -212,20 +214,23 @@ fn spawn(mut command: Command, log: &OpenOptions, run: &PlannedRun) -> io::Resul
     command.spawn()
 }
 
-impl Session {
-    fn interrupt(&mut self, under_way: &[UnderWay<'_>], board: &Board) {
+impl SessionOutcome {
+    fn interrupt(&mut self, under_way: &[ActiveRun<'_>], board: &ExperimentDisplay) {
         self.interruptions += 1;
         let signal = match self.interruptions {
             1 => {
-                board.say("stopping in order: every training finishes the updates of its epoch; Ctrl-C again stops at once, without saving");
+                board.say(
+                    "stopping: every training finishes the updates of its epoch, then saves; \
+                     press Ctrl-C again to stop immediately, without saving",
+                );
                 Signal::INT
             }
             2 => Signal::INT,
             _ => Signal::KILL,
         };
         for one in under_way {
-            // A child that is not reaped keeps its number, so the signal cannot reach a stranger;
-            // and that it has just ended is no error.
+            // A child that is not reaped keeps its process id, so the signal cannot reach another
+            // process. A child that has just ended is not an error.
             if let Some(pid) = one
                 .child
                 .id()
@@ -236,17 +241,22 @@ impl Session {
         }
     }
 
-    /// What is there of a run after one of its programs ended.
-    fn ended(&mut self, one: &UnderWay<'_>, code: Option<i32>, board: &Board) -> State {
-        let UnderWay { run, stage, .. } = *one;
-        // `skein-evaluate` has nothing to put in order: the first interruption ends it.
+    /// Returns the state of a run after one of its programs ended.
+    fn ended(
+        &mut self,
+        one: &ActiveRun<'_>,
+        code: Option<i32>,
+        board: &ExperimentDisplay,
+    ) -> RunState {
+        let ActiveRun { run, stage, .. } = *one;
+        // `skein-evaluate` has nothing to save: the first interruption ends it.
         let (program, before, kills) = match stage {
-            Stage::Training => ("skein run", State::Begun, 3),
-            Stage::Suite => ("skein-evaluate", State::Trained, 1),
+            RunStage::Training => ("skein run", RunState::Begun, 3),
+            RunStage::Suite => ("skein-evaluate", RunState::Trained, 1),
         };
         let how = match (code, stage) {
-            (Some(0), Stage::Training) => return self.trained(run, board),
-            (Some(0), Stage::Suite) => return self.flown(run, board),
+            (Some(0), RunStage::Training) => return self.trained(run, board),
+            (Some(0), RunStage::Suite) => return self.flown(run, board),
             (Some(code), _) if code == i32::from(EXIT_INTERRUPTED) && self.interruptions > 0 => {
                 return before;
             }
@@ -254,21 +264,21 @@ impl Session {
             (Some(code), _) => format!("its `{program}` exited with status {code}"),
             (None, _) => format!("its `{program}` was killed"),
         };
-        let said = run.said();
+        let log = run.log();
         self.fail(
             run,
-            &format!("{how}; {} ends with\n{}", said.display(), log_tail(&said)),
+            &format!("{how}; {} ends with\n{}", log.display(), log_tail(&log)),
             board,
         );
         before
     }
 
-    fn trained(&mut self, run: &PlannedRun, board: &Board) -> State {
+    fn trained(&mut self, run: &PlannedRun, board: &ExperimentDisplay) -> RunState {
         let result = match RunResult::trained(run) {
             Ok(result) => result,
             Err(error) => {
                 self.fail(run, &error.to_string(), board);
-                return State::Begun;
+                return RunState::Begun;
             }
         };
         let flown = result.evaluation.courses.first();
@@ -277,18 +287,18 @@ impl Session {
         });
         let wall = Clock(result.summary.wall_secs);
         let (what, state) = match &run.suite_json {
-            None => ("complete", State::Complete),
-            Some(_) => ("trained", State::Trained),
+            None => ("complete", RunState::Complete),
+            Some(_) => ("trained", RunState::Trained),
         };
         board.say(&format!("{} is {what} after {wall}{flown}", run.name));
         remove_checkpoints(run, board);
         state
     }
 
-    /// Brings the result of a suite to its place: a file that is there is whole.
-    fn flown(&mut self, run: &PlannedRun, board: &Board) -> State {
+    /// Moves the result of a suite to its final path, where every file is complete.
+    fn flown(&mut self, run: &PlannedRun, board: &ExperimentDisplay) -> RunState {
         let Some(result) = &run.suite_json else {
-            return State::Complete;
+            return RunState::Complete;
         };
         let unfinished = unfinished(result);
         let report = of_suite(&unfinished).map_err(|error| error.to_string());
@@ -310,55 +320,59 @@ impl Session {
                     run.name,
                     rates.join(", ")
                 ));
-                State::Complete
+                RunState::Complete
             }
             Err(problem) => {
                 self.fail(run, &problem, board);
-                State::Trained
+                RunState::Trained
             }
         }
     }
 
-    fn fail(&mut self, run: &PlannedRun, why: &str, board: &Board) {
+    fn fail(&mut self, run: &PlannedRun, why: &str, board: &ExperimentDisplay) {
         board.say(&format!("{} failed: {why}", run.name));
         self.failed.push(run.name.clone());
     }
 }
 
-/// What there is of every run.
-struct Tally {
+/// RunState of all runs.
+struct RunTally {
     complete: usize,
-    /// Training episodes learned from, by the place of the run in the plan.
+    /// Number of training episodes learned from, by the run's index in the plan.
     episodes: Vec<u64>,
 }
 
-impl Tally {
-    fn of(plan: &Plan) -> Self {
+impl RunTally {
+    fn of(plan: &ExperimentPlan) -> Self {
         let episodes = |run: &PlannedRun| match run.state {
-            State::Trained | State::Complete => run.config.run.episodes,
-            State::New => 0,
-            State::Begun | State::UnderWay => flown(&run.directory).len() as u64,
+            RunState::Trained | RunState::Complete => run.config.run.episodes,
+            RunState::New => 0,
+            RunState::Begun | RunState::UnderWay => flown(&run.directory).len() as u64,
         };
         Self {
-            complete: plan.count(State::Complete),
+            complete: plan.count(RunState::Complete),
             episodes: plan.runs.iter().map(episodes).collect(),
         }
     }
 
-    fn ended(&mut self, one: &UnderWay<'_>, state: State) {
+    fn ended(&mut self, one: &ActiveRun<'_>, state: RunState) {
         self.episodes[one.place] = flown(&one.run.directory).len() as u64;
-        self.complete += usize::from(state == State::Complete);
+        self.complete += usize::from(state == RunState::Complete);
     }
 
-    fn progress(&mut self, plan: &Plan, under_way: &[UnderWay<'_>]) -> Progress {
+    fn progress(
+        &mut self,
+        plan: &ExperimentPlan,
+        under_way: &[ActiveRun<'_>],
+    ) -> ExperimentProgress {
         let mut standings = Vec::with_capacity(under_way.len());
-        for &UnderWay {
+        for &ActiveRun {
             place, run, stage, ..
         } in under_way
         {
             let walls = flown(&run.directory);
             self.episodes[place] = walls.len() as u64;
-            standings.push(Standing {
+            standings.push(RunProgress {
                 name: run.name.clone(),
                 stage,
                 episodes: walls.len() as u64,
@@ -367,7 +381,7 @@ impl Tally {
                     .pop(),
             });
         }
-        Progress {
+        ExperimentProgress {
             complete: self.complete,
             runs: plan.runs.len(),
             episodes: self.episodes.iter().sum(),
@@ -377,8 +391,8 @@ impl Tally {
     }
 }
 
-/// Walls passed in each episode that a run has learned from so far. A row that is being written is
-/// left out.
+/// Returns the walls passed in each episode learned from so far. A row that is still being written
+/// is left out.
 fn flown(run: &RunDirectory) -> Vec<f64> {
     let text = fs::read_to_string(run.episodes_csv()).unwrap_or_default();
     let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
@@ -389,9 +403,9 @@ fn flown(run: &RunDirectory) -> Vec<f64> {
         .collect()
 }
 
-/// Nothing goes on from a run that is trained, and its checkpoints are most of what it takes of the
-/// disk.
-fn remove_checkpoints(run: &PlannedRun, board: &Board) {
+/// Removes the checkpoints of a trained run, which is never resumed. They take most of its disk
+/// space.
+fn remove_checkpoints(run: &PlannedRun, board: &ExperimentDisplay) {
     let checkpoints = run.directory.checkpoints();
     match fs::remove_dir_all(&checkpoints) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {

@@ -1,5 +1,5 @@
-//! Runs that another experiment has done already. A run is a function of its configuration and
-//! seed: there is no need to train it twice.
+//! Reuses runs of other experiments. A run is a function of its configuration and seed, so there is
+//! no need to train it twice.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -7,21 +7,25 @@ use std::path::{Path, PathBuf};
 
 use skein_run::RunDirectory;
 
-use super::plan::{Plan, PlanError, PlannedRun, State, io_at};
+use super::plan::{ExperimentPlan, PlanError, PlannedRun, RunState, io_at};
 use super::results::RunResult;
 
-impl Plan {
-    /// Makes every run of which there is nothing a link to the same one in another experiment
-    /// beside this one, where that is trained to its end. Returns the names of those it found, and
-    /// where.
+impl ExperimentPlan {
+    /// Replaces every run that does not exist by a link to the same run of another experiment in
+    /// the same folder, if it is fully trained there. Returns the names of these runs, and the
+    /// linked directories.
     ///
     /// # Errors
-    /// [`PlanError::Io`] when a link cannot be made, [`PlanError::Runs`] when what it leads to is
-    /// no longer what it was.
-    pub fn take_over(&mut self) -> Result<Vec<(String, PathBuf)>, PlanError> {
+    /// [`PlanError::Io`] if a link cannot be created, [`PlanError::Runs`] if the linked run has
+    /// changed meanwhile.
+    pub fn link_trained_runs(&mut self) -> Result<Vec<(String, PathBuf)>, PlanError> {
         let others: Vec<PathBuf> = arms_beside(&self.root);
         let mut found = Vec::new();
-        for run in self.runs.iter_mut().filter(|run| run.state == State::New) {
+        for run in self
+            .runs
+            .iter_mut()
+            .filter(|run| run.state == RunState::New)
+        {
             let Some(other) = others.iter().find_map(|arm| run.trained_in(arm)) else {
                 continue;
             };
@@ -36,7 +40,7 @@ impl Plan {
     }
 }
 
-/// The arms of all experiments beside the one in `root`, in an order that is always the same.
+/// Returns the arms of all other experiments beside the one in `root`, in a fixed order.
 fn arms_beside(root: &Path) -> Vec<PathBuf> {
     let folders = |path: &Path| -> Vec<PathBuf> {
         let entries = fs::read_dir(path).into_iter().flatten().flatten();
@@ -56,8 +60,8 @@ fn arms_beside(root: &Path) -> Vec<PathBuf> {
 }
 
 impl PlannedRun {
-    /// The directory of the same run in the folder `arm` of another experiment, if it is trained to
-    /// its end. What is a link itself is found where it leads.
+    /// Returns the directory of the same run in `arm` of another experiment, if it is fully
+    /// trained. Links are resolved to their target.
     fn trained_in(&self, arm: &Path) -> Option<PathBuf> {
         let directory = arm.join(format!("seed-{}", self.seed));
         if directory.is_symlink() || !directory.is_dir() {
@@ -68,12 +72,12 @@ impl PlannedRun {
             suite_json: None,
             ..self.clone()
         };
-        // What cannot be reported is of no use here: it is trained anew.
-        (other.look() == Ok(State::Complete) && RunResult::trained(&other).is_ok())
+        // A run that cannot be reported is useless here and is trained again.
+        (other.look() == Ok(RunState::Complete) && RunResult::trained(&other).is_ok())
             .then_some(directory)
     }
 
-    /// Relative, so that all experiments can be moved together.
+    /// The link is relative, so that all experiments can be moved together.
     fn link_to(&self, other: &Path) -> Result<(), PlanError> {
         let root = self.directory.root();
         let within: Vec<_> = other.iter().collect();
@@ -82,7 +86,7 @@ impl PlannedRun {
         if let Some(folder) = root.parent() {
             fs::create_dir_all(folder).map_err(io_at(folder))?;
         }
-        // An empty folder may be left of a run that never began.
+        // A run that never began may have left an empty folder.
         if root.is_dir() {
             fs::remove_dir(root).map_err(io_at(root))?;
         }
@@ -101,7 +105,8 @@ mod tests {
         let base = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/smoke.toml");
         let arm = |name, share| {
             format!(
-                "[[arm]]\nname = \"{name}\"\nlabel = \"{name}\"\nsettings.replay.success_share = {share}\n"
+                "[[arm]]\nname = \"{name}\"\nlabel = \"{name}\"\nsettings.replay.success_share = \
+                 {share}\n"
             )
         };
         let text = format!(
@@ -113,7 +118,7 @@ mod tests {
         Experiment::load(folder, name, None).unwrap()
     }
 
-    /// Leaves what a run leaves that is trained to its end.
+    /// Creates the files of a fully trained run.
     fn train(run: &PlannedRun, experiment: &Experiment) {
         prepare(
             &experiment.base,
@@ -122,8 +127,11 @@ mod tests {
             ACTORS,
         )
         .unwrap();
-        let summary = r#"{"skein_version":"0","run":7,"seed":2,"ending":"completed","policy_sha256":"","final_version":8,"best_version":7,
-            "best_confirmed_walls_passed":4.9,"episodes":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_episodes":4,
+        let summary = r#"{"skein_version":"0","run":7,"seed":2,"ending":"completed",
+        "policy_sha256":"",
+        "final_version":8,"best_version":7,
+            "best_confirmed_walls_passed":4.9,"episodes":8,"steps":4,"updates":2,
+        "vae_updates":4,"evaluation_episodes":4,
             "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
         fs::write(run.directory.summary_json(), summary).unwrap();
         let evaluation = r#"{"policy_version":7,"policy_sha256":"","courses":[]}"#;
@@ -135,8 +143,8 @@ mod tests {
         .unwrap();
     }
 
-    fn taken_over(plan: &mut Plan) -> Vec<String> {
-        plan.take_over()
+    fn taken_over(plan: &mut ExperimentPlan) -> Vec<String> {
+        plan.link_trained_runs()
             .unwrap()
             .into_iter()
             .map(|(name, _)| name)
@@ -148,7 +156,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let root = |name: &str| folder.path().join("runs").join(name);
         let first = experiment(folder.path(), "first", ["0.25", "0.5"]);
-        let plan = Plan::new(&first, &root("first"), 2).unwrap();
+        let plan = ExperimentPlan::new(&first, &root("first"), 2).unwrap();
         train(&plan.runs[0], &first);
         prepare(
             &first.base,
@@ -159,46 +167,48 @@ mod tests {
         .unwrap();
 
         let second = experiment(folder.path(), "second", ["0.125", "0.25"]);
-        let mut plan = Plan::new(&second, &root("second"), 2).unwrap();
+        let mut plan = ExperimentPlan::new(&second, &root("second"), 2).unwrap();
         assert_eq!(
             taken_over(&mut plan),
             ["b/seed-1"],
-            "seed 2 was begun and not ended"
+            "seed 2 was begun but not completed"
         );
-        assert_eq!(plan.count(State::Complete), 1);
+        assert_eq!(plan.count(RunState::Complete), 1);
         assert_eq!(
             fs::read_link(root("second/b/seed-1")).unwrap(),
             Path::new("../../first/a/seed-1")
         );
         assert_eq!(
-            Plan::new(&second, &root("second"), 2).unwrap(),
+            ExperimentPlan::new(&second, &root("second"), 2).unwrap(),
             plan,
-            "it stays"
+            "the link stays"
         );
         assert!(taken_over(&mut plan).is_empty());
 
-        // What cannot be reported is not taken over.
+        // A run that cannot be reported is not linked.
         let damaged = plan.runs[1].directory.evaluation_json();
         let whole = fs::read(&damaged).unwrap();
         fs::write(&damaged, "{").unwrap();
         let other = experiment(folder.path(), "other", ["0.25", "0.75"]);
-        assert!(taken_over(&mut Plan::new(&other, &root("other"), 1).unwrap()).is_empty());
+        assert!(
+            taken_over(&mut ExperimentPlan::new(&other, &root("other"), 1).unwrap()).is_empty()
+        );
         fs::write(&damaged, whole).unwrap();
 
-        // A third leads to where the run is, not to the link.
+        // A link to a link points to the run itself.
         let third = experiment(folder.path(), "third", ["0.25", "0.75"]);
-        let mut plan = Plan::new(&third, &root("third"), 1).unwrap();
+        let mut plan = ExperimentPlan::new(&third, &root("third"), 1).unwrap();
         assert_eq!(
-            plan.take_over().unwrap(),
+            plan.link_trained_runs().unwrap(),
             [("a/seed-1".to_owned(), root("first/a/seed-1"))]
         );
 
         fs::rename(root("first"), folder.path().join("gone")).unwrap();
-        let refusal = Plan::new(&third, &root("third"), 1)
+        let refusal = ExperimentPlan::new(&third, &root("third"), 1)
             .unwrap_err()
             .to_string();
         assert!(
-            refusal.contains("a/seed-1 is a link to a run that is gone"),
+            refusal.contains("a/seed-1 is a link to a run that no longer exists"),
             "{refusal}"
         );
     }

@@ -1,5 +1,5 @@
-//! A few numbers, one a seed, summed up honestly: interquartile mean or mean, and a bootstrap
-//! interval; and how restless a curve is.
+//! Summary statistics over seeds: interquartile mean or mean with a bootstrap interval, and
+//! fluctuation of a curve.
 //!
 //! Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice",
 //! arXiv:2108.13264, which recommends the interquartile mean and the bootstrap for few runs.
@@ -8,25 +8,26 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::seeds::{Purpose, derive};
 
-/// Resamples for a figure of a table.
+/// Number of resamples for a figure in a table.
 pub const RESAMPLES: usize = 10_000;
-/// The interval leaves out this share of the resamples at either end: 95 % remain.
+/// Share of the resamples outside the interval, at either end: 95 % remain inside.
 const TAIL: f64 = 0.025;
-/// The rise of a curve is over when it first reaches this share of the level that it comes to.
+/// A curve has risen when it first reaches this share of its final level.
 const RISEN: f64 = 0.9;
 
-/// A statement about all seeds from a few of them.
+/// Estimate for all seeds from a few of them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
     /// Interquartile mean or mean.
     pub value: f64,
-    /// 95 % bootstrap interval; `None` of a single value, which says nothing about others.
+    /// 95 % bootstrap interval; `None` for a single value, which is no evidence about other seeds.
     pub interval: Option<(f64, f64)>,
 }
 
-/// Mean of the middle half of `values`: a quarter of their weight is left out at either end, and a
-/// value on the border counts with the part that lies inside. Of three values, the middle one
-/// counts four times as much as each other. `None` of none.
+/// Returns the mean of the middle half of `values`; `None` for no values.
+///
+/// A quarter of the total weight is left out at either end. A value on the border counts with the
+/// part inside it: of three values, the middle one weighs four times as much as each of the others.
 pub fn interquartile_mean(values: &[f64]) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -46,22 +47,22 @@ fn mean_of_middle_half(sorted: &[f64]) -> Option<f64> {
     (!sorted.is_empty()).then(|| sum / (to - from))
 }
 
-/// `None` of none.
+/// Returns the mean; `None` for no values.
 fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// Resamples of so many seeds, drawn once: all measures of an experiment are resampled alike, and a
-/// report drawn again is the same.
+/// Resamples of a number of seeds, drawn once. All measures of an experiment use the same
+/// resamples, and a repeated report is identical.
 #[derive(Debug)]
 pub struct Bootstrap {
     seeds: usize,
-    /// For each resample, which seeds are in it.
+    /// Indices of the seeds in each resample.
     resamples: Vec<Vec<usize>>,
 }
 
 impl Bootstrap {
-    /// `resamples` samples of `seeds` values each, drawn with replacement.
+    /// Draws `resamples` samples of `seeds` indices each, with replacement.
     pub fn new(seeds: usize, resamples: usize) -> Self {
         let mut rng =
             Pcg64Mcg::seed_from_u64(derive(seeds as u64, Purpose::Bootstrap, resamples as u64));
@@ -76,11 +77,11 @@ impl Bootstrap {
         }
     }
 
-    /// Interquartile mean of `values`, one a seed, with the interval between the 2.5th and the
-    /// 97.5th percentile of the resamples' interquartile means. `None` of no values.
+    /// Returns the interquartile mean of `values`, one per seed. The interval reaches from the
+    /// 2.5th to the 97.5th percentile of the resamples' interquartile means. `None` for no values.
     ///
     /// # Panics
-    /// When there are not as many values as seeds.
+    /// Panics unless there is one value per seed.
     pub fn interquartile_mean(&self, values: &[f64]) -> Option<Estimate> {
         self.estimate(values, |drawn| {
             drawn.sort_by(f64::total_cmp);
@@ -88,10 +89,10 @@ impl Bootstrap {
         })
     }
 
-    /// The same of the mean, in which the worst seed counts as much as any.
+    /// Returns the same for the mean, in which the worst seed counts fully.
     ///
     /// # Panics
-    /// When there are not as many values as seeds.
+    /// Panics unless there is one value per seed.
     pub fn mean(&self, values: &[f64]) -> Option<Estimate> {
         self.estimate(values, |drawn| mean(drawn))
     }
@@ -121,7 +122,7 @@ impl Bootstrap {
     }
 }
 
-/// The `share` quantile of values in ascending order, linear between two of them.
+/// Returns the `share` quantile of values in ascending order, interpolated linearly.
 fn quantile(sorted: &[f64], share: f64) -> f64 {
     let place = share * (sorted.len() - 1) as f64;
     let (below, part) = (place.floor() as usize, place.fract());
@@ -129,15 +130,15 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
     sorted[below] + part * (sorted[above] - sorted[below])
 }
 
-/// How restless a curve is once it has risen: the root mean square of the differences between the
-/// averages over successive windows of `window` values that do not overlap. What is left of a slow
-/// trend in it is small, as differences of neighbours hardly see one.
+/// Returns the volatility of a curve after its rise: the root mean square of the differences
+/// between averages over successive windows of `window` values that do not overlap. A slow trend
+/// contributes little, because neighbouring windows hardly differ by it.
 ///
-/// The curve has risen when a window first averages 0.9 of the [`level`] that it comes to.
-/// `None` when fewer than three windows follow.
+/// The curve has risen when a window first averages 0.9 of its [`level`]. `None` if fewer than
+/// three windows follow.
 ///
-/// Where start levels are flown in turn, a window should be whole turns of them (50 episodes of 5
-/// levels, 10 each): otherwise the turns themselves show.
+/// If start levels are flown in turn, a window should contain whole turns (50 episodes of 5 levels,
+/// 10 each); otherwise the turns themselves appear as fluctuation.
 pub fn volatility(values: &[f64], window: usize) -> Option<f64> {
     let differences = differences_once_risen(values, window)?;
     let squares: f64 = differences
@@ -147,9 +148,9 @@ pub fn volatility(values: &[f64], window: usize) -> Option<f64> {
     Some((squares / differences.len() as f64).sqrt())
 }
 
-/// Dispersion across time: the interquartile range of the differences that [`volatility`] is of. A
-/// few large swings, which make most of a volatility, do not show in it: it tells how restless a
-/// curve usually is.
+/// Returns the dispersion across time: the interquartile range of the differences used by
+/// [`volatility`]. A few large swings dominate a volatility but do not affect this measure, which
+/// shows the usual fluctuation of a curve.
 ///
 /// Source: Chan et al., "Measuring the Reliability of Reinforcement Learning Algorithms",
 /// arXiv:1912.05663, with one window for all that follows the rise.
@@ -159,14 +160,14 @@ pub fn dispersion_across_time(values: &[f64], window: usize) -> Option<f64> {
     Some(quantile(&differences, 0.75) - quantile(&differences, 0.25))
 }
 
-/// The level that a curve comes to: the median of the averages over successive windows in its
-/// second half. `None` when there is no whole window.
+/// Returns the final level of a curve: the median of the averages over successive windows in its
+/// second half. `None` without a whole window.
 pub fn level(values: &[f64], window: usize) -> Option<f64> {
     level_of(&window_averages(values, window))
 }
 
-/// Differences between the averages over successive windows, from the one on that has risen; at
-/// least two.
+/// Returns the differences between averages over successive windows, from the first that has risen;
+/// at least two.
 fn differences_once_risen(values: &[f64], window: usize) -> Option<Vec<f64>> {
     let averages = window_averages(values, window);
     let level = level_of(&averages)?;
@@ -190,10 +191,10 @@ fn level_of(averages: &[f64]) -> Option<f64> {
     (!second_half.is_empty()).then(|| quantile(&second_half, 0.5))
 }
 
-/// How far each point of a curve lies below the highest before it: what was learned and is lost
-/// again.
+/// Returns the depth of each point of a curve below the previous maximum: learned performance that
+/// was lost again.
 ///
-/// Source: as [`dispersion_across_time`], where the worst of it is the long-term risk across time.
+/// Source: as [`dispersion_across_time`]; the maximum is its long-term risk across time.
 pub fn drawdowns(curve: &[f64]) -> Vec<f64> {
     let mut highest = f64::NEG_INFINITY;
     let below = |value: &f64| {
@@ -215,20 +216,20 @@ mod tests {
 
     #[test]
     fn the_level_of_an_even_number_of_windows_lies_between_the_middle_two() {
-        // Risen at 0.9 of 10, with the second value; of 11 it would be with the last but one, and
+        // Risen at 0.9 of 10, with the second value. At 0.9 of 11 it would be the last but one, and
         // too few would follow.
         assert!(volatility(&[0.0, 9.2, 9.2, 9.2, 9.0, 9.0, 11.0, 11.0], 1).is_some());
     }
 
     #[test]
-    fn the_interquartile_mean_is_that_of_the_textbook() {
+    fn the_interquartile_mean_matches_the_textbook() {
         let of = |values: &[f64]| interquartile_mean(values).unwrap();
-        // Twelve values: the middle six, 5 to 8.
+        // Twelve values: the middle six are 5 to 8.
         assert_eq!(
             of(&[5.0, 8.0, 4.0, 38.0, 8.0, 6.0, 9.0, 7.0, 7.0, 3.0, 1.0, 6.0]),
             6.5
         );
-        // Nine: the middle three, and three quarters of their neighbours.
+        // Nine values: the middle three, and three quarters of their neighbours.
         assert_eq!(of(&[1.0, 3.0, 5.0, 7.0, 9.0, 11.0, 13.0, 15.0, 17.0]), 9.0);
         assert_eq!(of(&[0.0, 1.0, 5.0]), (0.25 * 0.0 + 1.0 + 0.25 * 5.0) / 1.5);
         assert_eq!(
@@ -240,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interval_holds_its_mean_and_is_the_same_each_time() {
+    fn an_interval_contains_its_mean_and_is_reproducible() {
         let values = [0.91, 0.97, 0.88, 0.99, 0.95];
         let estimate = Bootstrap::new(5, RESAMPLES)
             .interquartile_mean(&values)
@@ -258,8 +259,8 @@ mod tests {
         );
     }
 
-    /// Of two values a and b, a resample is (a, a), (a, b), (b, a) or (b, b): with a quarter of the
-    /// resamples at each end, the interval is [a, b].
+    /// For two values a and b, a resample is (a, a), (a, b), (b, a) or (b, b). A quarter of the
+    /// resamples lies at each end, so the interval is [a, b].
     #[test]
     fn the_interval_of_two_values_reaches_from_one_to_the_other() {
         let estimate = Bootstrap::new(2, 1000)
@@ -274,8 +275,8 @@ mod tests {
         );
     }
 
-    /// Values that are equally likely anywhere in [0, 1]: the influence of x on their interquartile
-    /// mean is 2 (x - 1/2) with x bounded to [1/4, 3/4], whose variance is 1/6.
+    /// For values spread evenly over [0, 1], the influence of x on their interquartile mean is 2 (x
+    /// - 1/2) with x bounded to [1/4, 3/4]; its variance is 1/6.
     #[test]
     fn the_interval_of_many_values_is_the_asymptotic_one() {
         let n = 400;
@@ -295,8 +296,8 @@ mod tests {
         );
     }
 
-    /// The mean's standard error is that of the textbook, and the worst value, which an
-    /// interquartile mean of five sets aside, is in it.
+    /// The mean's standard error matches the textbook, and the worst value, which an interquartile
+    /// mean of five leaves out, is included.
     #[test]
     fn the_mean_counts_every_value() {
         let five = Bootstrap::new(5, RESAMPLES);
@@ -325,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn one_value_has_no_interval_and_none_no_mean() {
+    fn one_value_has_no_interval_and_no_values_have_no_mean() {
         let one = Bootstrap::new(1, RESAMPLES).interquartile_mean(&[2.5]);
         assert_eq!(
             one,
@@ -347,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn volatility_looks_behind_the_rise_alone() {
+    fn volatility_only_counts_what_follows_the_rise() {
         let of = |averages: &[f64]| {
             let values: Vec<f64> = averages
                 .iter()
@@ -355,21 +356,21 @@ mod tests {
                 .collect();
             volatility(&values, 2)
         };
-        // A steady curve has none, however it rose, and noise within a window is none.
+        // A steady curve has none, however it rose, and noise within a window does not count.
         assert_eq!(of(&[0.0, 0.5, 1.0, 2.0, 2.0, 2.0, 2.0, 2.0]), Some(0.0));
-        // Up and down by 0.2 after the rise; the drop counts, the rise does not.
+        // Up and down by 0.2 after the rise. The drop counts; the rise does not.
         let swinging = of(&[0.0, 0.1, 2.0, 1.8, 2.0, 1.8, 2.0, 1.8]).unwrap();
         assert!((swinging - 0.2).abs() < 1e-9, "{swinging}");
         let fallen = of(&[0.0, 2.0, 2.0, 2.0, 0.0, 2.0, 2.0, 2.0]).unwrap();
         assert!((fallen - (8.0_f64 / 6.0).sqrt()).abs() < 1e-9, "{fallen}");
-        // Too few windows to say anything.
+        // Too few windows for a result.
         assert_eq!(of(&[1.0, 1.0]), None);
         assert_eq!(of(&[]), None);
     }
 
     #[test]
-    fn dispersion_is_the_usual_swing_and_volatility_sees_the_rare_one() {
-        // Risen at once; differences are -0.1, 0.1 in turn.
+    fn dispersion_shows_the_usual_swing_and_volatility_the_rare_one() {
+        // Risen immediately; differences alternate between -0.1 and 0.1.
         let steady = [2.0, 1.9, 2.0, 1.9, 2.0, 1.9, 2.0, 1.9, 2.0];
         let of = |values: &[f64]| {
             (
@@ -383,14 +384,14 @@ mod tests {
         fallen_once[7] = 0.0;
         let (same, larger) = of(&fallen_once);
         assert!((same - 0.2).abs() < 1e-9 && larger > 0.9, "{same} {larger}");
-        // A steady rise has no dispersion: only how differences differ counts.
+        // A steady rise has no dispersion: only variation of the differences counts.
         let rising: Vec<f64> = (0..20).map(|step| 10.0 + 0.1 * f64::from(step)).collect();
         assert!(of(&rising).0 < 1e-9);
         assert_eq!(dispersion_across_time(&[1.0, 1.0], 1), None);
     }
 
     #[test]
-    fn a_drawdown_is_measured_from_the_highest_point_before() {
+    fn a_drawdown_is_measured_from_the_previous_maximum() {
         assert_eq!(
             drawdowns(&[1.0, 3.0, 2.0, 2.5, 0.5, 4.0, 3.5]),
             [0.0, 0.0, 1.0, 0.5, 2.5, 0.0, 0.5]

@@ -1,5 +1,5 @@
-//! Whether a configuration can be flown: its simulator settings, its courses, and what only shows
-//! when they are seen together.
+//! Checks that a configuration can be flown: its simulator settings, its courses, and their
+//! combination.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -10,8 +10,8 @@ use skein_simulator::simulator::{Simulator, SimulatorSettings};
 
 use super::PrepareError;
 
-/// Checks everything that must hold for `actors` actors to fly for `config`, which was read from
-/// `config_file`, and returns the simulator's settings.
+/// Checks that `actors` actors can fly with `config`, which was read from `config_file`, and
+/// returns the simulator's settings.
 ///
 /// # Errors
 /// [`PrepareError`] names file, key and remedy.
@@ -80,8 +80,7 @@ pub fn check(
     Ok(settings)
 }
 
-/// Whether training can start from every level it is to start from on `course`, which the user
-/// knows as `name`.
+/// Checks that `course`, called `name` in messages, has all start levels of the training.
 fn check_level_count(
     config_file: &Path,
     config: &Config,
@@ -100,20 +99,20 @@ fn check_level_count(
     })
 }
 
-/// Adds to the `error` of a check the override that brought it about, if one did.
+/// Adds the override that caused `error`, if one did.
 pub(super) fn blame(
     error: PrepareError,
     config_file: &Path,
     overrides: &[String],
     actors: usize,
 ) -> PrepareError {
-    let told = |overrides: &[String]| {
+    let message_for = |overrides: &[String]| {
         let checked = Config::load(config_file, overrides)
             .map_err(PrepareError::from)
             .and_then(|config| check(config_file, &config, actors));
         checked.err().map(|error| error.to_string())
     };
-    match culprit(overrides, told) {
+    match culprit(overrides, message_for) {
         Some(text) => PrepareError::Overridden {
             text: text.clone(),
             source: Box::new(error),

@@ -1,5 +1,4 @@
-//! The directory of a new run: created, filled with copies, and taken back if the run does not come
-//! to incarnation.
+//! Directory of a new run: created, filled with copies, and removed if the run never starts.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -13,10 +12,10 @@ use skein_run::RunDirectory;
 
 use super::PrepareError;
 
-/// What is in a run is its user's alone.
+/// A run's directory is accessible to its owner only.
 const OWNER_ONLY: u32 = 0o700;
 
-/// A directory that was made for a run, or was there and empty.
+/// Directory of a new run, created or found empty.
 #[derive(Debug)]
 pub struct NewDirectory {
     root: PathBuf,
@@ -30,10 +29,10 @@ enum Origin {
 }
 
 impl NewDirectory {
-    /// Makes `directory` unless it is there and empty. Nobody but its owner can look into it then.
+    /// Creates `directory` unless it exists and is empty. Only its owner can access it afterwards.
     ///
     /// # Errors
-    /// [`PrepareError::NotEmpty`], or [`PrepareError::Io`] with its path.
+    /// Returns [`PrepareError::NotEmpty`], or [`PrepareError::Io`] with the path.
     pub(super) fn make(directory: &Path) -> Result<Self, PrepareError> {
         let io = |source| PrepareError::Io {
             path: directory.to_owned(),
@@ -55,15 +54,15 @@ impl NewDirectory {
         Ok(Self { root, origin })
     }
 
-    /// Its absolute path.
+    /// Returns its absolute path.
     pub(super) fn root(&self) -> &Path {
         &self.root
     }
 
-    /// Leaves everything as it was before: nothing in it is worth keeping.
+    /// Restores the previous state: nothing in the directory is worth keeping.
     ///
     /// # Errors
-    /// When something cannot be removed.
+    /// Returns an error if something cannot be removed.
     pub fn take_back(&self) -> io::Result<()> {
         if self.origin == Origin::Made {
             return fs::remove_dir_all(&self.root);
@@ -80,8 +79,8 @@ impl NewDirectory {
     }
 }
 
-/// Copies the course files into the run's directory and has the configuration name the copies: what
-/// was flown stays known when the originals change.
+/// Copies the course files into the run's directory and makes the configuration refer to the
+/// copies, so that the run stays reproducible when the originals change.
 pub(super) fn copy_courses(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
     let folder = RunDirectory::new(root).courses();
     fs::create_dir_all(&folder).map_err(|source| PrepareError::Io {

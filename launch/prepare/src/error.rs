@@ -1,4 +1,4 @@
-//! Why a run cannot be started.
+//! Reasons why a run cannot start.
 
 use std::io;
 use std::path::PathBuf;
@@ -10,104 +10,110 @@ use skein_simulator::simulator::SimulatorError;
 
 use super::room::{FoldersTooSmall, SharedMemoryTooSmall};
 
-/// Why a run cannot be started.
+/// Reason why a run cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum PrepareError {
-    /// The configuration cannot be used.
+    /// The configuration is invalid.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// The `[simulator]` section cannot be used.
+    /// The `[simulator]` section is invalid.
     #[error("{}: [simulator] {problem}", config.display())]
     Simulator {
         /// The configuration file.
         config: PathBuf,
-        /// Which key, and what is wrong with it.
+        /// Key and problem.
         problem: String,
     },
     /// A course cannot be flown.
     #[error(transparent)]
     Course(#[from] CourseError),
-    /// A vehicle or camera setting makes no sense.
+    /// A vehicle or camera setting is invalid.
     #[error("{}: {source}", config.display())]
     Settings {
         /// The configuration file.
         config: PathBuf,
-        /// Why.
+        /// Problem of the setting.
         #[source]
         source: SimulatorError,
     },
-    /// Courses cannot be generated from the ranges given.
+    /// The given ranges do not allow courses to be generated.
     #[error("{}: [simulator.generator] {source}", config.display())]
     Ranges {
         /// The configuration file.
         config: PathBuf,
-        /// Why.
+        /// Problem of the ranges.
         #[source]
         source: RangesError,
     },
     /// An episode may become longer than an actor can send.
     #[error(
-        "[simulator] max_steps = {max_steps} makes episodes of up to {} records, but transport.max_records_per_episode = {records}: set it to {} or more",
+         "[simulator] max_steps = {max_steps} makes episodes of up to {} records, \
+          but transport.max_records_per_episode = {records}: set it to at least {}",
         max_steps + 1,
         max_steps + 1
     )]
     EpisodeTooLong {
-        /// The simulator's limit.
+        /// Largest number of steps in the simulator.
         max_steps: u32,
-        /// The transport's limit.
+        /// Largest number of records in the transport.
         records: usize,
     },
     /// Training would start from a level that its course does not have.
     #[error(
-        "{}: learning.levels = {levels} is more than the {walls} walls of {}: no episode could start from the last level; set it to {walls} or fewer",
+         "{}: learning.levels = {levels} exceeds the {walls} walls of {}, \
+          so no episode could start from the last level; set it to {walls} or fewer",
         config.display(),
         course
     )]
     TooManyLevels {
         /// The configuration file.
         config: PathBuf,
-        /// Start levels asked for.
+        /// Requested start levels.
         levels: u8,
-        /// The course, or the ranges of generated ones.
+        /// Name of the course, or of the ranges of generated courses.
         course: String,
-        /// Its walls.
+        /// Number of its walls.
         walls: u8,
     },
-    /// More actors than the transport has room for.
+    /// The transport allows fewer actors.
     #[error("{actors} actors are more than transport.max_actors = {max}: start fewer, or raise it")]
     TooManyActors {
-        /// Asked for.
+        /// Requested actors.
         actors: usize,
-        /// The limit.
+        /// Largest number allowed.
         max: usize,
     },
-    /// The shared memory would be used up.
+    /// Shared memory is too small.
     #[error(transparent)]
     Room(#[from] SharedMemoryTooSmall),
-    /// No room for the transport's small files.
+    /// The disk has no room for the transport's small files.
     #[error(transparent)]
     Folders(#[from] FoldersTooSmall),
-    /// There is something in the run's directory.
-    #[error("{folder} is not empty: choose another --run-dir, or, if it holds a run, go on with that: --resume {folder}", folder = .0.display())]
+    /// The run's directory is not empty.
+    #[error(
+        "{folder} is not empty: choose another --run-dir, \
+         or resume the run in it with --resume {folder}",
+        folder = .0.display()
+    )]
     NotEmpty(PathBuf),
     /// A file or folder of the run cannot be written.
     #[error("{}: {source}", path.display())]
     Io {
         /// The path.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         #[source]
         source: io::Error,
     },
     /// The run's directory cannot be set up.
     #[error(transparent)]
     Run(#[from] RunError),
-    /// The run could be started, were it not for an override.
+    /// An override makes the run impossible.
     #[error("with --set {text}, {source}")]
     Overridden {
-        /// The override as given.
+        /// The override, as given.
         text: String,
-        /// What is wrong now.
+        /// Problem caused by the override.
         #[source]
         source: Box<PrepareError>,
     },

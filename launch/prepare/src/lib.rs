@@ -1,8 +1,8 @@
-//! Everything that can be checked before the first process of a run is started, and the run's
-//! directory.
+//! Checks everything that can be checked before the first process of a run starts, and creates the
+//! run's directory.
 //!
-//! A mistake in a configuration or a course file is found here, in the terminal of whoever made it,
-//! and not in the log of the third actor.
+//! A mistake in a configuration or a course file is therefore reported in the user's terminal, not
+//! in an actor's log.
 
 mod checks;
 mod directory;
@@ -21,24 +21,24 @@ pub use checks::check;
 pub use directory::NewDirectory;
 pub use error::PrepareError;
 
-/// A run that is ready to be started.
+/// A run that is ready to start.
 #[derive(Debug)]
 pub struct Prepared {
     /// Its directory, with an absolute path.
     pub run: RunDirectory,
-    /// Who it is.
+    /// Its identity.
     pub identity: RunIdentity,
     /// Its resolved configuration.
     pub config: Config,
-    /// The directory that was made for it; `None` for a run that was there before.
+    /// Its directory if it was just created; `None` for a resumed run.
     pub new: Option<NewDirectory>,
 }
 
-/// Checks the configuration in `config_file` with `overrides`, the courses it names, the number of
-/// `actors` and the machine's room for them; then creates `run_directory` with copies of it all.
+/// Checks the configuration in `config_file` with `overrides`, its courses, the number of `actors`
+/// and the machine's room for them. Then creates `run_directory` with copies of all inputs.
 ///
 /// # Errors
-/// [`PrepareError`] names file, key and remedy; nothing was created then.
+/// [`PrepareError`] names file, key and remedy; in this case nothing was created.
 pub fn prepare(
     config_file: &Path,
     overrides: &[String],
@@ -55,18 +55,18 @@ pub fn prepare(
             ..prepared
         }),
         Err(error) => {
-            // What went wrong first is what there is to tell.
+            // The first error matters more than a failed removal.
             let _ = new.take_back();
             Err(error)
         }
     }
 }
 
-/// The configuration in `config_file` with `overrides`, checked as that of a run with `actors`
-/// actors is, with all that the simulator was not told written out.
+/// Returns the configuration in `config_file` with `overrides`, checked for a run with `actors`
+/// actors, with the simulator's defaults written out.
 ///
 /// # Errors
-/// [`PrepareError`] names file, key and remedy, and the override that is to blame.
+/// [`PrepareError`] names file, key and remedy, and the override at fault.
 pub fn resolve(
     config_file: &Path,
     overrides: &[String],
@@ -79,7 +79,7 @@ pub fn resolve(
     Ok(config)
 }
 
-/// Puts everything into a new run's directory that its processes begin with.
+/// Fills a new run's directory with the files that its processes need.
 fn fill(new: &NewDirectory, mut config: Config) -> Result<Prepared, PrepareError> {
     directory::copy_courses(new.root(), &mut config)?;
     let run = RunDirectory::new(new.root());
@@ -93,10 +93,10 @@ fn fill(new: &NewDirectory, mut config: Config) -> Result<Prepared, PrepareError
     })
 }
 
-/// The `[simulator]` section with the defaults of all that was not set: what was flown stays known
-/// when the defaults change.
+/// Returns the `[simulator]` section with all defaults written out, so that the run stays
+/// reproducible when the defaults change.
 fn written_out(settings: &SimulatorSettings) -> toml::Table {
-    // By way of text: a number of single precision would drag the digits of its double along.
+    // By way of text: a single-precision number would otherwise show the digits of its double.
     let text = toml::to_string(settings).expect("every setting is representable in TOML");
     toml::from_str(&text).expect("what was written as TOML is TOML")
 }

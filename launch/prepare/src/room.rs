@@ -1,6 +1,6 @@
-//! Whether the machine has room for a run: shared memory that is used up ends a process with SIGBUS
-//! in the middle of an episode, a full disk stops the learner until there is room again. Both can
-//! be foreseen.
+//! Checks that the machine has room for a run. If shared memory runs out, a process dies of SIGBUS
+//! in the middle of an episode. If the disk is full, the learner waits for room. Both can be
+//! foreseen.
 
 use std::path::{Path, PathBuf};
 
@@ -10,22 +10,26 @@ use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::{ACTION, IMAGE_PIXELS, TRUE_STATE};
 use skein_transport::shared_memory_needed;
 
-/// Where iceoryx2's segments lie.
+/// Folder of iceoryx2's segments.
 const SHARED_MEMORY: &str = "/dev/shm";
-/// Where the folder of a run's transport lies.
+/// Parent of the folder of a run's transport.
 const FOLDERS: &str = "/tmp";
-/// More than the small files of a hundred actors take: a dozen each, of a block each.
+/// Room for the small files of the transport, in bytes. A hundred actors need less: a dozen files
+/// each, of one block each.
 const TRANSPORT_FILES: u64 = 8 << 20;
 const MIB: u64 = 1 << 20;
-/// All that is trained, targets and moments, in snapshots of the same configuration. 23 were
-/// measured: `tensors.safetensors` of a checkpoint of `tests/small.toml` has 73.1 MB,
-/// `latest.safetensors` 3.2 MB.
+/// Size of a checkpoint's parameters (all networks, target networks and optimiser moments) in
+/// snapshots of the same configuration. Measured: 23, as `tensors.safetensors` of a checkpoint of
+/// `tests/small.toml` has 73.1 MB, `latest.safetensors` 3.2 MB.
 const CHECKPOINT_SNAPSHOTS: u64 = 24;
 
-/// There is less shared memory than a run needs.
+/// Shared memory has less free space than a run needs.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{} has {} MiB free, but {actors} actors need {} MiB: start fewer with --actors, remove what others left there, or make it larger: sudo mount -o remount,size={}M {}, in a container docker run --shm-size={}m",
+     "{} has {} MiB free, but {actors} actors need {} MiB: start fewer with --actors, \
+      remove what other programs left there, \
+      or make it larger: sudo mount -o remount,size={}M {}, \
+      in a container docker run --shm-size={}m",
     path.display(),
     free / MIB,
     needed.div_ceil(MIB),
@@ -40,15 +44,15 @@ pub struct SharedMemoryTooSmall {
     needed: u64,
     /// Bytes.
     free: u64,
-    /// Bytes that it should hold altogether.
+    /// Required total size, in bytes.
     enough: u64,
 }
 
-/// Checks that there is shared memory for a learner and `actors` actors with `config`. Where it
-/// cannot be asked for, nothing is foreseen.
+/// Checks that there is shared memory for a learner and `actors` actors with `config`. Passes if
+/// the free space is unknown.
 ///
 /// # Errors
-/// [`SharedMemoryTooSmall`] names what is needed, what there is, and the remedy.
+/// [`SharedMemoryTooSmall`] names the required and the free space, and the remedy.
 pub fn check_shared_memory(config: &Config, actors: usize) -> Result<(), SharedMemoryTooSmall> {
     check_memory_in(
         Path::new(SHARED_MEMORY),
@@ -61,7 +65,7 @@ pub fn check_shared_memory(config: &Config, actors: usize) -> Result<(), SharedM
 /// way.
 ///
 /// # Errors
-/// [`SharedMemoryTooSmall`] names what is needed, what there is, and the remedy.
+/// [`SharedMemoryTooSmall`] names the required and the free space, and the remedy.
 pub fn check_shared_memory_for_more(
     config: &Config,
     actors: usize,
@@ -86,9 +90,14 @@ fn check_memory_in(path: &Path, actors: usize, needed: u64) -> Result<(), Shared
     })
 }
 
-/// There is no room for the transport's locks and sockets.
+/// The disk has no room for the transport's locks and sockets.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{FOLDERS} has {} KiB free, but the files by which a run's processes find each other need {} KiB: make room there", free >> 10, TRANSPORT_FILES >> 10)]
+#[error(
+    "{FOLDERS} has {} KiB free, but a run's processes need {} KiB there for the files \
+     by which they find each other: free some space",
+    free >> 10,
+    TRANSPORT_FILES >> 10
+)]
 pub struct FoldersTooSmall {
     /// Bytes.
     free: u64,
@@ -97,7 +106,7 @@ pub struct FoldersTooSmall {
 /// Checks that there is room for the folder of a run's transport.
 ///
 /// # Errors
-/// [`FoldersTooSmall`] names what is needed and what there is.
+/// [`FoldersTooSmall`] names the required and the free space.
 pub fn check_folders() -> Result<(), FoldersTooSmall> {
     match space(Path::new(FOLDERS)) {
         Some(Space { free, .. }) if free < TRANSPORT_FILES => Err(FoldersTooSmall { free }),
@@ -105,20 +114,21 @@ pub fn check_folders() -> Result<(), FoldersTooSmall> {
     }
 }
 
-/// Bytes of shared memory that are free; `None` where it cannot be asked for.
+/// Returns the free bytes of shared memory; `None` if unknown.
 pub fn free_shared_memory() -> Option<u64> {
     space(Path::new(SHARED_MEMORY)).map(|space| space.free)
 }
 
-/// A warning, if the disk that `directory` lies on has no room for the checkpoints of a run with
+/// Returns a warning if the disk of `directory` has no room for the checkpoints of a run with
 /// `config`.
 pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
     let free = space(directory)?.free;
-    // The one being written lies beside those that are kept.
+    // A new checkpoint is written before the oldest is removed.
     let needed = checkpoint_bytes(config) * (config.checkpoints.keep as u64 + 1);
     (free < needed).then(|| {
         format!(
-            "the disk of {} has {} MiB free, and {} checkpoints may come to {} MiB: if it fills up, the learner waits until there is room",
+            "the disk of {} has {} MiB free, and {} checkpoints may need {} MiB: \
+                if it fills up, the learner waits until there is room",
             directory.display(),
             free / MIB,
             config.checkpoints.keep + 1,
@@ -127,17 +137,16 @@ pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
     })
 }
 
-/// Bytes of a checkpoint when the replay buffer is as full as it can become, with the depth images
-/// that are learned from.
+/// Returns the bytes of a checkpoint whose replay buffer is full, with its depth images.
 fn checkpoint_bytes(config: &Config) -> u64 {
     let learning = &config.learning;
     let records = (config.transport.max_records_per_episode * learning.times_stored()) as u64;
     let rows = (config.replay.capacity as u64).min(config.run.episodes.saturating_mul(records));
-    let told = match learning.critic_input {
+    let message = match learning.critic_input {
         CriticInput::Observation => 0,
         CriticInput::GroundTruth => TRUE_STATE,
     };
-    let row = 4 * (2 * (config.view().len() + told) + ACTION + 2) as u64;
+    let row = 4 * (2 * (config.view().len() + message) + ACTION + 2) as u64;
     let steps = match learning.encoder {
         EncoderTraining::Vae => config.vae.train_steps * learning.times_stored(),
         EncoderTraining::EndToEnd => config.replay.capacity,
@@ -148,7 +157,7 @@ fn checkpoint_bytes(config: &Config) -> u64 {
     rows * row + images * IMAGE_PIXELS as u64 + CHECKPOINT_SNAPSHOTS * snapshot
 }
 
-/// Bytes of a file system.
+/// Free and total bytes of a file system.
 struct Space {
     free: u64,
     total: u64,
@@ -167,11 +176,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn too_little_memory_is_told_with_figures_and_remedies() {
+    fn too_little_memory_is_refused_with_figures_and_remedies() {
         let directory = tempfile::tempdir().unwrap();
         assert_eq!(check_memory_in(directory.path(), 1, 0), Ok(()));
         let too_small = check_memory_in(directory.path(), 64, u64::MAX / 2).unwrap_err();
-        let told = too_small.to_string();
+        let message = too_small.to_string();
         for part in [
             "64 actors",
             "--actors",
@@ -179,24 +188,24 @@ mod tests {
             "--shm-size=",
             &format!("{} MiB free", too_small.free / MIB),
         ] {
-            assert!(told.contains(part), "`{part}` is missing in {told}");
+            assert!(message.contains(part), "`{part}` is missing in {message}");
         }
         assert!(too_small.enough >= too_small.needed);
     }
 
     #[test]
-    fn what_cannot_be_asked_is_not_foreseen() {
+    fn unknown_free_space_passes() {
         assert_eq!(check_memory_in(Path::new("/nowhere"), 1, u64::MAX), Ok(()));
         assert_eq!(scarce_disk(&Config::default(), Path::new("/nowhere")), None);
     }
 
     #[test]
-    fn a_disk_too_small_for_the_checkpoints_is_told() {
+    fn a_disk_too_small_for_the_checkpoints_causes_a_warning() {
         let mut config = Config::default();
         let directory = tempfile::tempdir().unwrap();
         assert_eq!(scarce_disk(&config, directory.path()), None);
         config.checkpoints.keep = 1 << 40;
-        let told = scarce_disk(&config, directory.path()).unwrap();
-        assert!(told.contains("checkpoints may come to"), "{told}");
+        let message = scarce_disk(&config, directory.path()).unwrap();
+        assert!(message.contains("checkpoints may need"), "{message}");
     }
 }

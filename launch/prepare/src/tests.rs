@@ -15,7 +15,7 @@ fn shipped(name: &str) -> PathBuf {
         .join(name)
 }
 
-/// A configuration file that flies one shipped course.
+/// Writes a configuration file that flies one shipped course.
 fn config_file(directory: &Path, text: &str) -> PathBuf {
     let path = directory.join("test.toml");
     let course = shipped("training.toml");
@@ -25,7 +25,7 @@ fn config_file(directory: &Path, text: &str) -> PathBuf {
 }
 
 #[test]
-fn a_prepared_run_holds_copies_of_all_it_needs() {
+fn a_prepared_run_holds_copies_of_all_its_inputs() {
     let directory = tempfile::tempdir().unwrap();
     let config = config_file(directory.path(), "");
     let prepared = prepare(
@@ -60,7 +60,7 @@ fn the_simulators_defaults_are_written_out_to_the_last_bit() {
 }
 
 #[test]
-fn two_courses_of_one_file_name_stay_two() {
+fn two_courses_with_the_same_file_name_stay_apart() {
     let directory = tempfile::tempdir().unwrap();
     let other = directory.path().join("training.toml");
     fs::copy(shipped("non_rectangular.toml"), &other).unwrap();
@@ -78,7 +78,7 @@ fn two_courses_of_one_file_name_stay_two() {
 }
 
 #[test]
-fn what_cannot_run_is_refused_before_anything_is_created() {
+fn an_impossible_run_is_refused_before_anything_is_created() {
     let directory = tempfile::tempdir().unwrap();
     for (text, set, actors, expected) in [
         (

@@ -1,8 +1,8 @@
-//! A picture in memory, and the style all plots share.
+//! A picture in memory, and the common style of all plots.
 //!
 //! The plotting library leaves the edges of thick lines jagged. A canvas is therefore drawn
-//! [`SCALE`] times too large and averaged down when it is saved. Text is set in a font compiled
-//! into the program: a fresh machine may have none.
+//! [`SCALE`] times too large and averaged down when it is saved. Text uses a font compiled into the
+//! program, because a fresh machine may have none.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter};
@@ -15,34 +15,34 @@ use plotters::style::register_font;
 
 use super::ReportError;
 
-/// How many times larger than saved a canvas is drawn, in each direction.
+/// Size of a canvas relative to the saved picture, in each direction.
 const SCALE: u32 = 2;
 
-/// Text and axes.
+/// Colour of text and axes.
 pub(super) const INK: RGBColor = RGBColor(0x33, 0x38, 0x40);
-/// Grid lines.
+/// Colour of grid lines.
 pub(super) const GRID: RGBColor = RGBColor(0xe6, 0xe8, 0xec);
-/// What the eye should follow.
+/// Colour of the main line.
 pub(super) const STRONG: RGBColor = RGBColor(0x1f, 0x5f, 0xa8);
-/// [`STRONG`], less so.
+/// Paler shade of [`STRONG`].
 pub(super) const FAINT: RGBColor = RGBColor(0xa9, 0xc2, 0xde);
-/// A level to compare with.
+/// Colour of reference levels.
 pub(super) const REFERENCE: RGBColor = RGBColor(0xc8, 0x55, 0x1b);
 
-/// The surface that plots are drawn on.
+/// Surface on which plots are drawn.
 pub(super) type Area<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
 
-/// Length in drawn pixels of `pixels` in the saved picture.
+/// Returns the drawn pixels for `pixels` of the saved picture.
 pub(super) const fn px(pixels: u32) -> u32 {
     pixels * SCALE
 }
 
-/// Text of `pixels` height in the saved picture.
+/// Returns a text style of `pixels` height in the saved picture.
 pub(super) fn font(pixels: u32) -> TextStyle<'static> {
     ("sans-serif", px(pixels)).into_font().color(&INK)
 }
 
-/// An RGB picture, white at first.
+/// RGB picture, initially white.
 pub(super) struct Canvas {
     width: u32,
     height: u32,
@@ -50,7 +50,7 @@ pub(super) struct Canvas {
 }
 
 impl Canvas {
-    /// A canvas that will be saved as `width` × `height` pixels.
+    /// Creates a canvas that is saved as `width` × `height` pixels.
     pub(super) fn new(width: u32, height: u32) -> Self {
         Self {
             width,
@@ -59,10 +59,10 @@ impl Canvas {
         }
     }
 
-    /// Lets `draw` paint with the plotting library, in drawn pixels ([`px`]).
+    /// Paints with the plotting library, in drawn pixels ([`px`]).
     ///
     /// # Errors
-    /// [`ReportError::Draw`] with what the plotting library says.
+    /// [`ReportError::Draw`] holds the message of the plotting library.
     pub(super) fn draw(
         &mut self,
         draw: impl FnOnce(&Area<'_>) -> Result<(), Box<dyn std::error::Error>>,
@@ -75,11 +75,11 @@ impl Canvas {
             .map_err(|error| ReportError::Draw(error.to_string()))
     }
 
-    /// Puts an 8-bit grey image of `image_width` columns with its corner at `corner` (saved
-    /// pixels), each of its pixels `zoom` saved pixels wide.
+    /// Draws an 8-bit grey image of `image_width` columns with its corner at `corner` (saved
+    /// pixels). Each of its pixels becomes `zoom` saved pixels wide.
     ///
     /// # Panics
-    /// If the image does not fit into the canvas.
+    /// Panics if the image does not fit into the canvas.
     pub(super) fn put_grey(
         &mut self,
         image: &[u8],
@@ -103,7 +103,7 @@ impl Canvas {
         }
     }
 
-    /// Writes the picture as PNG; a picture already there is replaced at once, never half.
+    /// Writes the picture as PNG. An existing picture is replaced atomically.
     ///
     /// # Errors
     /// [`ReportError::Write`] names the file.
@@ -131,7 +131,7 @@ impl Canvas {
         Ok(())
     }
 
-    /// The picture at its final size, each pixel the mean of the drawn ones.
+    /// Returns the picture at its final size, each pixel the mean of the drawn ones.
     fn averaged(&self) -> Vec<u8> {
         let stride = px(self.width) as usize;
         let scale = SCALE as usize;

@@ -1,5 +1,4 @@
-//! Several ways of training beside each other: a line each, and a band of what other seeds might
-//! have shown.
+//! Comparison of arms: one line each, with a band for the uncertainty over seeds.
 
 use std::path::Path;
 
@@ -10,16 +9,16 @@ use super::canvas::{Area, Canvas, GRID, INK, REFERENCE, STRONG, font, px};
 use super::curves::{legend_line, padded_range, thick_line};
 use super::growth::brief;
 
-/// More lines than this could not be told apart in one picture.
+/// Largest number of lines that can be distinguished in one picture.
 pub const MOST_LINES: usize = 8;
 
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 640;
 
-/// A level to compare with: no arm.
+/// Colour of the reference level, which is not an arm.
 const LEVEL: RGBColor = RGBColor(0x99, 0x9c, 0xa0);
-/// One colour a line, told apart by those who see colours differently too as far as so many can be
-/// (after Okabe and Ito).
+/// Colours of the lines, distinguishable as far as possible for colour-blind readers (after Okabe
+/// and Ito).
 const COLOURS: [RGBColor; MOST_LINES] = [
     STRONG,
     REFERENCE,
@@ -31,46 +30,46 @@ const COLOURS: [RGBColor; MOST_LINES] = [
     RGBColor(0x5d, 0x63, 0x6b),
 ];
 
-/// A picture of several ways of training.
+/// Picture that compares arms.
 #[derive(Debug)]
 pub struct Comparison<'a> {
-    /// Above the picture.
+    /// Title above the picture.
     pub title: String,
-    /// What the curves are drawn over.
+    /// Label of the x axis.
     pub x: &'static str,
-    /// What they show.
+    /// Label of the y axis.
     pub y: &'static str,
-    /// A level to compare with, and what it is.
+    /// Reference level and its label.
     pub level: Option<(f64, String)>,
-    /// The lines, [`MOST_LINES`] at most.
+    /// Lines, [`MOST_LINES`] at most.
     pub lines: Vec<ComparedLine<'a>>,
 }
 
-/// A line of such a picture.
+/// Line of a comparison.
 #[derive(Debug)]
 pub struct ComparedLine<'a> {
-    /// In the legend.
+    /// Label in the legend.
     pub label: &'a str,
-    /// In the order of their x.
+    /// Points in the order of their x.
     pub points: Vec<BandPoint>,
 }
 
-/// A point of a line, and the band around it.
+/// A point of a line, with the band around it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BandPoint {
-    /// Where.
+    /// Position on the x axis.
     pub x: f64,
-    /// What the line shows.
+    /// Position of the line on the y axis.
     pub value: f64,
-    /// The band's lower and upper end; `None` where there is no band.
+    /// Lower and upper end of the band; `None` without a band.
     pub interval: Option<(f64, f64)>,
 }
 
 impl Comparison<'_> {
-    /// Draws it to `path`; whether there was anything to draw.
+    /// Draws the picture to `path`. Returns `false` if there was nothing to draw.
     ///
     /// # Errors
-    /// [`ReportError`] if the picture cannot be drawn or written.
+    /// Returns [`ReportError`] if the picture cannot be drawn or written.
     pub fn draw(&self, path: &Path) -> Result<bool, ReportError> {
         if self.lines.iter().all(|line| line.points.len() < 2) {
             return Ok(false);
@@ -104,7 +103,7 @@ impl Comparison<'_> {
             .x_desc(self.x)
             .y_desc(self.y)
             .draw()?;
-        // Bands first: no band hides another arm's line.
+        // Bands come first, so that no band hides another arm's line.
         for (line, colour) in self.lines.iter().zip(COLOURS) {
             chart.draw_series(
                 band(line)
@@ -159,7 +158,7 @@ impl Comparison<'_> {
             values.extend([low, high]);
         }
         let (low, high) = padded_range(&values);
-        // What cannot be negative has no axis below zero.
+        // Values that are never negative get an axis from zero.
         let is_negative = values.iter().any(|value| *value < 0.0);
         (
             0.0..self.furthest().max(1.0),
@@ -168,8 +167,8 @@ impl Comparison<'_> {
     }
 }
 
-/// The corners of a line's band: along the upper ends of its intervals, and back along the lower
-/// ones. `None` where there are no intervals.
+/// Returns the corners of a line's band: along the upper ends of its intervals, and back along the
+/// lower ends. `None` without intervals.
 fn band(line: &ComparedLine<'_>) -> Option<Vec<(f64, f64)>> {
     let ends: Option<Vec<_>> = line
         .points

@@ -1,20 +1,20 @@
-//! The courses of a run, as its reports name them.
+//! Courses of a run, with their names in reports.
 
 use std::path::PathBuf;
 
 use skein_protocol::config::{Config, CoursesSection};
 use skein_simulator::course::{Course, CourseError};
 
-/// A course of the final evaluation, under the name it has in the run's reports.
+/// A course of the final evaluation, with its name in the run's reports.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NamedCourse {
-    /// [`CoursesSection::name_of`] its file.
+    /// Name of the course: [`CoursesSection::name_of`] its file.
     pub name: String,
     /// The course.
     pub course: Course,
 }
 
-/// The courses of the final evaluation.
+/// Loads the courses of the final evaluation.
 ///
 /// # Errors
 /// [`CourseError`] names the file, the wall and the key.
@@ -28,8 +28,8 @@ pub fn load_courses(config: &Config) -> Result<Vec<NamedCourse>, CourseError> {
     config.courses.evaluation.iter().map(load).collect()
 }
 
-/// Walls that an agent which passes every wall of the training course would pass an episode, on
-/// average over all start levels.
+/// Returns the walls per episode that an agent would pass on average if it passed every wall of the
+/// training course, over all start levels.
 ///
 /// # Errors
 /// [`CourseError`] names the file, the wall and the key.

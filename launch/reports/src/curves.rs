@@ -11,21 +11,21 @@ use super::canvas::{Area, Canvas, FAINT, GRID, INK, REFERENCE, STRONG, font, px}
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 640;
 
-/// The columns of `episodes.csv` that are plotted, in episode order.
+/// Row of `episodes.csv`, with the columns that are plotted.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct EpisodeRow {
-    /// Its environment steps.
+    /// Environment steps of the episode.
     pub steps: u32,
     /// Walls passed in the episode.
     pub walls_passed: u32,
-    /// Sum of its rewards, undiscounted.
+    /// Undiscounted sum of the episode's rewards.
     #[serde(rename = "return")]
     pub episode_return: f64,
 }
 
-/// No return is larger: an episode has at most 65536 records, of rewards up to
-/// `skein_protocol::transition::LARGEST_NUMBER`. An axis much longer than any return would take for
-/// ever to divide.
+/// Largest possible return: an episode has at most 65536 records, with rewards up to
+/// `skein_protocol::transition::LARGEST_NUMBER`. Dividing an axis much longer than any return would
+/// take for ever.
 const LARGEST_RETURN: f64 = 1e12;
 
 /// Reads `episodes.csv`.
@@ -46,7 +46,7 @@ pub fn read_episodes(path: &Path) -> Result<Vec<EpisodeRow>, ReportError> {
         if !(-LARGEST_RETURN..=LARGEST_RETURN).contains(&row.episode_return) {
             let (line, value) = (rows.reader().position().line() - 1, row.episode_return);
             return Err(malformed(format!(
-                "line {line}: a return of {value} is none"
+                "line {line}: {value} is not a possible return"
             )));
         }
         episodes.push(row);
@@ -58,7 +58,7 @@ pub fn read_episodes(path: &Path) -> Result<Vec<EpisodeRow>, ReportError> {
 /// 9).
 ///
 /// # Errors
-/// [`ReportError`] if the picture cannot be drawn or written.
+/// Returns [`ReportError`] if the picture cannot be drawn or written.
 pub(super) fn draw_return(
     episodes: &[EpisodeRow],
     window: usize,
@@ -68,23 +68,23 @@ pub(super) fn draw_return(
         .iter()
         .map(|episode| episode.episode_return)
         .collect();
-    Curve {
+    EpisodeCurve {
         title: "Return of the training episodes".to_owned(),
         y_label: "return",
         range: padded_range(&values),
         values,
         window,
-        raw: Raw::Shown,
+        raw: RawValues::Shown,
         level: None,
     }
     .save(path)
 }
 
-/// Draws the walls passed, averaged over `window` episodes (paper, figure 10). `ideal` is what an
-/// agent that passes every wall would average: episodes start at each of the levels in turn.
+/// Draws the walls passed, averaged over `window` episodes (paper, figure 10). `ideal` is the
+/// average of an agent that passes every wall: episodes start at each of the levels in turn.
 ///
 /// # Errors
-/// [`ReportError`] if the picture cannot be drawn or written.
+/// Returns [`ReportError`] if the picture cannot be drawn or written.
 pub(super) fn draw_walls_passed(
     episodes: &[EpisodeRow],
     window: usize,
@@ -95,19 +95,19 @@ pub(super) fn draw_walls_passed(
         .iter()
         .map(|episode| f64::from(episode.walls_passed))
         .collect();
-    Curve {
+    EpisodeCurve {
         title: format!("Walls passed, average over {window} episodes"),
         y_label: "walls passed",
         range: (0.0, ideal * 1.15),
         values,
         window,
-        raw: Raw::Hidden,
+        raw: RawValues::Hidden,
         level: Some((ideal, format!("all walls passed: {ideal}"))),
     }
     .save(path)
 }
 
-/// Mean over the last `window` values at each of them, over fewer where there are no more yet.
+/// Returns the mean over the last `window` values at each position, or over fewer at the beginning.
 pub fn trailing_mean(values: &[f64], window: usize) -> Vec<f64> {
     let mut sum = 0.0;
     (0..values.len())
@@ -121,24 +121,24 @@ pub fn trailing_mean(values: &[f64], window: usize) -> Vec<f64> {
         .collect()
 }
 
-/// Whether the single values are shown behind their average.
+/// Visibility of the single values behind their average.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Raw {
+enum RawValues {
     Shown,
     Hidden,
 }
 
-struct Curve {
+struct EpisodeCurve {
     title: String,
     y_label: &'static str,
     range: (f64, f64),
     values: Vec<f64>,
     window: usize,
-    raw: Raw,
+    raw: RawValues,
     level: Option<(f64, String)>,
 }
 
-impl Curve {
+impl EpisodeCurve {
     fn save(&self, path: &Path) -> Result<(), ReportError> {
         let mut canvas = Canvas::new(WIDTH, HEIGHT);
         canvas.draw(|area| self.draw(area))?;
@@ -171,7 +171,7 @@ impl Curve {
             .draw()?;
 
         let at = |(i, &value): (usize, &f64)| ((i + 1) as f64, value);
-        if self.raw == Raw::Shown {
+        if self.raw == RawValues::Shown {
             chart
                 .draw_series(
                     self.values
@@ -196,7 +196,8 @@ impl Curve {
                 .label(label)
                 .legend(|point| legend_line(point, REFERENCE));
         }
-        // The average is faint while its window fills: it is not comparable with what follows.
+        // The average is faint until its window is full: those values are not comparable with the
+        // rest.
         let mean = trailing_mean(&self.values, self.window);
         let filling = self.window.min(mean.len());
         let points: Vec<_> = mean.iter().enumerate().map(at).collect();
@@ -223,8 +224,8 @@ impl Curve {
     }
 }
 
-/// A line of `width` drawn pixels, segment by segment: the library's own leaves holes where a thick
-/// line turns sharply.
+/// Draws a line of `width` drawn pixels, one piece at a time: the library's own thick lines have
+/// holes at sharp turns.
 pub(super) fn thick_line(
     points: &[(f64, f64)],
     colour: RGBColor,
@@ -239,7 +240,7 @@ pub(super) fn legend_line((x, y): (i32, i32), colour: RGBColor) -> PathElement<(
     PathElement::new([(x, y), (x + px(24) as i32, y)], colour.stroke_width(px(3)))
 }
 
-/// The values' range with a margin, never empty.
+/// Returns the range of the values with a margin, never empty.
 pub(super) fn padded_range(values: &[f64]) -> (f64, f64) {
     let (low, high) = values
         .iter()
@@ -293,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn a_return_that_no_axis_could_show_is_named_by_its_line() {
+    fn an_impossible_return_is_named_by_its_line() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("episodes.csv");
         for value in ["1e308", "-1e13", "inf", "nan"] {
@@ -303,7 +304,7 @@ mod tests {
             )
             .unwrap();
             let error = read_episodes(&path).unwrap_err().to_string();
-            assert!(error.contains("line 3: a return of"), "{error}");
+            assert!(error.contains("line 3:"), "{error}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! How cost grows with something, on axes on which a power is a straight line.
+//! Growth of a cost with a size, on logarithmic axes, on which a power law is a straight line.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use super::canvas::{Area, Canvas, GRID, INK, REFERENCE, STRONG, font, px};
 const WIDTH: u32 = 760;
 const HEIGHT: u32 = 420;
 
-/// One colour a line; a picture has no more lines than these.
+/// Colours of the lines; a picture has at most this many.
 const COLOURS: [RGBColor; 4] = [
     STRONG,
     REFERENCE,
@@ -18,25 +18,25 @@ const COLOURS: [RGBColor; 4] = [
     RGBColor(0x7a, 0x5a, 0xa8),
 ];
 
-/// A picture of how cost grows with something.
+/// Picture of how a cost grows with a size.
 #[derive(Debug)]
 pub struct GrowthPicture<'a> {
-    /// Above the picture.
+    /// Title above the picture.
     pub title: &'a str,
-    /// What grows.
+    /// Label of the x axis: the size.
     pub x: &'a str,
-    /// What it costs, with its unit.
+    /// Label of the y axis: the cost, with its unit.
     pub y: &'a str,
-    /// The lines; more than four are not drawn.
+    /// Lines; at most four are drawn.
     pub lines: Vec<GrowthLine<'a>>,
 }
 
-/// A line of such a picture.
+/// Line of a growth picture.
 #[derive(Debug)]
 pub struct GrowthLine<'a> {
-    /// In the legend.
+    /// Label in the legend.
     pub label: &'a str,
-    /// In the order of their x. Points that have no place on logarithmic axes are left out.
+    /// Points in the order of their x. Points without a place on logarithmic axes are left out.
     pub points: Vec<(f64, f64)>,
 }
 
@@ -48,10 +48,10 @@ struct ColouredLine<'a> {
 }
 
 impl GrowthPicture<'_> {
-    /// Draws it to `path`; whether there was anything to draw.
+    /// Draws the picture to `path`. Returns `false` if there was nothing to draw.
     ///
     /// # Errors
-    /// [`ReportError`] if the picture cannot be drawn or written.
+    /// Returns [`ReportError`] if the picture cannot be drawn or written.
     pub fn draw(&self, path: &Path) -> Result<bool, ReportError> {
         let has_place = |&(x, y): &(f64, f64)| x > 0.0 && y > 0.0 && x.is_finite() && y.is_finite();
         let lines: Vec<ColouredLine<'_>> = self
@@ -107,7 +107,7 @@ fn draw_lines(
         .axis_style(INK.mix(0.4).stroke_width(px(1)))
         .bold_line_style(GRID.stroke_width(px(1)))
         .light_line_style(TRANSPARENT)
-        // More would run into each other before a power of ten.
+        // More labels would overlap below a power of ten.
         .x_labels(6)
         .x_label_formatter(&|x| brief(*x))
         .y_label_formatter(&|y| brief(*y))
@@ -149,12 +149,12 @@ fn bounds(values: impl Iterator<Item = f64>) -> (f64, f64) {
     })
 }
 
-/// From the power of ten below to the one above, so that a flat line looks flat.
+/// Returns the range from the power of ten below to the one above, so that a flat line looks flat.
 fn decades((low, high): (f64, f64)) -> std::ops::Range<f64> {
     10_f64.powf((low / 1.1).log10().floor())..10_f64.powf((high * 1.1).log10().ceil())
 }
 
-/// A number short enough for an axis.
+/// Returns a number short enough for an axis.
 pub(super) fn brief(value: f64) -> String {
     let (value, suffix) = match value {
         value if value >= 1e6 => (value / 1e6, " M"),

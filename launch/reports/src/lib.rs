@@ -1,7 +1,6 @@
-//! Plots of a run, drawn from the files it left.
+//! Plots of a run, drawn from its files.
 //!
-//! Nothing here asks a running process: whatever a run wrote before it ended, however it ended, can
-//! be drawn again later.
+//! No running process is involved: every run, however it ended, can be drawn again later.
 
 mod canvas;
 mod clock;
@@ -20,7 +19,7 @@ use skein_run::RunDirectory;
 pub use clock::Clock;
 pub use courses::{NamedCourse, ideal_walls_passed, load_courses};
 
-/// Why a plot could not be made.
+/// Reason why a plot could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum ReportError {
     /// A file cannot be read.
@@ -28,16 +27,16 @@ pub enum ReportError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         #[source]
         source: io::Error,
     },
-    /// A file does not hold what it should.
+    /// The contents of a file are invalid.
     #[error("{} cannot be plotted: {problem}", path.display())]
     Malformed {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it, and where.
+        /// Problem and its position.
         problem: String,
     },
     /// The plotting library failed.
@@ -48,25 +47,25 @@ pub enum ReportError {
     Write {
         /// The picture.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         #[source]
         source: io::Error,
     },
 }
 
-/// What a run left to be drawn. A run that ended early has less.
+/// Contents of the files to be drawn. A run that ended early has fewer.
 #[derive(Debug)]
-pub struct Material {
+pub struct RunMaterial {
     episodes: Option<Vec<curves::EpisodeRow>>,
     reconstructions: Option<reconstructions::Pairs>,
-    paths: Option<trajectories::PathsByCourse>,
+    paths: Option<trajectories::TrajectoriesByCourse>,
 }
 
-impl Material {
-    /// Reads all of it, before anything is drawn.
+impl RunMaterial {
+    /// Reads all files before anything is drawn.
     ///
     /// # Errors
-    /// [`ReportError`] names the file that is there but cannot be used.
+    /// [`ReportError`] names the invalid file.
     pub fn read(run: &RunDirectory) -> Result<Self, ReportError> {
         Ok(Self {
             episodes: existing(run.episodes_csv())
@@ -76,28 +75,26 @@ impl Material {
                 .map(|path| reconstructions::Pairs::read(&path))
                 .transpose()?,
             paths: existing(run.evaluation_trajectories_csv())
-                .map(|path| trajectories::read_paths(&path))
+                .map(|path| trajectories::read_trajectories(&path))
                 .transpose()?,
         })
     }
 }
 
-/// Draws every plot whose input the run left, and returns the pictures. A run that ended early has
-/// fewer.
+/// Draws every plot whose input exists, and returns the pictures. A run that ended early has fewer.
 ///
-/// `courses` are those of the final evaluation; `window` is the number of episodes averaged over,
-/// and `ideal_walls_passed` what a perfect agent would average.
+/// `courses` are those of the final evaluation. `window` is the number of episodes to average over,
+/// and `ideal_walls_passed` the average of a perfect agent.
 ///
 /// # Errors
-/// [`ReportError`] names the file that is there but cannot be used, or the picture that cannot be
-/// written.
+/// [`ReportError`] names the invalid file, or the picture that cannot be written.
 pub fn draw_all(
     run: &RunDirectory,
     courses: &[NamedCourse],
     window: usize,
     ideal_walls_passed: f64,
 ) -> Result<Vec<PathBuf>, ReportError> {
-    let material = Material::read(run)?;
+    let material = RunMaterial::read(run)?;
     let mut pictures = Vec::new();
     let mut picture = |name: &str| {
         let path = run.plots().join(name);
@@ -154,11 +151,12 @@ mod tests {
     }
 
     #[test]
-    fn a_whole_run_has_four_pictures() {
+    fn a_complete_run_has_four_pictures() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         write_episodes(&run);
-        let rows = "course,episode,step,x_m,y_m,z_m,outcome\ntraining,0,0,1.5,0,3,collided\ntraining,0,1,9.7,1,3,collided\n";
+        let rows = "course,episode,step,x_m,y_m,z_m,outcome\ntraining,0,0,1.5,0,3,collided\n\
+                    training,0,1,9.7,1,3,collided\n";
         fs::write(run.evaluation_trajectories_csv(), rows).unwrap();
         let image = vec![7; skein_protocol::IMAGE_PIXELS];
         let shape = vec![1, skein_protocol::IMAGE_HEIGHT, skein_protocol::IMAGE_WIDTH];
@@ -183,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_ended_early_has_the_pictures_it_can_have() {
+    fn a_run_that_ended_early_has_the_pictures_of_its_files() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         assert!(draw_all(&run, &[training()], 50, 3.0).unwrap().is_empty());

@@ -1,4 +1,4 @@
-//! Depth images beside what the auto-encoder makes of them.
+//! Depth images beside their reconstructions by the VAE.
 
 use std::fs;
 use std::path::Path;
@@ -9,9 +9,9 @@ use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
 use super::ReportError;
 use super::canvas::{Canvas, font, px};
 
-/// Pairs in a row of the picture.
+/// Pairs per row of the picture.
 const COLUMNS: usize = 4;
-/// Pairs in the picture; more would not be looked at.
+/// Largest number of pairs in the picture; nobody would look at more.
 const MAX_PAIRS: usize = 12;
 /// Saved pixels per image pixel.
 const ZOOM: u32 = 2;
@@ -19,7 +19,7 @@ const GAP: u32 = 16;
 const CAPTION: u32 = 28;
 const TITLE: u32 = 48;
 
-/// Depth images and their reconstructions, `[n, 72, 128]` bytes each, brighter is farther.
+/// Depth images and their reconstructions, `[n, 72, 128]` bytes each; brighter is farther.
 #[derive(Debug)]
 pub(super) struct Pairs {
     depth: Vec<u8>,
@@ -27,10 +27,10 @@ pub(super) struct Pairs {
 }
 
 impl Pairs {
-    /// Reads the tensors `depth` and `reconstruction`, u8 `[n, 72, 128]`, of a safetensors file.
+    /// Reads the tensors `depth` and `reconstruction`, u8 `[n, 72, 128]`, from a safetensors file.
     ///
     /// # Errors
-    /// [`ReportError`] names the file and what is wrong with it.
+    /// [`ReportError`] names the file and its problem.
     pub(super) fn read(path: &Path) -> Result<Self, ReportError> {
         let bytes = fs::read(path).map_err(|source| ReportError::Read {
             path: path.to_owned(),
@@ -49,7 +49,8 @@ impl Pairs {
             match (tensor.dtype(), tensor.shape()) {
                 (Dtype::U8, [_, IMAGE_HEIGHT, IMAGE_WIDTH]) => Ok(tensor.data().to_vec()),
                 (dtype, shape) => Err(malformed(format!(
-                    "tensor `{name}` is {dtype:?} {shape:?}, not U8 [n, {IMAGE_HEIGHT}, {IMAGE_WIDTH}]"
+                    "tensor `{name}` is {dtype:?} {shape:?}, not U8 [n, {IMAGE_HEIGHT}, \
+                     {IMAGE_WIDTH}]"
                 ))),
             }
         };
@@ -75,7 +76,7 @@ impl Pairs {
 /// Draws each depth image above its reconstruction.
 ///
 /// # Errors
-/// [`ReportError`] if the picture cannot be drawn or written.
+/// Returns [`ReportError`] if the picture cannot be drawn or written.
 pub(super) fn draw(pairs: &Pairs, path: &Path) -> Result<(), ReportError> {
     let shown = pairs.iter().count().min(MAX_PAIRS);
     let (width, height) = (IMAGE_WIDTH as u32 * ZOOM, IMAGE_HEIGHT as u32 * ZOOM);
@@ -90,12 +91,17 @@ pub(super) fn draw(pairs: &Pairs, path: &Path) -> Result<(), ReportError> {
     };
 
     canvas.draw(|area| {
-        let title = "Depth image (above) and its reconstruction from the latent code (below); brighter is farther";
+        let title = "Depth image (above) and its reconstruction from the latent code (below); \
+                     brighter is farther";
         area.draw_text(title, &font(19), (px(GAP) as i32, px(14) as i32))?;
         for (i, (depth, reconstruction)) in pairs.iter().take(shown).enumerate() {
             let (x, y) = corner(i);
             let error = format!("mean error {:.1} of 255", mean_error(depth, reconstruction));
-            area.draw_text(&error, &font(15), (px(x) as i32, px(y + 2 * height + 11) as i32))?;
+            area.draw_text(
+                &error,
+                &font(15),
+                (px(x) as i32, px(y + 2 * height + 11) as i32),
+            )?;
         }
         Ok(())
     })?;
@@ -107,7 +113,7 @@ pub(super) fn draw(pairs: &Pairs, path: &Path) -> Result<(), ReportError> {
     canvas.save(path)
 }
 
-/// Mean absolute difference in grey levels.
+/// Returns the mean absolute difference in grey levels.
 fn mean_error(depth: &[u8], reconstruction: &[u8]) -> f64 {
     let sum: u64 = depth
         .iter()

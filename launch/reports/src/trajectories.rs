@@ -1,4 +1,4 @@
-//! Evaluation episodes from above and from the side, through the openings of the walls.
+//! Trajectories of evaluation episodes from above and from the side, with walls and openings.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -25,21 +25,21 @@ const CORRIDOR: RGBColor = RGBColor(0xf3, 0xf5, 0xf8);
 const WALL: RGBColor = RGBColor(0x4a, 0x50, 0x5a);
 const TIMED_OUT: RGBColor = RGBColor(0x8a, 0x5f, 0xb5);
 
-/// One evaluation episode.
+/// Trajectory of one evaluation episode.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Trajectory {
-    /// Where the vehicle's centre was at each step, world frame, metres.
+    /// Position of the vehicle's centre at each step, world frame, metres.
     points_m: Vec<[f32; 3]>,
-    /// How it ended.
+    /// End of the episode.
     outcome: Outcome,
 }
 
-/// The evaluation episodes of each course, under the course's name.
-pub(super) type PathsByCourse = BTreeMap<String, Vec<Trajectory>>;
+/// Trajectories by the name of their course.
+pub(super) type TrajectoriesByCourse = BTreeMap<String, Vec<Trajectory>>;
 
-/// A row of `evaluation_trajectories.csv`.
+/// Row of `evaluation_trajectories.csv`.
 #[derive(Deserialize)]
-struct Row {
+struct TrajectoryRow {
     course: String,
     episode: u64,
     x_m: f32,
@@ -48,22 +48,22 @@ struct Row {
     outcome: Outcome,
 }
 
-/// Reads `evaluation_trajectories.csv`: the steps of an episode follow each other.
+/// Reads `evaluation_trajectories.csv`. The steps of an episode are consecutive.
 ///
 /// # Errors
 /// [`ReportError::Malformed`] names the line.
-pub(super) fn read_paths(path: &Path) -> Result<PathsByCourse, ReportError> {
+pub(super) fn read_trajectories(path: &Path) -> Result<TrajectoriesByCourse, ReportError> {
     let malformed = |problem: String| ReportError::Malformed {
         path: path.to_owned(),
         problem,
     };
-    let mut courses = PathsByCourse::new();
+    let mut courses = TrajectoriesByCourse::new();
     let mut current = None;
     let mut rows = csv::Reader::from_path(path)
         .map_err(|error| malformed(error.to_string()))?
         .into_deserialize();
     while let Some(row) = rows.next() {
-        let row: Row = row.map_err(|error| malformed(error.to_string()))?;
+        let row: TrajectoryRow = row.map_err(|error| malformed(error.to_string()))?;
         let at_m = [row.x_m, row.y_m, row.z_m];
         if !at_m
             .iter()
@@ -71,7 +71,7 @@ pub(super) fn read_paths(path: &Path) -> Result<PathsByCourse, ReportError> {
         {
             let line = rows.reader().position().line() - 1;
             return Err(malformed(format!(
-                "line {line}: no episode comes to {at_m:?}"
+                "line {line}: {at_m:?} is not a possible position"
             )));
         }
         let episodes = courses.entry(row.course.clone()).or_default();
@@ -90,14 +90,14 @@ pub(super) fn read_paths(path: &Path) -> Result<PathsByCourse, ReportError> {
     Ok(courses)
 }
 
-/// Draws the episodes of each course from above and from the side. Courses nobody flew are left
-/// out.
+/// Draws the episodes of each course from above and from the side. Courses without episodes are
+/// left out.
 ///
 /// # Errors
-/// [`ReportError`] if the picture cannot be drawn or written.
+/// Returns [`ReportError`] if the picture cannot be drawn or written.
 pub(super) fn draw(
     courses: &[NamedCourse],
-    paths: &PathsByCourse,
+    paths: &TrajectoriesByCourse,
     path: &Path,
 ) -> Result<(), ReportError> {
     let flown: Vec<_> = courses
@@ -122,38 +122,38 @@ pub(super) fn draw(
     canvas.save(path)
 }
 
-/// Saved pixels per metre, the same along and across the corridor: angles in the picture are angles
-/// in the world. A corridor that is wider or higher than long does not fill the picture's width:
-/// its panels would be higher than memory is large.
+/// Returns the saved pixels per metre, the same along and across the corridor, so that angles are
+/// true. A corridor that is wider or higher than long does not fill the picture's width; otherwise
+/// its panels would be too high for memory.
 fn pixels_per_metre(course: &Course) -> f32 {
     let corridor = course.corridor();
     let along = (WIDTH - LEFT - RIGHT) as f32 / corridor.length_m;
     along.min(HIGHEST_PANEL as f32 / corridor.width_m.max(corridor.height_m))
 }
 
-fn panel_height(course: &Course, view: View) -> u32 {
+fn panel_height(course: &Course, view: Projection) -> u32 {
     let (low, high) = view.range_m(course);
     ((high - low) * pixels_per_metre(course)) as u32
 }
 
 fn block_height(course: &Course) -> u32 {
     CAPTION
-        + panel_height(course, View::Above)
+        + panel_height(course, Projection::Above)
         + PANEL_GAP
-        + panel_height(course, View::Side)
+        + panel_height(course, Projection::Side)
         + AXIS
 }
 
-/// From where the corridor is looked at.
+/// Projection of the corridor.
 #[derive(Clone, Copy)]
-enum View {
-    /// x to the right, y (left of the drone) up.
+enum Projection {
+    /// From above: x to the right, y (left of the drone) up.
     Above,
-    /// x to the right, z up.
+    /// From the side: x to the right, z up.
     Side,
 }
 
-impl View {
+impl Projection {
     fn range_m(self, course: &Course) -> (f32, f32) {
         let corridor = course.corridor();
         match self {
@@ -189,10 +189,10 @@ impl View {
     }
 }
 
-/// Where metres of one panel lie in drawn pixels.
+/// Position of one panel in drawn pixels.
 struct Panel<'a> {
     course: &'a Course,
-    view: View,
+    view: Projection,
     top: u32,
 }
 
@@ -220,7 +220,7 @@ impl Panel<'_> {
             self.rectangle((0.0, length_m), (low, high)),
             CORRIDOR.filled(),
         ))?;
-        // What went wrong is drawn over what went well: it is what the reader looks for.
+        // Failed episodes are drawn last, over the others: readers look for them.
         let (well, wrong): (Vec<_>, Vec<_>) = episodes
             .iter()
             .partition(|episode| episode.outcome == Outcome::ReachedEnd);
@@ -322,13 +322,13 @@ fn draw_course(
     area.draw_text(&caption, &font(18), (px(LEFT) as i32, px(top + 8) as i32))?;
     let above = Panel {
         course,
-        view: View::Above,
+        view: Projection::Above,
         top: top + CAPTION,
     };
     let side = Panel {
         course,
-        view: View::Side,
-        top: above.top + panel_height(course, View::Above) + PANEL_GAP,
+        view: Projection::Side,
+        top: above.top + panel_height(course, Projection::Above) + PANEL_GAP,
     };
     above.draw(area, episodes)?;
     side.draw(area, episodes)?;
@@ -373,13 +373,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn episodes_are_told_apart_by_course_and_number() {
+    fn episodes_are_distinguished_by_course_and_number() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("evaluation_trajectories.csv");
-        let rows = "course,episode,step,x_m,y_m,z_m,outcome\n\
-                    a,0,0,1,0,3,collided\na,0,1,2,0,3,collided\na,1,0,1,0,3,reached_end\nb,1,0,1,0,3,timed_out\n";
+        let rows = "course,episode,step,x_m,y_m,z_m,outcome\na,0,0,1,0,3,collided\n\
+                    a,0,1,2,0,3,collided\na,1,0,1,0,3,reached_end\nb,1,0,1,0,3,timed_out\n";
         std::fs::write(&path, rows).unwrap();
-        let paths = read_paths(&path).unwrap();
+        let paths = read_trajectories(&path).unwrap();
         let lengths = |name: &str| {
             paths[name]
                 .iter()
@@ -394,9 +394,9 @@ mod tests {
     #[test]
     fn a_corridor_wider_than_long_has_a_picture_of_bounded_height() {
         let text = "name = \"hall\"\norder = [1]\nwall_x_m = [8.0]\nwall_thickness_m = 0.3\n\
-                    corridor = { length_m = 10.0, width_m = 100.0, height_m = 100.0 }\n\
-                    start = { offset_m = 1.5, jitter_y_m = 0.0, jitter_z_m = 0.0 }\n\
-                    [[wall]]\nlabel = 1\nshape = \"circle\"\ncentre_m = [0.0, 50.0]\ndiameter_m = 2.2\n";
+                    corridor = { length_m = 10.0, width_m = 100.0, height_m = 100.0 }\nstart = \
+                    { offset_m = 1.5, jitter_y_m = 0.0, jitter_z_m = 0.0 }\n[[wall]]\nlabel = 1\n\
+                    shape = \"circle\"\ncentre_m = [0.0, 50.0]\ndiameter_m = 2.2\n";
         let hall = Course::parse(text, "hall.toml").unwrap();
         assert_eq!(
             block_height(&hall),
@@ -405,14 +405,14 @@ mod tests {
     }
 
     #[test]
-    fn a_place_that_no_episode_comes_to_is_named_by_its_line() {
+    fn an_impossible_position_is_named_by_its_line() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("evaluation_trajectories.csv");
         for place in ["nan,0,0", "0,-inf,0", "0,0,1e30"] {
             let rows = format!("course,episode,step,x_m,y_m,z_m,outcome\na,0,0,{place},collided\n");
             std::fs::write(&path, rows).unwrap();
-            let error = read_paths(&path).unwrap_err().to_string();
-            assert!(error.contains("line 2: no episode comes to"), "{error}");
+            let error = read_trajectories(&path).unwrap_err().to_string();
+            assert!(error.contains("line 2:"), "{error}");
         }
     }
 }

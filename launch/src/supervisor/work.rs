@@ -1,18 +1,18 @@
-//! What a run has done so far, as far as the learner's reports show it.
+//! Work done by a run, as shown by the learner's reports.
 
 use skein_protocol::progress::Progress;
 
-/// What a run has done so far. More work is greater: episodes come first, then what is made of
+/// Work done by a run. More work compares greater: first by episodes, then by the updates made from
 /// them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Work {
+pub(super) struct WorkDone {
     episodes: u64,
     vae_updates: u64,
     updates: u64,
     evaluation_episodes: u64,
 }
 
-impl Work {
+impl WorkDone {
     pub(super) fn of(progress: &Progress) -> Self {
         Self {
             episodes: progress.episodes,
@@ -22,7 +22,7 @@ impl Work {
         }
     }
 
-    /// So many updates, and nothing else.
+    /// Returns work of `updates` updates and nothing else.
     #[cfg(test)]
     pub(super) fn test(updates: u64) -> Self {
         Self {

@@ -1,10 +1,9 @@
-//! What it costs to bring episodes home in epochs: microseconds of a run for each environment step,
-//! as epochs grow longer.
+//! Cost of epochs: microseconds of a run per environment step, against the length of epochs.
 //!
-//! Whole runs of the real programs with two actors, which fly at random and learn nothing, so that
-//! every run flies the same episodes and only the number of epochs differs: what is left beside
-//! flying is ordering, waiting for the last of an epoch, and publishing a snapshot after it. Each
-//! figure is a line of JSON; `--quick` flies little.
+//! The real programs run with two actors, which fly at random and learn nothing. Every run flies
+//! the same episodes, and only the number of epochs differs. The cost beyond flying is ordering
+//! episodes, waiting for the last of an epoch, and publishing a snapshot. Each figure is a line of
+//! JSON; `--quick` flies few episodes.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -47,7 +46,7 @@ fn main() {
     }
 }
 
-/// Runs so many episodes in epochs of `length`.
+/// Runs `episodes` in epochs of `length`.
 fn run(episodes: u64, length: u64) -> Summary {
     let folder = tempfile::tempdir().expect("there is room for a run");
     let directory = folder.path().join("run");

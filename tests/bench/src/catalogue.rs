@@ -1,142 +1,141 @@
-//! `tests/bench/benchmarks.toml`: which benchmarks there are, what they must reach, and what they are
-//! compared with.
+//! Catalogue of the benchmarks (`tests/bench/benchmarks.toml`), with their targets and baselines.
 
 use serde::Deserialize;
 
-/// The file, compiled in.
+/// Contents of the file, compiled in.
 const FILE: &str = include_str!("../benchmarks.toml");
 
-/// All of it.
+/// Contents of the catalogue.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Catalogue {
-    /// What is run, in this order.
+    /// Benchmarks, in the order in which they run.
     #[serde(rename = "bench")]
     pub benches: Vec<Bench>,
-    /// The table.
+    /// Rows of the table.
     #[serde(rename = "row")]
-    pub rows: Vec<Row>,
-    /// The pictures of how cost grows.
+    pub rows: Vec<BenchmarkRow>,
+    /// Pictures of how cost grows.
     #[serde(rename = "growth")]
     pub growths: Vec<Growth>,
 }
 
-/// A benchmark target of some package.
+/// A benchmark target of a package.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Bench {
     /// Its name for cargo, and the first part of the name of each of its figures.
     pub name: String,
-    /// How it is run.
+    /// Its kind, which decides how it is started.
     #[serde(default)]
     pub kind: BenchKind,
-    /// When it is run.
+    /// Condition on which it runs.
     #[serde(default)]
-    pub when: When,
+    pub when: RunCondition,
 }
 
-/// How a benchmark is run.
+/// Kind of a benchmark.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum BenchKind {
     /// By criterion, pinned to one core.
     #[default]
     OneCore,
-    /// By itself, on all cores: it starts processes. It is given `--quick` or nothing, and prints a
-    /// line of JSON for each figure: see [`figures`](super::figures).
+    /// On all cores, because it starts processes. It accepts `--quick` and prints a line of JSON
+    /// per figure: see [`figures`](super::figures).
     Processes,
 }
 
-/// When a benchmark is run.
+/// Condition on which a benchmark runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum When {
-    /// Each time.
+pub enum RunCondition {
+    /// It always runs.
     #[default]
     Always,
-    /// When pictures of growth are asked for.
+    /// It runs if pictures of growth are requested.
     Growth,
 }
 
-/// A row of the table.
+/// BenchmarkRow of the table.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Row {
-    /// What is measured, for readers.
+pub struct BenchmarkRow {
+    /// Stage that is measured, for readers.
     pub stage: String,
-    /// Name of the figure: what criterion calls it, or a line of JSON.
+    /// Name of the figure, from criterion or from a line of JSON.
     pub figure: String,
-    /// How the figure is shown.
+    /// Form in which the figure is shown.
     pub show: Show,
-    /// Unit it is shown in; of a time `s`, `ms`, `µs` or `ns`.
+    /// Unit of the shown figure; for a time `s`, `ms`, `µs` or `ns`.
     pub unit: String,
-    /// What it is multiplied by. Default 1.
+    /// Factor applied to the figure. Default 1.
     #[serde(default = "one")]
     pub scale: f64,
-    /// What it must reach, in `unit`; of a share of the peak, the share.
+    /// Lower limit, in `unit`; for a share of the peak, as a share.
     pub at_least: Option<f64>,
-    /// What it must not exceed, in `unit`.
+    /// Upper limit, in `unit`.
     pub at_most: Option<f64>,
-    /// What it is compared with. A figure that comes as JSON may bring its own.
+    /// Baseline to compare with. A figure from a line of JSON may have its own.
     pub baseline: Option<Baseline>,
-    /// How many times better than the baseline it must be.
+    /// Required improvement over the baseline, as a factor.
     pub ratio_at_least: Option<f64>,
 }
 
-/// What a figure is compared with.
+/// Baseline of a figure.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Baseline {
-    /// For readers.
+    /// Description for readers.
     pub what: String,
-    /// Names of the figures whose times add up to it.
+    /// Names of the figures whose times add up to the baseline.
     pub of: Vec<String>,
 }
 
-/// How a figure is shown.
+/// Form in which a figure is shown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Show {
-    /// Elements a second.
+    /// Elements per second.
     Rate,
-    /// Time of one element.
+    /// Time per element.
     Time,
-    /// Time of one iteration, whose elements are floating-point operations, and how much of the
-    /// core's peak that is.
+    /// Time per iteration, whose elements are floating-point operations, and the share of the
+    /// core's peak.
     PeakShare,
-    /// As it comes; of figures that come as JSON.
+    /// The value itself, for figures from lines of JSON.
     Value,
 }
 
-/// A picture of how cost grows with something.
+/// Picture of how a cost grows with a size.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Growth {
     /// File name without extension.
     pub picture: String,
-    /// Above the picture.
+    /// Title above the picture.
     pub title: String,
-    /// What grows.
+    /// Label of the x axis: the size.
     pub x: String,
-    /// What it costs, with its unit.
+    /// Label of the y axis: the cost, with its unit.
     pub y: String,
-    /// The lines.
-    pub series: Vec<Series>,
+    /// Lines of the picture.
+    pub series: Vec<GrowthSeries>,
 }
 
-/// A line of such a picture: all figures named `of/<number>`.
+/// Line of a growth picture: all figures named `of/<number>`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Series {
-    /// In the legend.
+pub struct GrowthSeries {
+    /// Label in the legend.
     pub label: String,
-    /// The figures' names up to the number.
+    /// Names of the figures up to the number.
     pub of: String,
-    /// How figures are shown.
+    /// Form in which the figures are shown.
     pub show: Show,
     /// Unit of a time; otherwise for readers.
     pub unit: String,
-    /// What figures are multiplied by. Default 1.
+    /// Factor applied to the figures. Default 1.
     #[serde(default = "one")]
     pub scale: f64,
 }
@@ -146,18 +145,18 @@ const fn one() -> f64 {
 }
 
 impl Catalogue {
-    /// What the file says.
+    /// Returns the contents of the file.
     ///
     /// # Panics
-    /// When it cannot be read, which a test rules out.
+    /// Panics if the file is invalid, which a test rules out.
     pub fn load() -> Self {
         toml::from_str(FILE).expect("tests/bench/benchmarks.toml is compiled in and tested")
     }
 }
 
-impl Row {
-    /// How a figure that its baseline is made of is shown, and in what unit. Times add up, rates do
-    /// not.
+impl BenchmarkRow {
+    /// Returns the form and unit for figures of the row's baseline. Times can be added up, rates
+    /// cannot.
     pub(super) fn part_shown(&self) -> (Show, &str) {
         match self.show {
             Show::Rate | Show::Time => (Show::Time, "s"),
@@ -167,12 +166,12 @@ impl Row {
     }
 }
 
-/// Name of the benchmark that a figure is from.
+/// Returns the name of the benchmark of a figure.
 pub fn bench_of(figure: &str) -> &str {
     figure.split_once('/').map_or(figure, |(bench, _)| bench)
 }
 
-/// How many of a unit of time a second has; `None` of any other unit.
+/// Returns the number of such units in a second; `None` if it is not a unit of time.
 pub(super) fn per_second(unit: &str) -> Option<f64> {
     Some(match unit {
         "s" => 1.0,
@@ -192,7 +191,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_file_makes_sense() {
+    fn the_file_is_consistent() {
         let catalogue: Catalogue = toml::from_str(FILE).unwrap();
         let timed = |show, unit: &str| match show {
             Show::Time | Show::PeakShare => per_second(unit).is_some(),
@@ -201,7 +200,7 @@ mod tests {
         for row in &catalogue.rows {
             assert!(
                 timed(row.show, &row.unit),
-                "{} is no unit of time: {}",
+                "{} is not a unit of time: {}",
                 row.unit,
                 row.stage
             );
@@ -254,7 +253,7 @@ mod tests {
         }
     }
 
-    /// Of a package's manifest, what is needed.
+    /// Needed part of a package's manifest.
     #[derive(Deserialize)]
     struct Manifest {
         #[serde(default)]
@@ -273,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn the_file_names_the_benchmarks_that_there_are_and_no_other() {
+    fn the_file_names_exactly_the_existing_benchmarks() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
         let manifest = |folder: &Path| -> Manifest {
             toml::from_str(&fs::read_to_string(folder.join("Cargo.toml")).unwrap()).unwrap()

@@ -1,14 +1,18 @@
-//! What the benchmarks should have told and did not: a figure that was renamed in one place alone
-//! must not pass for one that is not asked for.
+//! Missing or mismatched figures. A figure that was renamed in only one place must not pass
+//! unnoticed.
 
 use std::collections::BTreeSet;
 
-use super::catalogue::{Growth, Row, Show};
-use super::figures::Figures;
+use super::catalogue::{BenchmarkRow, Growth, Show};
+use super::figures::BenchmarkFigures;
 
-/// A line for each figure that `rows` and `growths` ask for, and that `figures` lack or have
-/// otherwise.
-pub fn faults(rows: &[Row], growths: &[Growth], figures: &Figures) -> Vec<String> {
+/// Returns a line per figure that `rows` and `growths` need but `figures` lack or hold in another
+/// form.
+pub fn faults(
+    rows: &[BenchmarkRow],
+    growths: &[Growth],
+    figures: &BenchmarkFigures,
+) -> Vec<String> {
     let of_rows = rows.iter().flat_map(|row| {
         let (show, unit) = row.part_shown();
         let parts = row.baseline.iter().flat_map(|baseline| &baseline.of);
@@ -34,7 +38,7 @@ pub fn faults(rows: &[Row], growths: &[Growth], figures: &Figures) -> Vec<String
     once.into_iter().collect()
 }
 
-fn of_figure(name: &str, show: Show, unit: &str, figures: &Figures) -> Option<String> {
+fn of_figure(name: &str, show: Show, unit: &str, figures: &BenchmarkFigures) -> Option<String> {
     match figures.get(name) {
         None => Some(format!("{name} was not measured")),
         Some(figure) => figure
@@ -50,18 +54,18 @@ mod tests {
 
     use super::*;
 
-    fn rows(toml: &str) -> Vec<Row> {
+    fn rows(toml: &str) -> Vec<BenchmarkRow> {
         #[derive(serde::Deserialize)]
         struct Rows {
-            row: Vec<Row>,
+            row: Vec<BenchmarkRow>,
         }
         toml::from_str::<Rows>(toml).unwrap().row
     }
 
-    fn told(lines: &str) -> Figures {
+    fn printed(lines: &str) -> BenchmarkFigures {
         let directory = tempfile::tempdir().unwrap();
         fs::write(directory.path().join("any.figures"), lines).unwrap();
-        Figures::read(directory.path()).unwrap()
+        BenchmarkFigures::read(directory.path()).unwrap()
     }
 
     const ROW: &str = r#"
@@ -82,29 +86,29 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_for_and_told_is_no_fault() {
-        assert_eq!(faults(&rows(ROW), &[], &told(&trimmed(BOTH))), [""; 0]);
+    fn a_measured_figure_is_not_a_fault() {
+        assert_eq!(faults(&rows(ROW), &[], &printed(&trimmed(BOTH))), [""; 0]);
     }
 
     #[test]
-    fn a_renamed_figure_is_found_whether_it_is_shown_or_compared_with() {
+    fn a_renamed_figure_or_baseline_is_found() {
         let renamed = trimmed(BOTH).replace("start/64", "begin/64");
         assert_eq!(
-            faults(&rows(ROW), &[], &told(&renamed)),
+            faults(&rows(ROW), &[], &printed(&renamed)),
             ["actor/start/64 was not measured"]
         );
         let renamed = trimmed(BOTH).replace("start/1", "begin/1");
         assert_eq!(
-            faults(&rows(ROW), &[], &told(&renamed)),
+            faults(&rows(ROW), &[], &printed(&renamed)),
             ["actor/start/1 was not measured"]
         );
     }
 
     #[test]
-    fn a_foreign_unit_is_refused() {
+    fn another_unit_is_refused() {
         let seconds = trimmed(BOTH).replacen("ms", "s", 1);
         assert_eq!(
-            faults(&rows(ROW), &[], &told(&seconds)),
+            faults(&rows(ROW), &[], &printed(&seconds)),
             ["actor/start/64 is in s, not in ms"]
         );
     }
@@ -125,7 +129,7 @@ mod tests {
         )
         .unwrap();
         assert_eq!(
-            faults(&[], &[growth], &told(&trimmed(BOTH))),
+            faults(&[], &[growth], &printed(&trimmed(BOTH))),
             ["actor/end/NUMBER was not measured"]
         );
     }

@@ -1,9 +1,9 @@
-//! What the benchmarks left: criterion's samples, and lines of JSON of those that criterion cannot
-//! run.
+//! BenchmarkFigures that the benchmarks measured: criterion's samples, and lines of JSON from
+//! benchmarks that criterion cannot run.
 //!
-//! The figure is the fastest sample. Virtual machines share their cores with strangers, who slow
-//! whole seconds down by half, unseen from within; nothing makes code faster than it is. The median
-//! is kept beside it, so that it is seen how much the machine was disturbed.
+//! A figure is the fastest sample. Virtual machines share their cores with others, who slow whole
+//! seconds down by half, invisibly from within; nothing makes code faster than it is. The median is
+//! kept too, to show how much the machine was disturbed.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -14,84 +14,84 @@ use serde::Deserialize;
 
 use super::catalogue::{Show, per_second};
 
-/// All figures of one run, by name.
+/// All figures of one session, by name.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Figures(BTreeMap<String, Figure>);
+pub struct BenchmarkFigures(BTreeMap<String, Figure>);
 
 /// One figure.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Figure {
-    /// By criterion.
+    /// Measured by criterion.
     Timed {
-        /// Seconds an iteration takes, in the fastest of the samples.
+        /// Seconds per iteration in the fastest sample.
         secs: f64,
-        /// The same, in their median.
+        /// Seconds per iteration in the median sample.
         median_secs: f64,
-        /// What an iteration counts for.
+        /// Elements per iteration.
         elements: f64,
     },
     /// From a line of JSON.
-    Told(Told),
+    Printed(PrintedFigure),
 }
 
-/// A line of JSON that a benchmark prints.
+/// Line of JSON that a benchmark prints.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct Told {
-    /// The figure's name.
+pub struct PrintedFigure {
+    /// Name of the figure.
     pub name: String,
-    /// The figure.
+    /// Value of the figure.
     pub figure: f64,
-    /// Its unit, which must be that of its row.
+    /// Unit of the value, which must equal that of its row.
     pub unit: String,
-    /// What it is compared with.
+    /// Description of the baseline.
     pub baseline: Option<String>,
-    /// That, in the same unit.
+    /// Value of the baseline, in the same unit.
     pub baseline_figure: Option<f64>,
 }
 
-/// A file that is not what it should be.
+/// Reason why a file of figures cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum FiguresError {
-    /// It cannot be read.
+    /// The file cannot be read.
     #[error("cannot read {}: {source}", path.display())]
     Read {
         /// The file or folder.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         #[source]
         source: io::Error,
     },
-    /// It does not hold what it should.
+    /// The contents are invalid.
     #[error("{}: {source}", path.display())]
     Malformed {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Problem of the contents.
         #[source]
         source: serde_json::Error,
     },
 }
 
-/// Why a figure cannot be shown as it is asked for.
+/// Reason why a figure cannot be shown in the requested form.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Unfit {
     /// It has another unit.
     #[error("is in {found}, not in {asked}")]
     Unit {
-        /// Its own.
+        /// Unit of the figure.
         found: String,
-        /// The one asked for.
+        /// Requested unit.
         asked: String,
     },
-    /// A time is asked for.
-    #[error("is a value that a benchmark told, not a time that criterion took")]
-    Told,
-    /// A value is asked for.
-    #[error("is a time that criterion took, not a value that a benchmark told")]
+    /// A time is requested.
+    #[error("is a value printed by a benchmark, not a time measured by criterion")]
+    Printed,
+    /// A value is requested.
+    #[error("is a time measured by criterion, not a value printed by a benchmark")]
     Timed,
 }
 
-/// Of criterion's `benchmark.json`, what is needed.
+/// Needed part of criterion's `benchmark.json`.
 #[derive(Deserialize)]
 struct About {
     full_id: String,
@@ -104,15 +104,15 @@ struct Throughput {
     elements: Option<f64>,
 }
 
-/// Of criterion's `sample.json`, what is needed: iterations and nanoseconds of each sample.
+/// Needed part of criterion's `sample.json`: iterations and nanoseconds of each sample.
 #[derive(Deserialize)]
 struct Samples {
     iters: Vec<f64>,
     times: Vec<f64>,
 }
 
-impl Figures {
-    /// All figures that `directory` holds: criterion's in `criterion/`, and those in the lines of
+impl BenchmarkFigures {
+    /// Reads all figures in `directory`: criterion's in `criterion/`, and those in the lines of
     /// `*.figures` that begin with a brace.
     ///
     /// # Errors
@@ -131,13 +131,12 @@ impl Figures {
         Ok(figures)
     }
 
-    /// Whether there are none.
+    /// Returns `true` if there are no figures.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// The figure that others held up longest, and how many times longer its median is than its
-    /// fastest sample.
+    /// Returns the most disturbed figure, with the ratio of its median to its fastest sample.
     pub fn most_disturbed(&self) -> Option<(&str, f64)> {
         self.0
             .iter()
@@ -145,12 +144,12 @@ impl Figures {
             .max_by(|(_, a), (_, b)| a.total_cmp(b))
     }
 
-    /// The figure called `name`.
+    /// Returns the figure called `name`.
     pub fn get(&self, name: &str) -> Option<&Figure> {
         self.0.get(name)
     }
 
-    /// All figures called `of/<number>`, with that number, from the smallest number on.
+    /// Returns all figures called `of/<number>` with their numbers, in ascending order.
     pub fn series(&self, of: &str) -> Vec<(f64, &Figure)> {
         let number = |name: &str| name.strip_prefix(of)?.strip_prefix('/')?.parse().ok();
         let mut series: Vec<(f64, &Figure)> = self
@@ -162,7 +161,7 @@ impl Figures {
         series
     }
 
-    /// A benchmark's results lie in folders named after its parts, `new/` in the last.
+    /// A benchmark's results lie in folders named after its parts, in `new/` of the last.
     fn read_criterion(&mut self, folder: &Path) -> Result<(), FiguresError> {
         let about = folder.join("new/benchmark.json");
         if about.exists() {
@@ -194,19 +193,20 @@ impl Figures {
             source,
         })?;
         for line in text.lines().filter(|line| line.starts_with('{')) {
-            let told: Told =
+            let printed: PrintedFigure =
                 serde_json::from_str(line).map_err(|source| FiguresError::Malformed {
                     path: path.to_owned(),
                     source,
                 })?;
-            self.0.insert(told.name.clone(), Figure::Told(told));
+            self.0
+                .insert(printed.name.clone(), Figure::Printed(printed));
         }
         Ok(())
     }
 }
 
 impl Samples {
-    /// Seconds of an iteration: the fastest, and the median. `None` without samples.
+    /// Returns the seconds per iteration: fastest and median. `None` without samples.
     fn secs(&self) -> Option<(f64, f64)> {
         let mut secs: Vec<f64> = self
             .times
@@ -220,10 +220,10 @@ impl Samples {
 }
 
 impl Figure {
-    /// The number that is shown, in `unit` and `scale` times; of a share of the peak, the time.
+    /// Returns the shown number, in `unit` and times `scale`; for a share of the peak, the time.
     ///
     /// # Errors
-    /// [`Unfit`] when this figure has no such number.
+    /// Returns [`Unfit`] if this figure has no such number.
     pub fn shown(&self, show: Show, unit: &str, scale: f64) -> Result<f64, Unfit> {
         let foreign = |found: &str| Unfit::Unit {
             found: found.to_owned(),
@@ -234,15 +234,17 @@ impl Figure {
             (Self::Timed { secs, elements, .. }, Show::Rate) => elements / secs,
             (Self::Timed { secs, elements, .. }, Show::Time) => in_unit(secs / elements)?,
             (Self::Timed { secs, .. }, Show::PeakShare) => in_unit(*secs)?,
-            (Self::Told(told), Show::Value) if told.unit == unit => told.figure,
-            (Self::Told(told), Show::Value) => return Err(foreign(&told.unit)),
+            (Self::Printed(printed), Show::Value) if printed.unit == unit => printed.figure,
+            (Self::Printed(printed), Show::Value) => return Err(foreign(&printed.unit)),
             (Self::Timed { .. }, Show::Value) => return Err(Unfit::Timed),
-            (Self::Told(_), Show::Rate | Show::Time | Show::PeakShare) => return Err(Unfit::Told),
+            (Self::Printed(_), Show::Rate | Show::Time | Show::PeakShare) => {
+                return Err(Unfit::Printed);
+            }
         };
         Ok(value * scale)
     }
 
-    /// The same figure by the median of its samples, if it was timed.
+    /// Returns the same figure by the median of its samples, if it was timed.
     pub fn at_median(&self) -> Option<Self> {
         match *self {
             Self::Timed {
@@ -254,17 +256,17 @@ impl Figure {
                 median_secs,
                 elements,
             }),
-            Self::Told(_) => None,
+            Self::Printed(_) => None,
         }
     }
 
-    /// How many times longer than the fastest sample the median took, if it was timed.
+    /// Returns the ratio of the median to the fastest sample, if it was timed.
     pub fn disturbance(&self) -> Option<f64> {
         match self {
             Self::Timed {
                 secs, median_secs, ..
             } => Some(median_secs / secs),
-            Self::Told(_) => None,
+            Self::Printed(_) => None,
         }
     }
 }
@@ -303,8 +305,8 @@ fn json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, FiguresError> 
 pub(super) mod tests {
     use super::*;
 
-    /// Figures as criterion would have left them: name, nanoseconds, elements.
-    pub(in super::super) fn timed(figures: &[(&str, f64, f64)]) -> Figures {
+    /// Returns figures as criterion leaves them: name, nanoseconds, elements.
+    pub(in super::super) fn timed(figures: &[(&str, f64, f64)]) -> BenchmarkFigures {
         let figure = |&(name, nanos, elements): &(&str, f64, f64)| {
             let secs = nanos / 1e9;
             let figure = Figure::Timed {
@@ -314,7 +316,7 @@ pub(super) mod tests {
             };
             (name.to_owned(), figure)
         };
-        Figures(figures.iter().map(figure).collect())
+        BenchmarkFigures(figures.iter().map(figure).collect())
     }
 
     #[test]
@@ -327,14 +329,17 @@ pub(super) mod tests {
         let samples =
             r#"{"sampling_mode":"Flat","iters":[2.0,2.0,2.0],"times":[8000.0,4000.0,6000.0]}"#;
         fs::write(new.join("sample.json"), samples).unwrap();
-        let line = r#"{"name":"transport/records","figure":3e5,"unit":"records/s","baseline":"memcpy","baseline_figure":6e5}"#;
+        let line = concat!(
+            r#"{"name":"transport/records","figure":3e5,"unit":"records/s","#,
+            r#""baseline":"memcpy","baseline_figure":6e5}"#
+        );
         fs::write(
             directory.path().join("transport.figures"),
             format!("a word\n{line}\n"),
         )
         .unwrap();
 
-        let figures = Figures::read(directory.path()).unwrap();
+        let figures = BenchmarkFigures::read(directory.path()).unwrap();
         let timed = figures.get("replay/sample/1024").unwrap();
         assert_eq!(timed.shown(Show::Time, "µs", 1.0), Ok(0.5));
         assert_eq!(timed.shown(Show::Rate, "any", 0.5), Ok(1e6));
@@ -344,14 +349,19 @@ pub(super) mod tests {
             Ok(0.75)
         );
         assert_eq!(timed.shown(Show::Value, "any", 1.0), Err(Unfit::Timed));
-        let told = figures.get("transport/records").unwrap();
-        assert_eq!(told.shown(Show::Value, "records/s", 1.0), Ok(3e5));
-        let refused = told.shown(Show::Value, "steps/s", 1.0).unwrap_err();
+        let printed = figures.get("transport/records").unwrap();
+        assert_eq!(printed.shown(Show::Value, "records/s", 1.0), Ok(3e5));
+        let refused = printed.shown(Show::Value, "steps/s", 1.0).unwrap_err();
         assert_eq!(refused.to_string(), "is in records/s, not in steps/s");
-        assert_eq!(told.shown(Show::Rate, "records/s", 1.0), Err(Unfit::Told));
+        assert_eq!(
+            printed.shown(Show::Rate, "records/s", 1.0),
+            Err(Unfit::Printed)
+        );
 
         fs::write(directory.path().join("bad.figures"), "{\"name\":1}\n").unwrap();
-        let refused = Figures::read(directory.path()).unwrap_err().to_string();
+        let refused = BenchmarkFigures::read(directory.path())
+            .unwrap_err()
+            .to_string();
         assert!(refused.contains("bad.figures"), "{refused}");
     }
 

@@ -1,10 +1,9 @@
-//! What the benchmarks measured, as a table and as pictures.
+//! Tables and pictures of what the benchmarks measured.
 //!
-//! The benchmarks themselves lie in the packages they measure. Which there are, what is asked of
-//! each and what it is compared with stands in one place, `tests/bench/benchmarks.toml` ([`catalogue`]);
-//! [`figures`] reads what they left, [`faults`] what is missing, and [`table`] sets the two beside
-//! each other, under the [`machine`] that they ran on. Figure and baseline of a row were measured
-//! by the same run.
+//! The benchmarks themselves lie in the packages that they measure. `tests/bench/benchmarks.toml`
+//! ([`catalogue`]) lists them with their targets and baselines. [`figures`] reads the results,
+//! [`faults`] lists what is missing, and [`table`] compares results with targets, below a
+//! description of the [`machine`]. Figure and baseline of a row come from the same session.
 
 pub mod catalogue;
 pub mod faults;

@@ -1,4 +1,4 @@
-//! The machine that figures were measured on.
+//! Machine on which figures were measured.
 
 use std::fmt;
 use std::fs;
@@ -10,48 +10,49 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 use skein_kernels::{Isa, peak_flops};
 
-/// Bytes copied at a time, beyond any cache.
+/// Bytes copied at a time, more than any cache holds.
 const COPIED: usize = 128 << 20;
-/// Times that they are copied; the fastest counts.
+/// Number of copies; the fastest counts.
 const COPIES: usize = 4;
 
-/// Instruction sets that decide how fast kernels are, as `/proc/cpuinfo` spells them.
+/// Instruction sets that determine the speed of the kernels, as `/proc/cpuinfo` spells them.
 const INSTRUCTIONS: [&str; 6] = ["sse4_2", "avx", "avx2", "fma", "f16c", "avx512f"];
 
-/// What one core can do at best, measured. A line of `machine.jsonl`, written between two
-/// benchmarks: what holds the core up then must not pass for all it can do, so the best of all
-/// lines counts.
+/// Best measured performance of one core, as a line of `machine.jsonl`. A line is written between
+/// any two benchmarks, and the best of all lines counts, because a disturbance must not pass for
+/// the core's limit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Core {
-    /// f32 operations a second.
+    /// f32 operations per second.
     pub f32_flops: f64,
-    /// Bytes a second copied from memory to memory.
+    /// Bytes per second copied from memory to memory.
     pub copied_bytes_per_sec: f64,
-    /// Threads of others that ran, or wanted to, at that moment: with any, times are too long.
+    /// Threads of other processes that ran or were ready at that moment. Any such thread lengthens
+    /// times.
     pub others_running: u32,
-    /// Whether it was the only core that was allowed to measure.
+    /// `true` if the measurement was pinned to this core.
     pub is_pinned: bool,
 }
 
-/// What is known of it.
+/// Description of the machine.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Machine {
-    /// The processor's name, with family and model: virtual machines often hide the rest.
+    /// Processor name with family and model; virtual machines often hide the rest.
     pub processor: String,
-    /// Cores that processes may use.
+    /// Cores available to processes.
     pub cores: usize,
-    /// Of the instruction sets that matter, those it has.
+    /// Relevant instruction sets that it has.
     pub instructions: Vec<&'static str>,
-    /// One of them.
+    /// Performance of one core.
     pub core: Core,
-    /// Memory, bytes.
+    /// Memory in bytes.
     pub memory_bytes: u64,
-    /// The kernel.
+    /// Kernel version.
     pub kernel: String,
 }
 
 impl Core {
-    /// The core that the calling thread runs on.
+    /// Measures the core of the calling thread.
     pub fn measure() -> Self {
         Self {
             f32_flops: peak_flops(Isa::best()),
@@ -61,8 +62,8 @@ impl Core {
         }
     }
 
-    /// The best of what the lines of `path` say, and the worst of what disturbed it; measured now
-    /// where there are none.
+    /// Combines the best performance and the worst disturbance of the lines of `path`; measures now
+    /// if there are none.
     pub fn best_of(path: &Path) -> Self {
         let text = fs::read_to_string(path).unwrap_or_default();
         let lines = text
@@ -80,7 +81,7 @@ impl Core {
 }
 
 impl Machine {
-    /// This machine, whose cores are like `core`.
+    /// Describes this machine, with `core` as measured.
     pub fn with(core: Core) -> Self {
         let info = read("/proc/cpuinfo");
         let field = |name: &str| {
@@ -129,7 +130,7 @@ fn copied_bytes_per_sec() -> f64 {
     COPIED as f64 / copies.fold(f64::INFINITY, f64::min)
 }
 
-/// Of `/proc/loadavg`, the threads that run or want to, without the calling one.
+/// Returns the running and ready threads of `/proc/loadavg`, without the calling one.
 fn others_running(load: &str) -> u32 {
     let running = load
         .split_whitespace()
@@ -138,7 +139,7 @@ fn others_running(load: &str) -> u32 {
     running.unwrap_or(1_u32).saturating_sub(1)
 }
 
-/// The machine's cores; the calling thread itself may be pinned to one.
+/// Returns the number of the machine's cores; the calling thread itself may be pinned to one.
 fn cores(info: &str) -> usize {
     let listed = info
         .lines()
@@ -147,7 +148,7 @@ fn cores(info: &str) -> usize {
     listed.max(thread::available_parallelism().map_or(1, Into::into))
 }
 
-/// What a file of the system says; nothing where there is none.
+/// Returns the contents of a system file; empty if it does not exist.
 fn read(path: &str) -> String {
     fs::read_to_string(path).unwrap_or_default()
 }
@@ -156,7 +157,8 @@ impl fmt::Display for Machine {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "{}, {} cores, {:.0} GB of memory, Linux {}; between benchmarks, at most {} threads of others ran",
+            "{}, {} cores, {:.0} GB of memory, Linux {}; \
+                at most {} other threads ran between benchmarks",
             self.processor,
             self.cores,
             self.memory_bytes as f64 / 1e9,
@@ -183,7 +185,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_best_of_what_was_measured_counts() {
+    fn the_best_measurement_counts() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("machine.jsonl");
         let line = |f32_flops, copied_bytes_per_sec, others_running| {
@@ -202,12 +204,12 @@ mod tests {
         .unwrap();
         let best = Core::best_of(&path);
         assert_eq!((best.f32_flops, best.copied_bytes_per_sec), (2e9, 3e9));
-        // And the worst of what disturbed.
+        // Of the disturbances, the worst counts.
         assert_eq!((best.others_running, best.is_pinned), (2, false));
     }
 
     #[test]
-    fn whoever_asks_does_not_count_as_another() {
+    fn the_calling_thread_does_not_count_as_another() {
         assert_eq!(others_running("9.92 9.09 6.03 3/412 31793"), 2);
         assert_eq!(others_running("0.00 0.00 0.00 1/412 31793"), 0);
         assert_eq!(others_running(""), 0);

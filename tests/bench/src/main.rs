@@ -1,5 +1,5 @@
-//! `skein-bench`: tells which benchmarks there are, and sets what they measured in a table.
-//! `tests/bench.sh` runs them in between.
+//! `skein-bench`: lists the benchmarks, and tabulates their results. `tests/bench.sh` runs the
+//! benchmarks in between.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,15 +8,15 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail};
 use clap::{Parser, Subcommand};
 use serde::Serialize;
-use skein_bench::catalogue::{BenchKind, Catalogue, Growth, Row, When, bench_of};
+use skein_bench::catalogue::{BenchKind, BenchmarkRow, Catalogue, Growth, RunCondition, bench_of};
 use skein_bench::faults::faults;
-use skein_bench::figures::Figures;
+use skein_bench::figures::BenchmarkFigures;
 use skein_bench::machine::{Core, Machine};
 use skein_bench::table::{Judging, Table};
 use skein_reports::growth::{GrowthLine, GrowthPicture};
 use skein_run::failure::with_causes;
 
-/// Lists the benchmarks, and tells what they measured.
+/// Lists the benchmarks and tabulates their results.
 #[derive(Debug, Parser)]
 #[command(version)]
 struct Cli {
@@ -26,34 +26,34 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Print name and kind of each benchmark that is to be run, one a line.
+    /// Print name and kind of each benchmark to run, one per line.
     List {
-        /// This one alone; may be repeated.
+        /// Only this benchmark; may be repeated.
         #[arg(long, value_name = "NAME")]
         only: Vec<String>,
-        /// Those too that only pictures of growth need.
+        /// Include benchmarks that only pictures of growth need.
         #[arg(long)]
         growth: bool,
     },
-    /// Measure what this core can do at best, and print it as a line of JSON.
+    /// Measure the peak performance of this core, and print it as a line of JSON.
     Core,
-    /// Print the table of what was measured, and write it beside the figures.
+    /// Print the table of the results, and write it beside the figures.
     Table {
-        /// Where the figures are.
+        /// Folder of the figures.
         directory: PathBuf,
-        /// Rows of this benchmark alone; may be repeated.
+        /// Only rows of this benchmark; may be repeated.
         #[arg(long, value_name = "NAME")]
         only: Vec<String>,
-        /// The benchmarks were run to see that they work: judge nothing.
+        /// Treat the results as a trial run: judge nothing.
         #[arg(long)]
         quick: bool,
-        /// Draw how cost grows into this folder.
+        /// Draw pictures of how cost grows into this folder.
         #[arg(long, value_name = "DIR")]
         pictures: Option<PathBuf>,
     },
 }
 
-/// `table.json`.
+/// Contents of `table.json`.
 #[derive(Serialize)]
 struct Results<'a> {
     machine: &'a Machine,
@@ -63,9 +63,14 @@ struct Results<'a> {
 
 fn main() -> ExitCode {
     let done = match Cli::parse().command {
-        Command::List { only, growth } => {
-            list(&only, if growth { When::Growth } else { When::Always })
-        }
+        Command::List { only, growth } => list(
+            &only,
+            if growth {
+                RunCondition::Growth
+            } else {
+                RunCondition::Always
+            },
+        ),
         Command::Core => core(),
         Command::Table {
             directory,
@@ -78,7 +83,7 @@ fn main() -> ExitCode {
             } else {
                 Judging::Times
             };
-            tell(&directory, &only, judging, pictures.as_deref())
+            tabulate(&directory, &only, judging, pictures.as_deref())
         }
     };
     match done {
@@ -90,7 +95,7 @@ fn main() -> ExitCode {
     }
 }
 
-fn list(only: &[String], when: When) -> Result<()> {
+fn list(only: &[String], when: RunCondition) -> Result<()> {
     let benches = Catalogue::load().benches;
     if let Some(unknown) = only
         .iter()
@@ -98,13 +103,13 @@ fn list(only: &[String], when: When) -> Result<()> {
     {
         let names: Vec<_> = benches.into_iter().map(|bench| bench.name).collect();
         bail!(
-            "no benchmark is called {unknown}; there are {}",
+            "no benchmark is called {unknown}; the benchmarks are {}",
             names.join(", ")
         );
     }
     for bench in benches {
         let wanted = match only {
-            [] => bench.when == When::Always || when == When::Growth,
+            [] => bench.when == RunCondition::Always || when == RunCondition::Growth,
             only => only.contains(&bench.name),
         };
         if wanted {
@@ -123,7 +128,7 @@ fn core() -> Result<()> {
     Ok(())
 }
 
-fn tell(
+fn tabulate(
     directory: &Path,
     only: &[String],
     judging: Judging,
@@ -131,7 +136,7 @@ fn tell(
 ) -> Result<()> {
     let wanted = |figure: &str| only.is_empty() || only.iter().any(|name| name == bench_of(figure));
     let Catalogue { rows, growths, .. } = Catalogue::load();
-    let figures = Figures::read(directory)?;
+    let figures = BenchmarkFigures::read(directory)?;
     if figures.is_empty() {
         bail!(
             "{} holds no figures: run tests/bench.sh",
@@ -139,7 +144,7 @@ fn tell(
         );
     }
     let machine = Machine::with(Core::best_of(&directory.join("machine.jsonl")));
-    let rows: Vec<Row> = rows.into_iter().filter(|row| wanted(&row.figure)).collect();
+    let rows: Vec<BenchmarkRow> = rows.into_iter().filter(|row| wanted(&row.figure)).collect();
     let table = Table::new(&rows, &figures, machine.core.f32_flops);
     let note = note(judging, &figures);
     println!("{machine}\n{}\n{note}", table.to_terminal(judging));
@@ -169,28 +174,28 @@ fn tell(
     match faults(&rows, &growths, &figures) {
         faults if faults.is_empty() => Ok(()),
         faults => bail!(
-            "the benchmarks told something else than tests/bench/benchmarks.toml asks for:\n  {}",
+            "the figures differ from what tests/bench/benchmarks.toml needs:\n  {}",
             faults.join("\n  ")
         ),
     }
 }
 
-/// What is to be known of the table's times.
-fn note(judging: Judging, figures: &Figures) -> String {
+/// Returns a note on the meaning of the table's times.
+fn note(judging: Judging, figures: &BenchmarkFigures) -> String {
     match (judging, figures.most_disturbed()) {
-        (Judging::Nothing, _) => {
-            "Run to see that the benchmarks work: these times mean nothing.".to_owned()
-        }
+        (Judging::Nothing, _) => "Trial run: these times mean nothing.".to_owned(),
         (Judging::Times, None) => {
-            "What needs processes is a median of 15 starts, or a mean over two seconds.".to_owned()
+            "BenchmarkFigures from processes are medians of 15 starts, or means over two seconds."
+                .to_owned()
         }
         (Judging::Times, Some((name, times))) => format!(
-            "A figure that has a median beside it is the fastest of 60 samples, and judged by that; the median took up to {times:.2} times as long, at {name}."
+            "A figure with a median beside it is the fastest of 60 samples and is judged by that; \
+                the median was up to {times:.2} times as long, for {name}."
         ),
     }
 }
 
-fn draw(growths: &[Growth], figures: &Figures, folder: &Path) -> Result<()> {
+fn draw(growths: &[Growth], figures: &BenchmarkFigures, folder: &Path) -> Result<()> {
     for growth in growths {
         let path = folder.join(&growth.picture).with_extension("png");
         if picture(growth, figures).draw(&path)? {
@@ -200,7 +205,7 @@ fn draw(growths: &[Growth], figures: &Figures, folder: &Path) -> Result<()> {
     Ok(())
 }
 
-fn picture<'a>(growth: &'a Growth, figures: &Figures) -> GrowthPicture<'a> {
+fn picture<'a>(growth: &'a Growth, figures: &BenchmarkFigures) -> GrowthPicture<'a> {
     let lines = growth.series.iter().map(|series| GrowthLine {
         label: &series.label,
         points: figures

@@ -1,77 +1,77 @@
-//! The table: each figure beside what it must reach and what it is compared with.
+//! Table of figures with their targets and baselines.
 
 use comfy_table::presets::{ASCII_MARKDOWN, UTF8_FULL_CONDENSED};
 use comfy_table::{Cell, CellAlignment, ContentArrangement, Table as Grid};
 use serde::Serialize;
 
-use super::catalogue::{Row, Show, per_second};
-use super::figures::{Figure, Figures};
+use super::catalogue::{BenchmarkRow, Show, per_second};
+use super::figures::{BenchmarkFigures, Figure};
 
-/// Columns of a terminal that the table fits into.
+/// Terminal columns that the table fits into.
 const WIDTH: u16 = 130;
 
-/// The rows, judged.
+/// Rows with verdicts.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Table {
-    lines: Vec<Line>,
+    lines: Vec<JudgedRow>,
 }
 
-/// A row with its numbers.
+/// BenchmarkRow with its numbers.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-struct Line {
+struct JudgedRow {
     stage: String,
     unit: String,
-    /// In `unit`.
+    /// Value in `unit`.
     figure: Option<f64>,
-    /// The same by the median of its samples, if it was timed.
+    /// Value by the median of its samples, if it was timed.
     median: Option<f64>,
-    /// Of the core's f32 peak.
+    /// Share of the core's f32 peak.
     peak_share: Option<f64>,
     target: String,
     baseline: Option<Compared>,
-    /// How many times better than the baseline.
+    /// Improvement over the baseline, as a factor.
     ratio: Option<f64>,
-    verdict: Verdict,
+    verdict: RowVerdict,
 }
 
-/// What a figure is compared with, and its number in the row's unit.
+/// Baseline of a figure, with its value in the row's unit.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 struct Compared {
     what: String,
     figure: f64,
 }
 
-/// Whether a row reaches what is asked of it.
+/// Verdict on a row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-enum Verdict {
+enum RowVerdict {
     Met,
     Missed,
     NothingAsked,
     NotMeasured,
 }
 
-/// Whether times mean anything.
+/// Meaning of the measured times.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Judging {
-    /// They do.
+    /// Times are meaningful.
     Times,
-    /// It was run to see that it works; nothing is judged.
+    /// A trial run: nothing is judged.
     Nothing,
 }
 
 impl Table {
-    /// `rows` with their `figures`, where one core does `f32_flops`.
-    pub fn new(rows: &[Row], figures: &Figures, f32_flops: f64) -> Self {
+    /// Builds the table of `rows` with their `figures`, for a core with `f32_flops`.
+    pub fn new(rows: &[BenchmarkRow], figures: &BenchmarkFigures, f32_flops: f64) -> Self {
         Self {
             lines: rows
                 .iter()
-                .map(|row| Line::new(row, figures, f32_flops))
+                .map(|row| JudgedRow::new(row, figures, f32_flops))
                 .collect(),
         }
     }
 
-    /// For a terminal.
+    /// Returns the table for a terminal.
     pub fn to_terminal(&self, judging: Judging) -> String {
         let mut grid = self.grid(judging);
         grid.load_preset(UTF8_FULL_CONDENSED)
@@ -80,7 +80,7 @@ impl Table {
         grid.to_string()
     }
 
-    /// For a document.
+    /// Returns the table for a document.
     pub fn to_markdown(&self, judging: Judging) -> String {
         let mut grid = self.grid(judging);
         grid.load_preset(ASCII_MARKDOWN);
@@ -90,13 +90,7 @@ impl Table {
     fn grid(&self, judging: Judging) -> Grid {
         let mut grid = Grid::new();
         grid.set_header([
-            "stage",
-            "figure",
-            "median",
-            "must reach",
-            "baseline",
-            "ratio",
-            "met",
+            "stage", "figure", "median", "target", "baseline", "ratio", "met",
         ]);
         for line in &self.lines {
             let right = |text: String| Cell::new(text).set_alignment(CellAlignment::Right);
@@ -112,9 +106,10 @@ impl Table {
                         .unwrap_or_default(),
                 ),
                 Cell::new(match (judging, line.verdict) {
-                    (Judging::Times, Verdict::Met) => "yes",
-                    (Judging::Times, Verdict::Missed) => "NO",
-                    (Judging::Nothing, _) | (_, Verdict::NothingAsked | Verdict::NotMeasured) => "",
+                    (Judging::Times, RowVerdict::Met) => "yes",
+                    (Judging::Times, RowVerdict::Missed) => "NO",
+                    (Judging::Nothing, _)
+                    | (_, RowVerdict::NothingAsked | RowVerdict::NotMeasured) => "",
                 }),
             ]);
         }
@@ -122,8 +117,8 @@ impl Table {
     }
 }
 
-impl Line {
-    fn new(row: &Row, figures: &Figures, f32_flops: f64) -> Self {
+impl JudgedRow {
+    fn new(row: &BenchmarkRow, figures: &BenchmarkFigures, f32_flops: f64) -> Self {
         let measured = figures.get(&row.figure);
         let shown = |figure: &Figure| figure.shown(row.show, &row.unit, row.scale).ok();
         let figure = measured.and_then(shown);
@@ -173,8 +168,8 @@ impl Line {
     }
 }
 
-/// Times are better when they are less, and so is what must not exceed something.
-fn less_is_better(row: &Row) -> bool {
+/// Returns `true` for times and for figures with an upper limit.
+fn less_is_better(row: &BenchmarkRow) -> bool {
     match row.show {
         Show::Rate => false,
         Show::Time | Show::PeakShare => true,
@@ -182,13 +177,13 @@ fn less_is_better(row: &Row) -> bool {
     }
 }
 
-/// What `measured` is compared with, if that was measured too.
-fn compared(row: &Row, measured: &Figure, figures: &Figures) -> Option<Compared> {
+/// Returns the baseline of `measured`, if it was measured too.
+fn compared(row: &BenchmarkRow, measured: &Figure, figures: &BenchmarkFigures) -> Option<Compared> {
     let Some(baseline) = &row.baseline else {
         return match measured {
-            Figure::Told(told) => Some(Compared {
-                what: told.baseline.clone()?,
-                figure: told.baseline_figure? * row.scale,
+            Figure::Printed(printed) => Some(Compared {
+                what: printed.baseline.clone()?,
+                figure: printed.baseline_figure? * row.scale,
             }),
             Figure::Timed { .. } => None,
         };
@@ -210,7 +205,7 @@ fn compared(row: &Row, measured: &Figure, figures: &Figures) -> Option<Compared>
     })
 }
 
-fn target(row: &Row) -> String {
+fn target(row: &BenchmarkRow) -> String {
     let figure = match (row.show, row.at_least, row.at_most) {
         (Show::PeakShare, Some(share), _) => Some(format!("≥ {}", of_peak(share))),
         (_, Some(least), _) => Some(format!("≥ {}", number(least))),
@@ -227,9 +222,14 @@ fn target(row: &Row) -> String {
         .join(", ")
 }
 
-fn judge(row: &Row, figure: Option<f64>, peak_share: Option<f64>, ratio: Option<f64>) -> Verdict {
+fn judge(
+    row: &BenchmarkRow,
+    figure: Option<f64>,
+    peak_share: Option<f64>,
+    ratio: Option<f64>,
+) -> RowVerdict {
     let Some(figure) = figure else {
-        return Verdict::NotMeasured;
+        return RowVerdict::NotMeasured;
     };
     let reached = [
         row.at_least
@@ -240,11 +240,11 @@ fn judge(row: &Row, figure: Option<f64>, peak_share: Option<f64>, ratio: Option<
     ];
     let mut reached = reached.into_iter().flatten().peekable();
     if reached.peek().is_none() {
-        Verdict::NothingAsked
+        RowVerdict::NothingAsked
     } else if reached.all(|reached| reached) {
-        Verdict::Met
+        RowVerdict::Met
     } else {
-        Verdict::Missed
+        RowVerdict::Missed
     }
 }
 
@@ -252,7 +252,7 @@ fn of_peak(share: f64) -> String {
     format!("{:.0} % of peak", 100.0 * share)
 }
 
-/// Three digits that mean something, thousands set apart.
+/// Returns the number with three significant digits and separated thousands.
 pub(super) fn number(value: f64) -> String {
     if value == 0.0 || !value.is_finite() {
         return value.to_string();
@@ -285,8 +285,8 @@ mod tests {
     use super::super::figures::tests::timed;
     use super::*;
 
-    fn row(show: Show, unit: &str) -> Row {
-        Row {
+    fn row(show: Show, unit: &str) -> BenchmarkRow {
+        BenchmarkRow {
             stage: "a stage".to_owned(),
             figure: "a/figure".to_owned(),
             show,
@@ -299,8 +299,8 @@ mod tests {
         }
     }
 
-    fn line(row: &Row, figures: &Figures) -> Line {
-        Line::new(row, figures, 1e9)
+    fn line(row: &BenchmarkRow, figures: &BenchmarkFigures) -> JudgedRow {
+        JudgedRow::new(row, figures, 1e9)
     }
 
     #[test]
@@ -327,7 +327,7 @@ mod tests {
             ("a/one", 300.0, 10.0),
             ("a/two", 100.0, 5.0),
         ]);
-        let compared = Row {
+        let compared = BenchmarkRow {
             baseline: Some(Baseline {
                 what: "both".to_owned(),
                 of: vec!["a/one".to_owned(), "a/two".to_owned()],
@@ -337,7 +337,7 @@ mod tests {
             ..row(Show::Rate, "frames/s")
         };
         let found = line(&compared, &figures);
-        // 10 ns an element, and 30 + 20 ns.
+        // 10 ns per element, and 30 + 20 ns.
         assert!(
             (found.figure.unwrap() / 1e8 - 1.0).abs() < 1e-9,
             "{found:?}"
@@ -347,39 +347,39 @@ mod tests {
             "{found:?}"
         );
         assert!((found.ratio.unwrap() - 5.0).abs() < 1e-9, "{found:?}");
-        assert_eq!(found.verdict, Verdict::Missed, "the ratio falls short");
-        let met = Row {
+        assert_eq!(found.verdict, RowVerdict::Missed, "the ratio falls short");
+        let met = BenchmarkRow {
             ratio_at_least: Some(4.9),
             ..compared
         };
-        assert_eq!(line(&met, &figures).verdict, Verdict::Met);
+        assert_eq!(line(&met, &figures).verdict, RowVerdict::Met);
     }
 
     #[test]
     fn a_share_of_the_peak_is_judged_by_the_share() {
-        // 600 operations in 1000 ns, of 1000 that the core could do.
+        // 600 operations in 1000 ns, of the 1000 that the core could do.
         let figures = timed(&[("a/figure", 1000.0, 600.0)]);
-        let asked = |share| Row {
+        let asked = |share| BenchmarkRow {
             at_least: Some(share),
             ..row(Show::PeakShare, "µs")
         };
         let found = line(&asked(0.8), &figures);
         assert_eq!(found.figure_text(), "1 µs, 60 % of peak");
         assert_eq!(found.target, "≥ 80 % of peak");
-        assert_eq!(found.verdict, Verdict::Missed);
-        assert_eq!(line(&asked(0.5), &figures).verdict, Verdict::Met);
+        assert_eq!(found.verdict, RowVerdict::Missed);
+        assert_eq!(line(&asked(0.5), &figures).verdict, RowVerdict::Met);
     }
 
     #[test]
-    fn what_was_not_measured_is_not_met() {
-        let asked = Row {
+    fn a_target_without_measurement_is_not_met() {
+        let asked = BenchmarkRow {
             at_most: Some(1.0),
             ..row(Show::Value, "MB")
         };
-        let found = line(&asked, &Figures::default());
+        let found = line(&asked, &BenchmarkFigures::default());
         assert_eq!(
             (found.verdict, found.figure_text().as_str()),
-            (Verdict::NotMeasured, "not measured")
+            (RowVerdict::NotMeasured, "not measured")
         );
     }
 }

@@ -1,8 +1,6 @@
-//! Reads back what TensorBoard is shown: every point of every curve, however many event files it is
-//! spread over.
+//! Reads every point of every TensorBoard curve of a run, across all its event files.
 //!
-//! Field numbers and frame are those that the learner writes by; every length and checksum is
-//! checked.
+//! The learner writes the same field numbers and frames. Every length and checksum is checked.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -11,35 +9,35 @@ use std::path::{Path, PathBuf};
 
 use prost::Message;
 
-/// The values at each step of each curve, in the order in which they are in the files. One each, if
-/// all is well.
+/// Values of each curve at each step, in the order of the files. A sound run has one value per
+/// step.
 pub type Curves = BTreeMap<String, BTreeMap<i64, Vec<f32>>>;
 
-/// Why curves cannot be read.
+/// Reason why curves cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum CurvesError {
-    /// The file system refuses.
+    /// The file system reported an error.
     #[error("{}: {source}", path.display())]
     Io {
         /// File or folder.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         #[source]
         source: io::Error,
     },
-    /// An event is cut short, damaged, or none.
+    /// An event is truncated, damaged, or not an event.
     #[error("{} is damaged after {offset} bytes: {problem}", path.display())]
     Damaged {
         /// The file.
         path: PathBuf,
-        /// Where the event begins.
+        /// Byte offset of the event.
         offset: usize,
-        /// What is wrong with it.
+        /// Problem of the event.
         problem: String,
     },
 }
 
-/// All points in the event files of `folder`.
+/// Returns all points in the event files of `folder`.
 ///
 /// # Errors
 /// [`CurvesError`] names the file.
@@ -52,7 +50,7 @@ pub fn read_curves(folder: &Path) -> Result<Curves, CurvesError> {
     for entry in fs::read_dir(folder).map_err(at(folder))? {
         files.push(entry.map_err(at(folder))?.path());
     }
-    // TensorBoard's order.
+    // TensorBoard reads files in this order.
     files.sort();
     let mut curves = Curves::new();
     for path in files {
@@ -87,7 +85,7 @@ fn read_file(bytes: &[u8], curves: &mut Curves) -> Result<(), (usize, String)> {
 }
 
 fn take_event(rest: &mut &[u8]) -> Result<Event, String> {
-    let cut = || "cut short".to_owned();
+    let cut = || "truncated".to_owned();
     let (length, after) = rest.split_first_chunk::<8>().ok_or_else(cut)?;
     let (length_crc, after) = after.split_first_chunk::<4>().ok_or_else(cut)?;
     if masked_crc(length) != u32::from_le_bytes(*length_crc) {
@@ -135,7 +133,7 @@ struct Value {
 pub(super) mod samples {
     use super::*;
 
-    /// An event file with one point for each of `points`: tag, step, value.
+    /// Returns an event file with one point per element of `points`: tag, step, value.
     pub(crate) fn file(points: &[(&str, i64, f32)]) -> Vec<u8> {
         let mut bytes = Vec::new();
         for &(tag, step, value) in points {
@@ -181,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn an_event_that_is_cut_short_or_damaged_is_named() {
+    fn a_truncated_or_damaged_event_is_named() {
         let sound = samples::file(&[("a", 1, 0.5), ("a", 2, 1.0)]);
         let second = sound.len() / 2;
         for length in second + 1..sound.len() {

@@ -1,5 +1,5 @@
-//! What a run's processes hold of the machine, and may leave behind: other processes, shared
-//! memory, the transport's folder.
+//! Machine resources of a run that may outlive it: processes, shared memory, the transport's
+//! folder.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -10,23 +10,23 @@ use skein_run::RunDirectory;
 
 use super::processes::processes_of;
 
-/// What a run has outside its directory.
+/// Resources of a run outside its directory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Footprint {
     /// Segments in shared memory.
     pub segments: u64,
-    /// Memory that they take, which is less than their length where nothing was written.
+    /// Memory that they occupy, in bytes. Pages that were never written do not count.
     pub segment_bytes: u64,
-    /// Files, folders and sockets in the transport's folder, itself included.
+    /// Files, folders and sockets in the transport's folder, including the folder itself.
     pub transport_entries: u64,
 }
 
-/// What the run `id` has outside its directory.
+/// Returns the resources of the run `id` outside its directory.
 pub fn footprint(id: RunId) -> Footprint {
     let segments = segments(id);
     Footprint {
         segments: segments.len() as u64,
-        // A block is 512 bytes whatever the file system's are: stat(2).
+        // stat(2) counts blocks of 512 bytes, whatever the file system's block size.
         segment_bytes: segments
             .iter()
             .filter_map(|path| fs::metadata(path).ok())
@@ -36,7 +36,7 @@ pub fn footprint(id: RunId) -> Footprint {
     }
 }
 
-/// Everything that is there and should not be once the run is over.
+/// Returns everything that exists but should not exist once the run is over.
 pub fn leftovers(run: &RunDirectory) -> Vec<String> {
     let mut found: Vec<_> = processes_of(run)
         .iter()
@@ -48,7 +48,7 @@ pub fn leftovers(run: &RunDirectory) -> Vec<String> {
             )
         })
         .collect();
-    // Without an identity, nothing was started that could have left anything else.
+    // A run without an identity started no process, so nothing else can be left.
     if let Ok((identity, _)) = run.open() {
         let shared = segments(identity.run);
         found.extend(shared.iter().map(|path| path.display().to_string()));

@@ -1,9 +1,7 @@
-//! Looks at runs from outside: who is alive, what lies about on the machine, and whether two runs
-//! came to the same.
+//! Inspects runs from outside: live processes, leftovers on the machine, and equality of two runs.
 //!
-//! Nothing here takes part in a run. It is what `skein-chaos` and the whole-system tests judge by,
-//! so it trusts no program of ours: processes are those the kernel lists, results are read from the
-//! files.
+//! Nothing here takes part in a run. `skein-chaos` and the whole-system tests judge by it, so it
+//! trusts no program of Skein: it reads processes from the kernel and results from files.
 
 mod curves;
 mod leftovers;
@@ -12,5 +10,5 @@ mod processes;
 
 pub use curves::{Curves, CurvesError, read_curves};
 pub use leftovers::{Footprint, footprint, leftovers};
-pub use outcome::{Check, compare};
-pub use processes::{Process, Role, Usage, processes_of};
+pub use outcome::{OutcomeCheck, compare};
+pub use processes::{ListedProcess, Role, Usage, processes_of};

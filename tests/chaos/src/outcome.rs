@@ -1,4 +1,4 @@
-//! Whether two runs came to the same: file by file, value by value.
+//! Compares the outcomes of two runs, file by file and value by value.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -12,28 +12,28 @@ use skein_run::failure::with_causes;
 
 use super::curves::{Curves, read_curves};
 
-/// Curves that tell of the machine and of what happened to the processes, not of what was learned:
-/// their values differ between any two runs.
-const OF_THE_MACHINE: [&str; 3] = ["rate/", "reissued/", "refused/"];
-/// The column of `episodes.csv` that says who flew.
-const WHO_FLEW: &str = "actor";
+/// Curves that depend on the machine and on the fate of processes, not on what was learned. Their
+/// values differ between any two runs.
+const MACHINE_CURVES: [&str; 3] = ["rate/", "reissued/", "refused/"];
+/// Column of `episodes.csv` with the actor that flew the episode.
+const ACTOR_COLUMN: &str = "actor";
 
-/// One thing that two runs of one configuration and seed have in common.
+/// Comparison of one item that two runs with the same configuration and seed must share.
 #[derive(Debug)]
-pub struct Check {
-    /// What was compared.
+pub struct OutcomeCheck {
+    /// Item compared.
     pub what: &'static str,
-    /// What they have in common, or the first difference.
+    /// Common value, or the first difference.
     pub verdict: Result<String, String>,
 }
 
-/// Compares what `other` came to with what `calm` did. Both have ended.
-pub fn compare(calm: &RunDirectory, other: &RunDirectory) -> Vec<Check> {
+/// Compares the outcome of `other` with that of `calm`. Both have ended.
+pub fn compare(calm: &RunDirectory, other: &RunDirectory) -> Vec<OutcomeCheck> {
     type Compare = fn(&RunDirectory, &RunDirectory) -> Result<String, String>;
     let checks: [(&'static str, Compare); 8] = [
         ("policy_sha256", policies),
-        ("summary.json, what was learned", summaries),
-        ("episodes.csv, but for the actor", episodes),
+        ("summary.json: counts and versions", summaries),
+        ("episodes.csv without the actor", episodes),
         ("best.safetensors", |calm, other| {
             snapshots(&calm.best_snapshot(), &other.best_snapshot())
         }),
@@ -49,11 +49,11 @@ pub fn compare(calm: &RunDirectory, other: &RunDirectory) -> Vec<Check> {
                 &other.evaluation_trajectories_csv(),
             )
         }),
-        ("TensorBoard, every point once", curves),
+        ("TensorBoard: every point once", curves),
     ];
     checks
         .into_iter()
-        .map(|(what, compare)| Check {
+        .map(|(what, compare)| OutcomeCheck {
             what,
             verdict: compare(calm, other),
         })
@@ -83,7 +83,8 @@ fn policies(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String>
 fn summaries(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String> {
     let learned = |of: &Summary| {
         format!(
-            "{:?}: {} episodes, {} steps, {} updates, {} VAE updates, version {}, best {:?} with {:?} walls passed",
+            "{:?}: {} episodes, {} steps, {} updates, {} VAE updates, version {}, \
+                 best {:?} with {:?} walls passed",
             of.ending,
             of.episodes,
             of.steps,
@@ -115,13 +116,13 @@ fn episodes(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String>
             "columns {other_header:?} instead of {calm_header:?}"
         ));
     }
-    let who = calm_header.iter().position(|column| column == WHO_FLEW);
+    let who = calm_header.iter().position(|column| column == ACTOR_COLUMN);
     let without_who = |row: &StringRecord| -> Vec<String> {
-        let told = row
+        let kept = row
             .iter()
             .enumerate()
             .filter(|&(column, _)| Some(column) != who);
-        told.map(|(_, value)| value.to_owned()).collect()
+        kept.map(|(_, value)| value.to_owned()).collect()
     };
     for (number, (calm, other)) in calm_rows.iter().zip(&other_rows).enumerate() {
         if without_who(calm) != without_who(other) {
@@ -133,8 +134,8 @@ fn episodes(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String>
 }
 
 fn snapshots(calm: &Path, other: &Path) -> Result<String, String> {
-    // The file holds paths of course files in its configuration, and those of no two directories
-    // are equal.
+    // The configuration in the file holds absolute paths of course files, which differ between
+    // directories.
     let load = |path: &Path| match Snapshot::load(path) {
         Ok((snapshot, _)) => Ok(format!(
             "version {}, {}",
@@ -183,14 +184,16 @@ fn compare_curves(calm: &Curves, other: &Curves) -> Result<(), String> {
         let steps: BTreeSet<_> = calm.keys().chain(other.keys()).collect();
         for step in steps {
             let [calm] = calm.get(step).map_or(&[][..], Vec::as_slice) else {
-                return Err(format!("the calm run has not one point of {tag} at {step}"));
+                return Err(format!(
+                    "the calm run does not have exactly one point of {tag} at {step}"
+                ));
             };
             let value = match other.get(step).map(Vec::as_slice) {
-                None => return Err(format!("{tag} has a hole at {step}")),
+                None => return Err(format!("{tag} has no point at {step}")),
                 Some([value]) => value,
                 Some(values) => return Err(format!("{tag} has {} points at {step}", values.len())),
             };
-            let of_the_machine = OF_THE_MACHINE.iter().any(|group| tag.starts_with(group));
+            let of_the_machine = MACHINE_CURVES.iter().any(|group| tag.starts_with(group));
             if !of_the_machine && calm.to_bits() != value.to_bits() {
                 return Err(format!("{tag} at {step} is {value} instead of {calm}"));
             }
@@ -214,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn who_flew_is_no_difference_and_anything_else_is() {
+    fn only_the_actor_of_an_episode_may_differ() {
         let (_calm, calm) = run_with("0,0,0,0,1,20,1,0.5,collided\n1,0,0,1,1,20,1,0.5,collided\n");
         let (_other, other) =
             run_with("0,0,0,7,1,20,1,0.5,collided\n1,0,0,7,1,20,1,0.5,collided\n");
@@ -237,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hole_a_duplicate_and_another_value_are_differences() {
+    fn missing_duplicate_and_changed_points_are_differences() {
         let calm = curves_of(&[
             ("sac/loss", 1, 0.5),
             ("sac/loss", 2, 0.25),
@@ -250,7 +253,7 @@ mod tests {
             ("rate/steps", 1, 99.0),
         ];
         assert_eq!(compare_curves(&calm, &curves_of(&sound)), Ok(()));
-        assert!(problem(&[sound[0], sound[2]]).contains("hole at 2"));
+        assert!(problem(&[sound[0], sound[2]]).contains("no point at 2"));
         assert!(problem(&[sound[0], sound[1], sound[1], sound[2]]).contains("2 points at 2"));
         assert!(
             problem(&[sound[0], ("sac/loss", 2, 0.26), sound[2]]).contains("0.26 instead of 0.25")

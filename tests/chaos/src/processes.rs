@@ -1,4 +1,4 @@
-//! The processes of a run, as the kernel lists them.
+//! Processes of a run, as listed by the kernel.
 
 use std::fs;
 use std::io;
@@ -7,19 +7,19 @@ use std::path::{Path, PathBuf};
 use rustix::process::{Pid, Signal, kill_process};
 use skein_run::RunDirectory;
 
-/// A process that was alive when it was looked for.
+/// Process that was alive when it was found.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Process {
-    /// Its number.
+pub struct ListedProcess {
+    /// Process id.
     pub pid: Pid,
     /// Program and arguments.
     pub command: Vec<String>,
-    /// When it was started, in clock ticks since the machine was: tells it from a later process of
-    /// the same number.
+    /// Start time in clock ticks since boot. Distinguishes it from a later process with the same
+    /// id.
     started_ticks: u64,
 }
 
-/// What a process is to its run.
+/// Role of a process in its run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
     /// `skein run`.
@@ -30,12 +30,12 @@ pub enum Role {
     Learner,
     /// `skein-actor`.
     Actor,
-    /// Anything else that was given the directory.
+    /// Any other process that was given the directory.
     Other,
 }
 
 impl Role {
-    /// Its name in reports.
+    /// Returns its name in reports.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Supervisor => "supervisor",
@@ -47,14 +47,14 @@ impl Role {
     }
 }
 
-/// What a process holds of the machine.
+/// Machine resources used by a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Usage {
-    /// Memory that is mapped and present, shared memory included.
+    /// Resident memory, including shared memory.
     pub resident_bytes: u64,
-    /// As many were there at one time.
+    /// Peak of the resident memory.
     pub most_resident_bytes: u64,
-    /// The part of it that is its own: neither files nor shared memory.
+    /// Resident memory that is neither file nor shared memory.
     pub anonymous_bytes: u64,
     /// Open file descriptors.
     pub descriptors: u64,
@@ -62,15 +62,15 @@ pub struct Usage {
     pub threads: u64,
 }
 
-impl Process {
-    /// Whether it runs the program `name`.
+impl ListedProcess {
+    /// Returns `true` if it runs the program `name`.
     pub fn runs(&self, name: &str) -> bool {
         self.command
             .first()
             .is_some_and(|program| Path::new(program).ends_with(name))
     }
 
-    /// What it is to its run.
+    /// Returns its role in the run.
     pub fn role(&self) -> Role {
         let asked_to = |what: &str| self.command.get(1).is_some_and(|argument| argument == what);
         if self.runs("skein-learner") {
@@ -86,7 +86,7 @@ impl Process {
         }
     }
 
-    /// The actor's number, of an actor.
+    /// Returns the actor's id, if it is an actor.
     pub fn actor(&self) -> Option<u32> {
         let flag = self
             .command
@@ -95,30 +95,30 @@ impl Process {
         self.command.get(flag + 1)?.parse().ok()
     }
 
-    /// Sends `signal`, unless it has ended meanwhile.
+    /// Sends `signal`, unless it has ended.
     pub fn signal(&self, signal: Signal) {
         if self.is_alive() {
-            // It may end between the two lines; its number is not given to another that soon.
+            // It may end between the two lines; the kernel does not reuse its id that soon.
             let _ = kill_process(self.pid, signal);
         }
     }
 
-    /// Its number.
+    /// Returns its process id.
     pub fn pid(&self) -> u32 {
         self.pid.as_raw_nonzero().get().cast_unsigned()
     }
 
-    /// Whether it has not ended. A process that waits to be reaped has.
+    /// Returns `true` while it runs. A zombie counts as ended.
     pub fn is_alive(&self) -> bool {
         self.stat().is_some_and(|stat| stat.state != 'Z')
     }
 
-    /// Whether it is stopped by a signal.
+    /// Returns `true` if a signal has stopped it.
     pub fn is_frozen(&self) -> bool {
         self.stat().is_some_and(|stat| stat.state == 'T')
     }
 
-    /// The process that it is a child of now, unless it has ended.
+    /// Returns the id of its current parent, unless it has ended.
     pub fn parent(&self) -> Option<u32> {
         Some(self.stat()?.parent)
     }
@@ -127,10 +127,10 @@ impl Process {
         stat(&proc_folder(self.pid)).filter(|stat| stat.started_ticks == self.started_ticks)
     }
 
-    /// What it holds of the machine.
+    /// Returns the machine resources it uses.
     ///
     /// # Errors
-    /// When it has ended, or belongs to another user.
+    /// Returns an error if it has ended or belongs to another user.
     pub fn usage(&self) -> io::Result<Usage> {
         let folder = proc_folder(self.pid);
         let status = fs::read_to_string(folder.join("status"))?;
@@ -165,18 +165,18 @@ fn proc_folder(pid: Pid) -> PathBuf {
     PathBuf::from(format!("/proc/{}", pid.as_raw_nonzero()))
 }
 
-/// What the kernel tells of a process in one line.
+/// Fields of `/proc/PID/stat`.
 struct Stat {
     state: char,
     parent: u32,
     started_ticks: u64,
 }
 
-/// Of the process that `folder` in /proc is about; `None` when there is none.
+/// Returns the fields for the process of `folder` in /proc; `None` if it does not exist.
 fn stat(folder: &Path) -> Option<Stat> {
     let stat = fs::read_to_string(folder.join("stat")).ok()?;
-    // The program's name, in brackets, may hold anything, brackets and blanks included. Field 3,
-    // the state, follows: proc_pid_stat(5).
+    // The program's name, in brackets, may contain anything, even brackets and blanks. Field 3,
+    // the state, follows it: proc_pid_stat(5).
     let fields: Vec<_> = stat[stat.rfind(')')? + 1..].split_whitespace().collect();
     let field = |number: usize| fields.get(number - 3);
     Some(Stat {
@@ -186,13 +186,13 @@ fn stat(folder: &Path) -> Option<Stat> {
     })
 }
 
-/// The living processes that were given the run's directory as an argument: all of its own are. In
-/// the order in which they were started.
-pub fn processes_of(run: &RunDirectory) -> Vec<Process> {
+/// Returns the live processes that have the run's directory as an argument, which all processes of
+/// a run have, in order of their start.
+pub fn processes_of(run: &RunDirectory) -> Vec<ListedProcess> {
     let directory = run.root().to_string_lossy();
     let process = |entry: fs::DirEntry| {
         let pid = Pid::from_raw(entry.file_name().to_str()?.parse().ok()?)?;
-        // A process that has just ended cannot be read, one that waits to be reaped reads as empty.
+        // A process that has just ended cannot be read; a zombie reads as empty.
         let command = fs::read(entry.path().join("cmdline")).ok()?;
         let command: Vec<_> = command
             .strip_suffix(&[0])?
@@ -203,7 +203,7 @@ pub fn processes_of(run: &RunDirectory) -> Vec<Process> {
         command
             .iter()
             .any(|argument| *argument == directory)
-            .then_some(Process {
+            .then_some(ListedProcess {
                 pid,
                 command,
                 started_ticks,
@@ -226,7 +226,7 @@ mod tests {
 
     use super::*;
 
-    /// A process that was given the directory `run`, and is ended with the test.
+    /// A process that has the argument `run` and ends with the test.
     struct Sleeper(Child);
 
     impl Sleeper {
@@ -260,14 +260,14 @@ mod tests {
     fn a_process_is_found_frozen_woken_and_gone() {
         let run = RunDirectory::new("/no-run-has-this-name/found");
         let mut sleeper = Sleeper::given("/no-run-has-this-name/found");
-        // Between fork and exec it still has the arguments of this process.
+        // Between fork and exec it still has this test's arguments.
         until(|| !processes_of(&run).is_empty());
         let found = processes_of(&run);
         assert_eq!(found.len(), 1);
         let process = &found[0];
         assert!(process.runs("sh") && process.role() == Role::Other && process.is_alive());
         assert_eq!(process.parent(), Some(std::process::id()));
-        // Just after exec it has hardly a page yet.
+        // Just after exec it has hardly any pages.
         until(|| {
             let usage = process.usage().unwrap();
             usage.threads == 1
@@ -279,7 +279,7 @@ mod tests {
         process.signal(Signal::CONT);
         until(|| !process.is_frozen());
         process.signal(Signal::KILL);
-        // Not reaped yet, and dead all the same.
+        // A zombie, and dead all the same.
         until(|| !process.is_alive());
         assert_eq!(processes_of(&run), []);
         sleeper.0.wait().unwrap();

@@ -1,8 +1,8 @@
-//! Turns one input into another: bits, bytes, pieces, words and numbers changed.
+//! Mutates an input: bits, bytes, pieces, words and numbers.
 
 use rand::{Rng, RngExt};
 
-/// What stands where a number or a word stood.
+/// Replacements for a number or a word.
 const NASTY: [&str; 30] = [
     "nan",
     "-nan",
@@ -36,7 +36,7 @@ const NASTY: [&str; 30] = [
     "1979-05-27",
 ];
 
-/// Changes `bytes` in one to eight ways. `words` are put in here and there, and pieces of `other`.
+/// Changes `bytes` in one to eight ways. Inserts some of `words`, and pieces of `other`.
 pub fn mutate(
     bytes: &mut Vec<u8>,
     other: &[u8],
@@ -107,7 +107,7 @@ fn replace(bytes: &mut Vec<u8>, range: std::ops::Range<usize>, by: &[u8]) {
     bytes.splice(range, by.iter().copied());
 }
 
-/// A piece of `bytes`, mostly a short one.
+/// Returns a piece of `bytes`, mostly a short one.
 fn piece<'a>(bytes: &'a [u8], rng: &mut impl Rng) -> &'a [u8] {
     let start = rng.random_range(0..=bytes.len());
     let longest = (bytes.len() - start).min(if rng.random_range(0..4_u32) == 0 {
@@ -118,7 +118,7 @@ fn piece<'a>(bytes: &'a [u8], rng: &mut impl Rng) -> &'a [u8] {
     &bytes[start..start + rng.random_range(0..=longest)]
 }
 
-/// The word or number about `at`.
+/// Returns the word or number around `at`.
 fn token(bytes: &[u8], at: usize) -> std::ops::Range<usize> {
     let is_part = |byte: &u8| byte.is_ascii_alphanumeric() || b"_.+-".contains(byte);
     let before = bytes[..at]

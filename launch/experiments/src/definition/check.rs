@@ -1,4 +1,4 @@
-//! Whether an experiment makes sense and every arm of it can be run.
+//! Checks that an experiment makes sense and that each of its arms can run.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -6,29 +6,29 @@ use std::path::Path;
 use skein_protocol::config::Config;
 use skein_simulator::suite::MOST_EPISODES;
 
-use super::file::{ArmFile, File, as_overrides};
+use super::file::{ArmFile, ExperimentFile, as_overrides};
 use super::{Arm, DefinitionError, Experiment, FlownSuite, MOST_ARMS, Measure, TableKind};
 use crate::plan::{ACTORS, REPORT};
 use skein_prepare::PrepareError;
 
-/// What is set in every run, because it gets one core. Sums of several threads round otherwise on
-/// libtorch; the native engine's do not.
-const FOR_ALL: &str = "run.learner_threads=1";
-/// Keys that no file may set, and why.
-const OURS: [(&str, &str); 2] = [
+/// Setting of every run, because each gets one core. On libtorch, the number of threads changes the
+/// rounding of sums; on the native engine it does not.
+const COMMON_SETTING: &str = "run.learner_threads=1";
+/// Keys that no file may set, each with the reason.
+const RESERVED_KEYS: [(&str, &str); 2] = [
     (
         "run.seed",
-        "each arm is run with the seeds from 1 on; `seeds` says how many",
+        "each arm runs with seeds from 1; set their number with `seeds`",
     ),
     (
         "run.learner_threads",
-        "each run has one, because runs are side by side; leave it out",
+        "each run has one, because runs share the machine; remove the key",
     ),
 ];
 
-/// What `file`, read from `path`, means.
+/// Returns the experiment described by `file`, which was read from `path`.
 pub(super) fn resolve(
-    file: File,
+    file: ExperimentFile,
     path: &Path,
     name: &str,
     episodes: Option<u64>,
@@ -38,11 +38,11 @@ pub(super) fn resolve(
     let base = folder.join(&file.base);
     let settings_of = |whose: &str, settings| {
         as_overrides(settings, folder)
-            .and_then(refuse_ours)
+            .and_then(refuse_reserved_keys)
             .map_err(|problem| settings_error(path, whose, problem))
     };
     let mut settings = [
-        vec![FOR_ALL.to_owned()],
+        vec![COMMON_SETTING.to_owned()],
         settings_of("[settings]", &file.settings)?,
     ]
     .concat();
@@ -55,7 +55,7 @@ pub(super) fn resolve(
         arms.push(arm_of(arm, own, overrides, &base, episodes, path)?);
     }
     if let Some(episodes) = episodes {
-        tell_episodes(episodes, &mut settings, &mut arms);
+        state_episodes(episodes, &mut settings, &mut arms);
     }
     check_comparable(&arms, path)?;
     check_same_episodes(&file, &arms, path)?;
@@ -101,7 +101,7 @@ fn arm_of(
     if let Some(episodes) = episodes {
         if episodes >= config.run.episodes {
             let problem = format!(
-                "shortens nothing: arm {} flies {}; give fewer, or leave it out",
+                "does not shorten the run: arm {} flies {} episodes; give fewer, or leave it out",
                 arm.name, config.run.episodes
             );
             return Err(value_error(path, "--episodes", episodes, problem));
@@ -119,52 +119,49 @@ fn arm_of(
     })
 }
 
-/// Has readers told what is flown, instead of what the file says.
-fn tell_episodes(episodes: u64, settings: &mut Vec<String>, arms: &mut [Arm]) {
+/// Replaces the number of episodes in the file by the number flown, for readers.
+fn state_episodes(episodes: u64, settings: &mut Vec<String>, arms: &mut [Arm]) {
     let own = arms.iter_mut().map(|arm| &mut arm.settings);
-    for told in own.chain([&mut *settings]) {
-        told.retain(|setting| !setting.starts_with("run.episodes="));
+    for settings in own.chain([&mut *settings]) {
+        settings.retain(|setting| !setting.starts_with("run.episodes="));
     }
     settings.push(format!("run.episodes={episodes}"));
 }
 
-/// The suite that `file` names, if every arm can be put to it and a table tells what came of it.
+/// Returns the suite that `file` names, if every arm can fly it and a table shows its results.
 fn suite_of(
-    file: &File,
+    file: &ExperimentFile,
     folder: &Path,
     arms: &[Arm],
     path: &Path,
 ) -> Result<Option<FlownSuite>, DefinitionError> {
-    let is_told = file.tables.contains(&TableKind::Suite);
+    let is_shown = file.tables.contains(&TableKind::Suite);
     let nothing = match (file.suite_episodes, &file.suite) {
         (Some(episodes), _) if !(1..=MOST_EPISODES).contains(&episodes) => Some(format!(
-            "is outside 1..={MOST_EPISODES}: leave it out for as many as the suite says"
+            "is outside 1..={MOST_EPISODES}: leave it out to use the suite's own number"
         )),
-        (Some(_), None) => Some(
-            "are of a suite, and none is named: add suite = \"FILE\", or leave it out".to_owned(),
-        ),
+        (Some(_), None) => Some("needs a suite: add suite = \"FILE\", or leave it out".to_owned()),
         _ => None,
     };
     if let (Some(episodes), Some(problem)) = (file.suite_episodes, nothing) {
         return Err(value_error(path, "suite_episodes", episodes, problem));
     }
     let Some(named) = &file.suite else {
-        let problem =
-            "has the results of a suite, and none is named: add suite = \"FILE\", or take it out";
-        return match is_told {
+        let problem = "needs a suite: add suite = \"FILE\", or remove the table";
+        return match is_shown {
             true => Err(value_error(path, "tables", "\"suite\"", problem.to_owned())),
             false => Ok(None),
         };
     };
     let refuse = |problem| value_error(path, "suite", format!("{named:?}"), problem);
-    if !is_told {
-        let problem =
-            "would be flown, and no table tells it: add \"suite\" to tables, or leave it out";
+    if !is_shown {
+        let problem = "would be flown but not shown: add \"suite\" to tables, or leave it out";
         return Err(refuse(problem.to_owned()));
     }
     let suite = FlownSuite::load(&folder.join(named), file.suite_episodes).map_err(|problem| {
         refuse(format!(
-            "cannot be flown: {problem}; name a suite file, relative to this one, or leave it out"
+            "cannot be flown: {problem}; \
+                 name a suite file, relative to this one, or leave it out"
         ))
     })?;
     for arm in arms {
@@ -178,19 +175,19 @@ fn suite_of(
     Ok(Some(suite))
 }
 
-fn refuse_ours(overrides: Vec<String>) -> Result<Vec<String>, String> {
+fn refuse_reserved_keys(overrides: Vec<String>) -> Result<Vec<String>, String> {
     for setting in &overrides {
         let key = setting
             .split_once('=')
             .map_or(setting.as_str(), |(key, _)| key);
-        if let Some((_, why)) = OURS.iter().find(|(ours, _)| *ours == key) {
+        if let Some((_, why)) = RESERVED_KEYS.iter().find(|(ours, _)| *ours == key) {
             return Err(format!("{setting} cannot be set: {why}"));
         }
     }
     Ok(overrides)
 }
 
-fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
+fn check_values(file: &ExperimentFile, path: &Path) -> Result<(), DefinitionError> {
     let refuse = |key, value: &dyn std::fmt::Display, problem: &str| {
         Err(value_error(path, key, value, problem.into()))
     };
@@ -198,21 +195,21 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
         return refuse(
             "question",
             &"\"\"",
-            "asks nothing: write what the experiment is to find out",
+            "is empty: write what the experiment shall find out",
         );
     }
     if file.question.contains('\n') || file.question.contains("<!--") {
         return refuse(
             "question",
             &format!("{:?}", file.question),
-            "cannot head a report: write one line without <!--",
+            "cannot be a report's heading: write one line without <!--",
         );
     }
     if file.paper_episodes == Some(0) {
         return refuse(
             "paper_episodes",
             &0,
-            "are no run: write how many the paper's have, or leave it out",
+            "is not a run: write the number of the paper's runs, or leave it out",
         );
     }
     if !(1..=100).contains(&file.seeds) {
@@ -220,7 +217,7 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
     }
     if !(1..=MOST_ARMS).contains(&file.arms.len()) {
         let problem = format!(
-            "of them are outside 1..={MOST_ARMS}: more could not be told apart in one picture"
+            "are outside 1..={MOST_ARMS} arms: one picture cannot show more distinguishable lines"
         );
         return refuse("[[arm]]", &file.arms.len(), &problem);
     }
@@ -235,7 +232,8 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
             || arm.name == REPORT
         {
             let problem = format!(
-                "cannot be a folder: begin with a letter or digit, use these, -, _ and . only, and not {REPORT}"
+                "cannot name a folder: begin with a letter or digit, \
+                      use only letters, digits, -, _ and ., and not {REPORT}"
             );
             return refuse("arm.name", &arm.name, &problem);
         }
@@ -246,28 +244,28 @@ fn check_values(file: &File, path: &Path) -> Result<(), DefinitionError> {
             return refuse(
                 "arm.label",
                 &arm.label,
-                "cannot stand in a table: write one line without | and <!--",
+                "cannot be shown in a table: write one line without | and <!--",
             );
         }
         if !names.insert(&arm.name) {
             return refuse(
                 "arm.name",
                 &arm.name,
-                "is there twice: give each arm its own",
+                "occurs twice: give each arm a different one",
             );
         }
         if !labels.insert(&arm.label) {
             return refuse(
                 "arm.label",
                 &arm.label,
-                "is there twice: give each arm its own",
+                "occurs twice: give each arm a different one",
             );
         }
     }
     Ok(())
 }
 
-/// Whether all arms are measured alike.
+/// Refuses arms that are evaluated differently.
 fn check_comparable(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
     let measured = |arm: &Arm| {
         (
@@ -277,17 +275,23 @@ fn check_comparable(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
     };
     refuse_other(arms, path, measured, |first| {
         format!(
-            "[evaluation] and courses.evaluation cannot differ from those of arm {first}, or the two could not be compared: set them in [settings]"
+            "[evaluation] and courses.evaluation differ from those of arm {first}, \
+                so the two could not be compared: set them in [settings]"
         )
     })
 }
 
-/// Why arms that fly elsewhere cannot be compared by their own episodes, and how they can.
-const ELSEWHERE: &str = ", or the two would be measured on different episodes: put them to a suite, and write tables = [\"suite\", \"cost\"] and curves = []";
+/// Reason why arms that train on different episodes cannot be compared by these, and the remedy.
+const ELSEWHERE: &str = ", so the two would be measured on different episodes: \
+                         add a suite, and write tables = [\"suite\", \"cost\"] and curves = []";
 
-/// Whether what is told of the arms' own episodes, training's and evaluation's, is of episodes of
-/// one kind. A suite flies all arms alike, whatever they were trained on.
-fn check_same_episodes(file: &File, arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
+/// Refuses tables and curves of the arms' own episodes (training and evaluation) if these differ in
+/// kind. A suite flies all arms alike, whatever their training.
+fn check_same_episodes(
+    file: &ExperimentFile,
+    arms: &[Arm],
+    path: &Path,
+) -> Result<(), DefinitionError> {
     let of_own_episodes = |kind: &TableKind| !matches!(kind, TableKind::Suite | TableKind::Cost);
     if file.curves.is_empty() && !file.tables.iter().any(of_own_episodes) {
         return Ok(());
@@ -302,20 +306,25 @@ fn check_same_episodes(file: &File, arms: &[Arm], path: &Path) -> Result<(), Def
     };
     refuse_other(arms, path, courses, |first| {
         format!(
-            "courses.training, courses.generated_share and learning.levels cannot differ from those of arm {first}{ELSEWHERE}"
+            "courses.training, courses.generated_share and learning.levels differ \
+                from those of arm {first}{ELSEWHERE}"
         )
     })?;
     for key in ["generator", "disturbances"] {
         let flown = |arm: &Arm| arm.config.simulator.get(key).cloned();
         refuse_other(arms, path, flown, |first| {
-            format!("simulator.{key} cannot differ from that of arm {first}{ELSEWHERE}")
+            format!("simulator.{key} differs from that of arm {first}{ELSEWHERE}")
         })?;
     }
     Ok(())
 }
 
-/// Whether returns that are drawn beside one another are of one scale.
-fn check_same_reward(file: &File, arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
+/// Refuses returns in one picture if they have different scales.
+fn check_same_reward(
+    file: &ExperimentFile,
+    arms: &[Arm],
+    path: &Path,
+) -> Result<(), DefinitionError> {
     if file
         .curves
         .iter()
@@ -325,12 +334,14 @@ fn check_same_reward(file: &File, arms: &[Arm], path: &Path) -> Result<(), Defin
     }
     refuse_other(arms, path, Arm::reward, |first| {
         format!(
-            "simulator.reward cannot differ from that of arm {first} where returns are drawn: they would be of another scale; draw walls_passed"
+            "simulator.reward differs from that of arm {first}, so their returns have \
+                different scales: draw walls_passed instead"
         )
     })
 }
 
-/// Refuses the first arm that has not what the first of all has; `problem` is told that one's name.
+/// Refuses the first arm whose value differs from the first arm's; `problem` gets the latter's
+/// name.
 fn refuse_other<T: PartialEq>(
     arms: &[Arm],
     path: &Path,

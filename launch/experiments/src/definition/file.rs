@@ -1,4 +1,4 @@
-//! The file of an experiment as it is written.
+//! The file of an experiment, as written.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,33 +6,33 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use toml::{Table, Value};
 
-use super::{Curve, DefinitionError, TableKind};
+use super::{CurveSpec, DefinitionError, TableKind};
 
-/// What an experiment's file says.
+/// Contents of an experiment's file.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct File {
+pub(super) struct ExperimentFile {
     pub(super) question: String,
-    /// Relative to the file.
+    /// Path relative to the file.
     pub(super) base: PathBuf,
     #[serde(default = "three")]
     pub(super) seeds: u64,
-    /// Relative to the file.
+    /// Path relative to the file.
     pub(super) suite: Option<PathBuf>,
-    /// Episodes of each entry of it, if they are not as many as it says.
+    /// Number of episodes per suite entry, if it differs from the suite's own.
     pub(super) suite_episodes: Option<u64>,
-    /// Training episodes of the paper's own runs, where the experiment stands for them.
+    /// Number of training episodes of the paper's own runs, for experiments that reproduce these.
     pub(super) paper_episodes: Option<u64>,
-    /// In what all arms differ from the base.
+    /// Settings in which all arms differ from the base.
     #[serde(default)]
     pub(super) settings: Table,
     pub(super) tables: Vec<TableKind>,
-    pub(super) curves: Vec<Curve>,
+    pub(super) curves: Vec<CurveSpec>,
     #[serde(rename = "arm")]
     pub(super) arms: Vec<ArmFile>,
 }
 
-/// A `[[arm]]` of it.
+/// An `[[arm]]` of the file.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ArmFile {
@@ -42,15 +42,15 @@ pub(super) struct ArmFile {
     pub(super) settings: Table,
 }
 
-/// The fewest runs of which anything can be said.
+/// Smallest number of seeds that supports any conclusion.
 const fn three() -> u64 {
     3
 }
 
-/// Names of the experiments in `folder`, in alphabetical order.
+/// Returns the names of the experiments in `folder`, in alphabetical order.
 ///
 /// # Errors
-/// [`DefinitionError::Read`].
+/// [`DefinitionError::Read`] names the folder.
 pub fn names(folder: &Path) -> Result<Vec<String>, DefinitionError> {
     let fail = |source| DefinitionError::Read {
         path: folder.to_owned(),
@@ -71,7 +71,7 @@ pub fn names(folder: &Path) -> Result<Vec<String>, DefinitionError> {
     Ok(names)
 }
 
-/// The file of the experiment called `name`.
+/// Returns the path of the experiment called `name`.
 pub(super) fn find(folder: &Path, name: &str) -> Result<PathBuf, DefinitionError> {
     let names = names(folder)?;
     if names.iter().any(|known| known == name) {
@@ -87,7 +87,7 @@ pub(super) fn find(folder: &Path, name: &str) -> Result<PathBuf, DefinitionError
     })
 }
 
-pub(super) fn read(path: &Path) -> Result<File, DefinitionError> {
+pub(super) fn read(path: &Path) -> Result<ExperimentFile, DefinitionError> {
     let text = fs::read_to_string(path).map_err(|source| DefinitionError::Read {
         path: path.to_owned(),
         source,
@@ -98,17 +98,18 @@ pub(super) fn read(path: &Path) -> Result<File, DefinitionError> {
     })
 }
 
-/// `settings` as overrides, `section.key=value`. Course files are named relative to `folder`.
+/// Returns `settings` as overrides, `section.key=value`. Paths of course files are relative to
+/// `folder`.
 ///
 /// # Errors
-/// What is wrong with them.
+/// Returns the problem as text.
 pub(super) fn as_overrides(settings: &Table, folder: &Path) -> Result<Vec<String>, String> {
     let mut overrides = Vec::new();
     flatten("", settings, folder, &mut overrides)?;
     Ok(overrides)
 }
 
-/// Tables within each other at most: more than any setting has, and few enough to be gone through.
+/// Deepest nesting of tables: more than any setting needs, and small enough for recursion.
 const DEEPEST: usize = 16;
 
 fn flatten(
@@ -119,7 +120,7 @@ fn flatten(
 ) -> Result<(), String> {
     if section.split('.').count() > DEEPEST {
         return Err(format!(
-            "{section} lies deeper than any setting: write section.key = value"
+            "{section} is nested deeper than any setting: write section.key = value"
         ));
     }
     for (name, value) in table {
@@ -129,7 +130,7 @@ fn flatten(
         };
         match value {
             Value::Table(inner) if inner.is_empty() => {
-                return Err(format!("{key} holds no setting: leave it out"));
+                return Err(format!("{key} holds no setting: remove it"));
             }
             Value::Table(inner) => flatten(&key, inner, folder, into)?,
             value if ["courses.training", "courses.evaluation"].contains(&key.as_str()) => {
@@ -141,7 +142,7 @@ fn flatten(
     Ok(())
 }
 
-/// `value` with every path in it relative to `folder`.
+/// Returns `value` with every path in it relative to `folder`.
 fn within(value: &Value, folder: &Path) -> Value {
     match value {
         Value::String(path) => Value::String(folder.join(path).to_string_lossy().into_owned()),

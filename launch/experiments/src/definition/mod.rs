@@ -1,4 +1,5 @@
-//! `configs/experiments/NAME.toml`: what an experiment asks, and what is run to answer it.
+//! Definition of an experiment (`configs/experiments/NAME.toml`): its question and the runs that
+//! answer it.
 
 mod check;
 mod file;
@@ -17,47 +18,47 @@ use skein_prepare::PrepareError;
 pub use file::names;
 pub use suite::FlownSuite;
 
-/// More arms than this could not be told apart in one picture.
+/// Largest number of arms whose lines can be distinguished in one picture.
 pub const MOST_ARMS: usize = skein_reports::comparison::MOST_LINES;
 
-/// An experiment whose every arm can be run.
+/// An experiment whose arms can all run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Experiment {
-    /// The file's name without its ending.
+    /// The file's name without its extension.
     pub name: String,
-    /// What it is to find out, and which figure or table of the paper it belongs to.
+    /// Question to answer, with the figure or table of the paper that it belongs to.
     pub question: String,
-    /// The configuration that all arms differ from, as the file names it, for readers.
+    /// Name of the base configuration as written in the file, for readers.
     pub base_name: String,
-    /// Its path.
+    /// Path of the base configuration.
     pub base: PathBuf,
-    /// Training episodes that the base configuration flies.
+    /// Number of training episodes in the base configuration.
     pub base_episodes: u64,
-    /// Training episodes of the paper's own runs, where the experiment stands for them.
+    /// Number of training episodes of the paper's own runs, for experiments that reproduce these.
     pub paper_episodes: Option<u64>,
-    /// In what all arms differ from the base, the one thread of each run among it:
+    /// Settings in which all arms differ from the base, including the single learner thread:
     /// `section.key=value`.
     pub settings: Vec<String>,
-    /// Runs of each arm, with seeds from 1.
+    /// Number of runs per arm, with seeds from 1.
     pub seeds: u64,
-    /// What the best snapshot of every run flies beside the evaluation courses.
+    /// Suite that the best snapshot of every run flies in addition to the evaluation courses.
     pub suite: Option<FlownSuite>,
-    /// What is set in tables.
+    /// Tables of the report.
     pub tables: Vec<TableKind>,
-    /// What is drawn.
-    pub curves: Vec<Curve>,
-    /// What is compared.
+    /// Pictures of the report.
+    pub curves: Vec<CurveSpec>,
+    /// Arms that are compared.
     pub arms: Vec<Arm>,
 }
 
-/// Runs that fly less than whole ones.
+/// Runs with fewer episodes than complete ones.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Shortened {
-    /// Their training episodes.
+    /// Number of training episodes flown.
     pub flown: u64,
-    /// Those of a whole run.
+    /// Number of training episodes of a complete run.
     pub whole: u64,
-    /// Whose that is, for readers.
+    /// Origin of the complete run, for readers.
     pub whose: String,
 }
 
@@ -75,19 +76,19 @@ impl Display for Shortened {
     }
 }
 
-/// One way of training, of several that are compared.
+/// One of several compared ways of training.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Arm {
-    /// The folder of its runs.
+    /// Folder of its runs.
     pub name: String,
-    /// What it is called in tables and pictures.
+    /// Label in tables and pictures.
     pub label: String,
-    /// In what it differs from the other arms: `section.key=value`.
+    /// Settings in which it differs from the other arms: `section.key=value`.
     pub settings: Vec<String>,
-    /// Everything that is set beside the base configuration, but for the seed: for `--set`, in this
+    /// All settings beyond the base configuration, except the seed, as arguments of `--set` in this
     /// order.
     pub overrides: Vec<String>,
-    /// What comes of it, for seed 1.
+    /// Resulting configuration, for seed 1.
     pub config: Config,
 }
 
@@ -95,45 +96,44 @@ pub struct Arm {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TableKind {
-    /// R and completed courses of the best snapshot, for each evaluation course.
+    /// R (share of walls passed) and completed courses of the best snapshot, per evaluation course.
     Evaluation,
-    /// How the evaluation episodes went: wall by wall, and what ended those that did not get
-    /// through.
+    /// Outcomes of the evaluation episodes: walls passed, and causes of failure.
     Outcomes,
-    /// Completed courses and R of the best snapshot, for each entry of the suite.
+    /// Completed courses and R of the best snapshot, per suite entry.
     Suite,
-    /// What it took until the first wall was passed and until the agent was trained, and how well
-    /// and steadily it flew at the end of training.
+    /// Episodes until the first wall was passed and until the goal was reached, and quality and
+    /// stability at the end of training.
     Learning,
-    /// How much training swung, and how much of what was learned was lost again.
+    /// Fluctuation during training, and loss of what was learned.
     Steadiness,
-    /// What the runs took: steps, updates, time.
+    /// Cost of the runs: steps, updates, time.
     Cost,
 }
 
-/// A picture of a report: one line an arm.
+/// A picture of a report, with one line per arm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Curve {
-    /// What is shown.
+pub struct CurveSpec {
+    /// Quantity on the y axis.
     pub measure: Measure,
-    /// Over what.
+    /// Quantity on the x axis.
     pub over: Axis,
 }
 
-/// What a curve shows, averaged over `evaluation.window_episodes` training episodes.
+/// Quantity of a curve, averaged over `evaluation.window_episodes` training episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Measure {
-    /// Walls passed an episode.
+    /// Walls passed per episode.
     WallsPassed,
     /// Sum of an episode's rewards.
     Return,
-    /// How far the walls passed an episode lie below the most they had been.
+    /// Distance of the walls passed per episode below their previous maximum.
     Drawdown,
 }
 
-/// What a curve is drawn over.
+/// Quantity on a curve's x axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Axis {
@@ -145,7 +145,7 @@ pub enum Axis {
     Updates,
 }
 
-/// Why an experiment cannot be run.
+/// Reason why an experiment cannot run.
 #[derive(Debug, thiserror::Error)]
 pub enum DefinitionError {
     /// The folder or file cannot be read.
@@ -153,67 +153,67 @@ pub enum DefinitionError {
     Read {
         /// The folder or file.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         #[source]
         source: std::io::Error,
     },
-    /// There is no experiment of this name.
-    #[error("no experiment is called {name}: {} has {known}", folder.display())]
+    /// No experiment has this name.
+    #[error("no experiment is called {name}: {} holds {known}", folder.display())]
     Unknown {
         /// The name.
         name: String,
-        /// Where it was looked for.
+        /// Folder that was searched.
         folder: PathBuf,
-        /// Those that are there.
+        /// Names of the experiments in it.
         known: String,
     },
-    /// It is not TOML, or has other keys or kinds of value.
-    #[error("{} is no experiment: {source}", path.display())]
+    /// The file is not TOML, or has unknown keys or types.
+    #[error("{} is not an experiment: {source}", path.display())]
     Syntax {
         /// The file.
         path: PathBuf,
-        /// Where and why.
+        /// Position and reason.
         #[source]
         source: Box<toml::de::Error>,
     },
-    /// A value makes no sense.
+    /// A value is not allowed.
     #[error("{}: {key} = {value} {problem}", path.display())]
     Value {
         /// The file.
         path: PathBuf,
-        /// Which key.
+        /// Key of the value.
         key: &'static str,
         /// The value found.
         value: String,
-        /// What is wrong with it, and what to write instead.
+        /// Problem and remedy.
         problem: String,
     },
-    /// The settings of an arm, or of all of them, cannot be used.
+    /// The settings of an arm, or of all arms, cannot be used.
     #[error("{}: {whose}: {problem}", path.display())]
     Settings {
         /// The file.
         path: PathBuf,
-        /// Whose settings.
+        /// Owner of the settings.
         whose: String,
-        /// What is wrong with them.
+        /// Problem of the settings.
         problem: String,
     },
-    /// An arm cannot be run.
-    #[error("{}: arm {arm} cannot be run: {source}", path.display())]
+    /// An arm cannot run.
+    #[error("{}: arm {arm} cannot run: {source}", path.display())]
     Arm {
         /// The file.
         path: PathBuf,
-        /// Its name.
+        /// Name of the arm.
         arm: String,
-        /// Why; an override that it names is a setting of the file.
+        /// Reason; an override named in it is a setting of the file.
         #[source]
         source: Box<PrepareError>,
     },
 }
 
 impl Experiment {
-    /// Reads the experiment called `name` in `folder`, and checks that each of its arms can be run.
-    /// `episodes` shortens all runs to so many.
+    /// Reads the experiment called `name` in `folder`, and checks that each of its arms can run.
+    /// `episodes` shortens all runs to this number of episodes.
     ///
     /// # Errors
     /// [`DefinitionError`] names file, arm, key, value and remedy.
@@ -222,8 +222,8 @@ impl Experiment {
         check::resolve(file::read(&path)?, &path, name, episodes)
     }
 
-    /// How much less the shortest arm flies than the paper, or than the configuration that all are
-    /// based on; `None` if it flies as much.
+    /// Compares the shortest arm with the paper's run, or with the base configuration; `None` if it
+    /// flies at least as many episodes.
     pub fn shortened(&self) -> Option<Shortened> {
         let paper = self
             .paper_episodes
@@ -241,7 +241,7 @@ impl Experiment {
         })
     }
 
-    /// Whether all arms are rewarded alike, so that their returns can be compared.
+    /// Returns `true` if all arms have the same reward, so that their returns can be compared.
     pub fn has_one_reward(&self) -> bool {
         self.arms
             .windows(2)

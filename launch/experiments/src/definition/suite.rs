@@ -1,4 +1,4 @@
-//! The suite that the best snapshot of every run of an experiment flies once the run is trained.
+//! Suite that the best snapshot of every run of an experiment flies after training.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,26 +10,25 @@ use toml::{Table, Value};
 
 use super::Arm;
 
-/// A suite, and what its results are called.
+/// A suite, and the name of its results.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FlownSuite {
-    /// Its file.
+    /// Path of its file.
     pub path: PathBuf,
-    /// What is flown.
+    /// Entries of the suite.
     pub suite: Suite,
-    /// Episodes of each entry, if they are not as many as the suite says.
+    /// Number of episodes per entry, if it differs from the suite's own.
     pub each: Option<u64>,
-    /// What the result of a run is called: the suite file's name, `each`, and a checksum of all
-    /// that is flown. The result of a suite that has been changed since is that of another one, and
-    /// stays as it is.
+    /// Name of a run's result: the suite file's name, `each`, and a checksum of all that is flown.
+    /// A changed suite therefore has a new name, and old results stay untouched.
     pub result_name: String,
 }
 
 impl FlownSuite {
-    /// The suite in the file at `path`; with `each`, so many episodes of each entry.
+    /// Reads the suite at `path`; `each` overrides the number of episodes per entry.
     ///
     /// # Errors
-    /// What keeps it from being flown, or told in a table.
+    /// Returns the reason why it cannot be flown or shown in a table.
     pub fn load(path: &Path, each: Option<u64>) -> Result<Self, String> {
         let mut suite = Suite::load(path).map_err(|error| with_causes(&error))?;
         for entry in &mut suite.entries {
@@ -41,7 +40,7 @@ impl FlownSuite {
             .find(|entry| entry.name.contains(['|', '\n']))
         {
             return Err(format!(
-                "entry {:?} cannot stand in a table: call it something on one line without |",
+                "entry {:?} cannot be shown in a table: name it in one line without |",
                 entry.name
             ));
         }
@@ -55,7 +54,7 @@ impl FlownSuite {
         })
     }
 
-    /// The file's name, for readers.
+    /// Returns the file's name, for readers.
     pub fn file_name(&self) -> String {
         self.path
             .file_name()
@@ -64,16 +63,16 @@ impl FlownSuite {
             .into_owned()
     }
 
-    /// Episodes of all entries.
+    /// Number of episodes of all entries.
     pub fn episodes(&self) -> u64 {
         self.suite.entries.iter().map(|entry| entry.episodes).sum()
     }
 
-    /// Whether what `arm` trains can be put to it: that shows when the suite is flown, and that
-    /// would be after all of the training.
+    /// Checks that policies trained by `arm` can fly the suite. Otherwise the problem would only
+    /// show when the suite is flown, after all of the training.
     ///
     /// # Errors
-    /// The entry, and what is wrong with it for this arm.
+    /// Names the entry and its problem with this arm.
     pub(super) fn check(&self, arm: &Arm) -> Result<(), String> {
         let settings: SimulatorSettings = Value::Table(arm.config.simulator.clone())
             .try_into()
@@ -88,7 +87,7 @@ impl FlownSuite {
     }
 }
 
-/// Of the suite file and every course file that it names, without the comments.
+/// Returns a checksum of the suite file and every course file that it names, comments excluded.
 fn checksum(path: &Path) -> Result<u32, String> {
     let suite = content(path)?;
     let folder = path.parent().unwrap_or(Path::new(""));

@@ -1,4 +1,4 @@
-//! Experiments that can be run, and experiments that cannot.
+//! Experiments that can run, and experiments that cannot.
 
 use std::fs;
 
@@ -10,10 +10,11 @@ fn shipped(path: &str) -> PathBuf {
         .join(path)
 }
 
-/// The head of an experiment's file, based on the shipped smoke configuration.
+/// Head of an experiment's file, based on the shipped smoke configuration.
 fn head() -> String {
     format!(
-        "question = \"What for?\"\nbase = {:?}\ntables = [\"evaluation\"]\ncurves = [{{ measure = \"return\", over = \"steps\" }}]\n",
+        "question = \"What for?\"\nbase = {:?}\ntables = [\"evaluation\"]\ncurves = [{{ measure = \
+         \"return\", over = \"steps\" }}]\n",
         shipped("smoke.toml")
     )
 }
@@ -28,7 +29,7 @@ fn load(text: &str, episodes: Option<u64>) -> Result<Experiment, String> {
 const ARM: &str = "[[arm]]\nname = \"a\"\nlabel = \"A\"\n";
 
 #[test]
-fn every_shipped_experiment_can_be_run() {
+fn every_shipped_experiment_can_run() {
     let folder = shipped("experiments");
     let names = names(&folder).unwrap();
     assert!(names.contains(&"paper".to_owned()), "{names:?}");
@@ -42,7 +43,7 @@ fn every_shipped_experiment_can_be_run() {
             .unwrap();
         assert!(
             experiment.seeds >= 3,
-            "{name}: fewer seeds than anything can be said of"
+            "{name}: too few seeds for any conclusion"
         );
         assert!(
             Experiment::load(&folder, &name, Some(fewest - 1))
@@ -52,9 +53,11 @@ fn every_shipped_experiment_can_be_run() {
 }
 
 #[test]
-fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
+fn an_arm_combines_the_base_the_common_settings_and_its_own() {
     let text = format!(
-        "{}[settings]\nrun.episodes = 90\nreplay = {{ success_share = 0.5, success = \"approach\" }}\n{ARM}settings.\"replay.success_share\" = 0.25\nsettings.simulator.reward.open_view = 2.0\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n",
+        "{}[settings]\nrun.episodes = 90\nreplay = {{ success_share = 0.5, success = \"approach\" \
+         }}\n{ARM}settings.\"replay.success_share\" = 0.25\n\
+         settings.simulator.reward.open_view = 2.0\n[[arm]]\nname = \"b\"\nlabel = \"B\"\n",
         head().replace("\"return\"", "\"walls_passed\"")
     );
     let experiment = load(&text, None).unwrap();
@@ -88,7 +91,7 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
     );
     assert!(
         !experiment.has_one_reward(),
-        "arm a is rewarded twice as much for the view ahead"
+        "arm a has twice the reward for the view ahead"
     );
     let short = load(&text, Some(40)).unwrap();
     assert_eq!(short.arms[1].config.run.episodes, 40);
@@ -100,7 +103,7 @@ fn an_arm_is_the_base_with_what_all_arms_and_it_alone_set() {
 }
 
 #[test]
-fn what_flies_less_than_the_paper_is_shortened_and_what_flies_as_much_is_not() {
+fn only_runs_with_fewer_episodes_than_the_paper_are_shortened() {
     let shortened = |keys: &str| {
         load(&format!("{keys}{}{ARM}", head()), None)
             .unwrap()
@@ -115,7 +118,7 @@ fn what_flies_less_than_the_paper_is_shortened_and_what_flies_as_much_is_not() {
 }
 
 #[test]
-fn the_example_in_the_documents_can_be_run() {
+fn the_example_in_the_documents_can_run() {
     let document = fs::read_to_string(shipped("../docs/experiments.md")).unwrap();
     let example = document
         .split("```toml\n")
@@ -139,7 +142,8 @@ fn course_files_are_named_relative_to_the_experiment() {
     )
     .unwrap();
     let text = format!(
-        "{}{ARM}[settings]\ncourses.training = \"mine.toml\"\ncourses.evaluation = [\"mine.toml\"]\n",
+        "{}{ARM}[settings]\ncourses.training = \"mine.toml\"\ncourses.evaluation = \
+         [\"mine.toml\"]\n",
         head()
     );
     fs::write(folder.path().join("test.toml"), text).unwrap();
@@ -149,7 +153,7 @@ fn course_files_are_named_relative_to_the_experiment() {
 }
 
 #[test]
-fn a_suite_is_named_relative_to_the_experiment_and_its_result_after_all_that_is_flown() {
+fn a_suite_path_is_relative_and_its_result_name_covers_all_that_is_flown() {
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
     let course = fs::read_to_string(shipped("courses/training.toml")).unwrap();
@@ -180,7 +184,7 @@ fn a_suite_is_named_relative_to_the_experiment_and_its_result_after_all_that_is_
         "{}",
         first.result_name
     );
-    // Words about it change nothing.
+    // Comments do not change the name.
     write("few.toml", &format!("# Few episodes.\n{suite}"));
     write("mine.toml", &format!("# Five walls.\n{course}"));
     assert_eq!(load(), first);
@@ -206,7 +210,7 @@ fn a_suite_is_named_relative_to_the_experiment_and_its_result_after_all_that_is_
 }
 
 #[test]
-fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
+fn an_invalid_experiment_is_refused_with_file_key_value_and_remedy() {
     let with_arm = |rest: &str| format!("{}{ARM}{rest}", head());
     let with_suite = |suite: &Path| {
         let head = head().replace("\"evaluation\"", "\"evaluation\", \"suite\"");
@@ -216,7 +220,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         (
             "question = 1".to_owned(),
             None,
-            vec!["test.toml is no experiment", "question = 1"],
+            vec!["test.toml is not an experiment", "question = 1"],
         ),
         (
             with_arm("sed = 1"),
@@ -242,25 +246,25 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         (
             head().replace("What for?", " ") + ARM,
             None,
-            vec!["question = \"\" asks nothing"],
+            vec!["question = \"\" is empty"],
         ),
         (
             head().replace("What for?", "What\\nfor?") + ARM,
             None,
             vec![
-                "question = \"What\\nfor?\" cannot head a report",
+                "question = \"What\\nfor?\" cannot be a report's heading",
                 "one line",
             ],
         ),
         (
             head().replace("What for?", "<!-- end -->") + ARM,
             None,
-            vec!["cannot head a report", "without <!--"],
+            vec!["cannot be a report's heading", "without <!--"],
         ),
         (
             format!("paper_episodes = 0\n{}{ARM}", head()),
             None,
-            vec!["paper_episodes = 0 are no run", "leave it out"],
+            vec!["paper_episodes = 0 is not a run", "leave it out"],
         ),
         (
             format!("seeds = 0\n{}{ARM}", head()),
@@ -270,7 +274,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         (
             head() + &ARM.repeat(2),
             None,
-            vec!["arm.name = a is there twice"],
+            vec!["arm.name = a occurs twice"],
         ),
         (
             head() + &ARM.replace("\"a\"", "\"../a\""),
@@ -295,7 +299,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         (
             with_arm("settings.run.sed = 1"),
             None,
-            vec!["arm a cannot be run", "run.sed=1", "unknown field `sed`"],
+            vec!["arm a cannot run", "run.sed=1", "unknown field `sed`"],
         ),
         (
             with_arm("settings.replay.success_share = 1.5"),
@@ -339,7 +343,10 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         (
             with_arm(""),
             Some(300),
-            vec!["--episodes = 300 shortens nothing", "arm a flies 300"],
+            vec![
+                "--episodes = 300 does not shorten the run",
+                "arm a flies 300",
+            ],
         ),
         (
             head().replace("smoke.toml", "nowhere.toml") + ARM,
@@ -364,7 +371,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
                 "relative to this one",
             ],
         ),
-        // Its drone has no mass.
+        // The drone of these configurations has no mass.
         (
             with_suite(&shipped("evaluations/generalist.toml")),
             None,
@@ -377,15 +384,16 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
         (
             format!("suite_episodes = 5\n{}{ARM}", head()),
             None,
-            vec!["suite_episodes = 5 are of a suite", "add suite ="],
+            vec!["suite_episodes = 5 needs a suite", "add suite ="],
         ),
         (
             with_arm(
-                "[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.generator.clearance_m = [0.9, 1.25]",
+                "[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.simulator.generator.clearance_m = \
+                 [0.9, 1.25]",
             ),
             None,
             vec![
-                "arm b: simulator.generator cannot differ",
+                "arm b: simulator.generator differs from",
                 "arm a",
                 "\"suite\"",
             ],
@@ -396,7 +404,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             ),
             None,
             vec![
-                "arm b: simulator.disturbances cannot differ",
+                "arm b: simulator.disturbances differs from",
                 "arm a",
                 "\"suite\"",
             ],
@@ -406,7 +414,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             None,
             vec![
                 "arm b: courses.training",
-                "learning.levels cannot differ",
+                "learning.levels differ",
                 "arm a",
                 "\"suite\"",
             ],
@@ -427,7 +435,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             ),
             None,
             vec![
-                "arm b: simulator.reward cannot differ",
+                "arm b: simulator.reward differs from",
                 "arm a",
                 "walls_passed",
             ],
@@ -444,14 +452,14 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
             format!("suite = \"few.toml\"\n{}{ARM}", head()),
             None,
             vec![
-                "suite = \"few.toml\" would be flown",
+                "suite = \"few.toml\" would be flown but not shown",
                 "add \"suite\" to tables",
             ],
         ),
         (
             head().replace("evaluation", "suite") + ARM,
             None,
-            vec!["tables = \"suite\" has the results", "add suite = "],
+            vec!["tables = \"suite\" needs a suite", "add suite = "],
         ),
     ] {
         let error = load(&text, episodes).unwrap_err();
@@ -471,7 +479,7 @@ fn what_cannot_be_run_is_refused_with_file_key_value_and_remedy() {
 }
 
 #[test]
-fn an_unknown_name_is_told_with_the_known_ones() {
+fn an_unknown_name_is_refused_with_the_known_names() {
     let error = Experiment::load(&shipped("experiments"), "papre", None)
         .unwrap_err()
         .to_string();

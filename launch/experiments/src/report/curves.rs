@@ -1,22 +1,22 @@
-//! The pictures of a report.
+//! Pictures of a report.
 
 use std::path::Path;
 
 use super::{ExperimentReportError, Findings, Picture};
-use crate::definition::{Axis, Curve, Measure};
+use crate::definition::{Axis, CurveSpec, Measure};
 use crate::results::RunResult;
 use crate::statistics::{Bootstrap, Estimate};
 use skein_reports::comparison::{BandPoint, ComparedLine, Comparison};
 use skein_reports::ideal_walls_passed;
 
-/// Places at which a curve is summed up over the seeds; a picture has not many more pixels.
+/// Number of points of a curve; a picture has hardly more pixel columns.
 const PLACES: usize = 400;
-/// Resamples at each of them: the edge of a band needs no more digits.
+/// Number of resamples at each point: the edge of a band needs no higher precision.
 const RESAMPLES: usize = 2000;
 
 impl Findings<'_> {
-    /// Draws every picture of the experiment into `folder`. One that would have no line, because
-    /// runs are shorter than what is averaged over, is left out.
+    /// Draws every picture of the experiment into `folder`. A picture without lines, because the
+    /// runs are shorter than the averaging window, is left out.
     pub(super) fn draw(&self, folder: &Path) -> Result<Vec<Picture>, ExperimentReportError> {
         let mut pictures = Vec::new();
         for &curve in &self.experiment.curves {
@@ -35,7 +35,7 @@ impl Findings<'_> {
         Ok(pictures)
     }
 
-    fn comparison(&self, curve: Curve) -> Result<Comparison<'_>, ExperimentReportError> {
+    fn comparison(&self, curve: CurveSpec) -> Result<Comparison<'_>, ExperimentReportError> {
         let arms = &self.experiment.arms;
         let window = arms[0].config.evaluation.window_episodes;
         let what = measure_title(curve.measure);
@@ -55,7 +55,7 @@ impl Findings<'_> {
             y: match curve.measure {
                 Measure::WallsPassed => "walls passed",
                 Measure::Return => "return",
-                Measure::Drawdown => "walls below the highest average before",
+                Measure::Drawdown => "walls below the previous maximum average",
             },
             level: match curve.measure {
                 Measure::WallsPassed => self.ideal()?,
@@ -72,7 +72,7 @@ impl Findings<'_> {
         })
     }
 
-    /// What a perfect agent would average, where that is one number for all arms.
+    /// Returns the average of a perfect agent and its label, if it is the same for all arms.
     fn ideal(&self) -> Result<Option<(f64, String)>, ExperimentReportError> {
         let mut ideals = Vec::new();
         for arm in &self.experiment.arms {
@@ -85,20 +85,19 @@ impl Findings<'_> {
             .then(|| (first, format!("all walls passed: {first}"))))
     }
 
-    fn line(&self, arm: usize, curve: Curve) -> Vec<BandPoint> {
+    fn line(&self, arm: usize, curve: CurveSpec) -> Vec<BandPoint> {
         let curves: Vec<_> = self
             .of_arm(arm)
             .map(|result: &RunResult| result.curve(curve.measure, curve.over))
             .collect();
-        let points = summed_up(&curves, &self.bootstrap(arm, RESAMPLES));
+        let points = combined(&curves, &self.bootstrap(arm, RESAMPLES));
         let point = |(x, Estimate { value, interval })| BandPoint { x, value, interval };
         points.into_iter().map(point).collect()
     }
 }
 
-/// `curves`, one a seed, as one: from where the last of them begins to where the first of them
-/// ends.
-fn summed_up(curves: &[Vec<(f64, f64)>], bootstrap: &Bootstrap) -> Vec<(f64, Estimate)> {
+/// Combines `curves`, one per seed, into one, over the range that all of them cover.
+fn combined(curves: &[Vec<(f64, f64)>], bootstrap: &Bootstrap) -> Vec<(f64, Estimate)> {
     let begin = curves
         .iter()
         .map(|curve| curve.first().map_or(f64::INFINITY, |point| point.0));
@@ -118,7 +117,7 @@ fn summed_up(curves: &[Vec<(f64, f64)>], bootstrap: &Bootstrap) -> Vec<(f64, Est
         .collect()
 }
 
-/// The newest value of a curve that begins at `x` or before.
+/// Returns the newest value of a curve at or before `x`, where the curve begins at or before `x`.
 fn value_at(curve: &[(f64, f64)], x: f64) -> f64 {
     let after = curve.partition_point(|point| point.0 <= x);
     curve[after.saturating_sub(1)].1
@@ -153,16 +152,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_summed_up_curve_reaches_as_far_as_all_seeds_do() {
+    fn a_combined_curve_covers_the_range_of_all_seeds() {
         let curves = [
             vec![(0.0, 1.0), (10.0, 2.0), (20.0, 3.0)],
             vec![(5.0, 1.0), (15.0, 4.0)],
         ];
-        let line = summed_up(&curves, &Bootstrap::new(2, 100));
+        let line = combined(&curves, &Bootstrap::new(2, 100));
         assert_eq!((line[0].0, line[line.len() - 1].0), (5.0, 15.0));
         // At 5 the values are 1 and 1, at 15 they are 2 and 4.
         assert_eq!((line[0].1.value, line[line.len() - 1].1.value), (1.0, 3.0));
-        assert!(summed_up(&[vec![], vec![(1.0, 1.0)]], &Bootstrap::new(2, 100)).is_empty());
-        assert!(summed_up(&[], &Bootstrap::new(0, 100)).is_empty());
+        assert!(combined(&[vec![], vec![(1.0, 1.0)]], &Bootstrap::new(2, 100)).is_empty());
+        assert!(combined(&[], &Bootstrap::new(0, 100)).is_empty());
     }
 }

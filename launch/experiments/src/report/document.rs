@@ -1,4 +1,4 @@
-//! The text of a report: everything a reader needs to judge a figure, and to have it again.
+//! Text of a report: all that a reader needs to judge the figures and to reproduce them.
 
 use std::collections::BTreeSet;
 use std::fmt::Write;
@@ -9,21 +9,18 @@ use crate::results::RunResult;
 use skein_reports::Clock;
 
 impl Findings<'_> {
-    /// The report as Markdown, without a heading. `runs` and the pictures' files are paths from
-    /// where it stands.
+    /// Returns the report as Markdown, without heading, command and legend. The paths of
+    /// `pictures`, and of `runs` with the figures of each run, are relative to the document.
     ///
-    /// How to read its tables is explained once, in `docs/results/README.md`.
+    /// The legend of all reports is in `docs/results/README.md`.
     pub(super) fn body(&self, pictures: &[Picture], runs: &str) -> String {
         let mut text = String::new();
         push(&mut text, &self.what_was_run());
-        if let Some(note) = self.shortened() {
+        for note in [self.shortened(), self.missing()].into_iter().flatten() {
             push(&mut text, &note);
         }
-        if let Some(note) = self.missing() {
-            push(&mut text, &note);
-        }
-        push(&mut text, &self.rests_on());
-        if let Some(note) = self.of_several_builds() {
+        push(&mut text, &self.sample());
+        if let Some(note) = self.several_builds() {
             push(&mut text, &note);
         }
         for &kind in &self.experiment.tables {
@@ -32,22 +29,20 @@ impl Findings<'_> {
                 push(&mut text, &titled.table);
             }
         }
-        for Picture { file, caption } in pictures {
+        for Picture { caption, file } in pictures {
             push(&mut text, &format!("![{caption}]({file})"));
         }
-        push(
-            &mut text,
-            &format!("The figures of each run: [{runs}]({runs})."),
-        );
-        text
+        let figures = "Figures of each run, with the SHA-256 of its policy";
+        push(&mut text, &format!("{figures}: [{runs}]({runs})."));
+        text.trim_end().to_owned()
     }
 
-    /// The heading of a document of its own: the question.
+    /// Returns the heading of a separate document: the question.
     pub(super) fn heading(&self) -> String {
         format!("# {}\n\n", self.experiment.question)
     }
 
-    /// The command that makes the report again.
+    /// Returns a section with the command that repeats the experiment.
     pub(super) fn how_to_repeat(&self) -> String {
         format!("## Repeat it\n\n```sh\n{}\n```\n", self.command)
     }
@@ -85,11 +80,12 @@ impl Findings<'_> {
     fn missing(&self) -> Option<String> {
         let (planned, complete) = (self.plan.runs.len(), self.results.len());
         (complete < planned)
-            .then(|| format!("**Not all of it**: {complete} of {planned} runs are complete."))
+            .then(|| format!("**Incomplete**: {complete} of {planned} runs are complete."))
     }
 
-    /// What all figures rest on.
-    fn rests_on(&self) -> String {
+    /// Returns the numbers of seeds, episodes, steps and updates, and the builds, behind the
+    /// figures.
+    fn sample(&self) -> String {
         let seeds = match self.plan.seeds {
             1 => "1 seed".to_owned(),
             seeds => format!("{seeds} seeds"),
@@ -120,13 +116,15 @@ impl Findings<'_> {
         )
     }
 
-    fn of_several_builds(&self) -> Option<String> {
+    fn several_builds(&self) -> Option<String> {
         (self.builds().len() > 1).then(|| {
-            "**Of several builds**: what differs between runs may be what changed between them. Runs that are moved away are done again, with one build.".to_owned()
+            "**Several builds**: differences between runs may come from changes between the \
+             builds. To train runs again with one build, move their directories away."
+                .to_owned()
         })
     }
 
-    /// Versions that the runs were trained with, each once.
+    /// Returns the versions that trained the runs, each once.
     fn builds(&self) -> Vec<&str> {
         let versions: BTreeSet<_> = self
             .results
@@ -137,7 +135,7 @@ impl Findings<'_> {
     }
 }
 
-/// One paragraph more.
+/// Appends a paragraph.
 fn push(text: &mut String, paragraph: &str) {
     text.push_str(paragraph);
     text.push_str("\n\n");
@@ -151,7 +149,7 @@ fn code(settings: &[String]) -> String {
     quoted.join(", ")
 }
 
-/// From the least to the most, or the one that all have.
+/// Returns the range of a value over the runs, or the single value that all runs have.
 fn range(
     results: &[RunResult],
     of: impl Fn(&RunResult) -> f64,

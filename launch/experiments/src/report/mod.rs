@@ -1,4 +1,4 @@
-//! What an experiment found: tables, pictures, and what they rest on.
+//! Report of an experiment: tables, pictures, and the runs behind them.
 
 mod curves;
 mod document;
@@ -13,7 +13,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::definition::Experiment;
-use super::plan::{Plan, REPORT, State};
+use super::plan::{ExperimentPlan, REPORT, RunState};
 use super::results::{ResultError, RunResult};
 use super::statistics::Bootstrap;
 use runs::RUNS;
@@ -22,29 +22,29 @@ use skein_simulator::course::CourseError;
 
 pub use publication::{Publication, PublicationError};
 
-/// Where a report that lies beside its runs sends its reader.
-const LEGEND: &str = "How to read these tables and pictures: docs/results/README.md.\n\n";
+/// Link to the legend, for a report that lies beside its runs.
+const LEGEND: &str = "How to read the tables and pictures: docs/results/README.md.\n\n";
 
-/// What a report is drawn from.
+/// Input of a report.
 #[derive(Debug)]
 pub struct Findings<'a> {
-    /// The experiment.
+    /// Experiment to report.
     pub experiment: &'a Experiment,
-    /// Its runs.
-    pub plan: &'a Plan,
-    /// Those of them that are complete.
+    /// Its runs, complete or not.
+    pub plan: &'a ExperimentPlan,
+    /// Results of its complete runs.
     pub results: &'a [RunResult],
-    /// The command that makes this report, for readers.
+    /// Command that creates this report, for readers.
     pub command: String,
 }
 
-/// Why a report cannot be made.
+/// Reason why a report cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum ExperimentReportError {
-    /// Nothing is complete.
+    /// No run is complete.
     #[error("no run in {} is complete: there is nothing to report yet", .0.display())]
     Nothing(PathBuf),
-    /// A run cannot be read.
+    /// The results of a run cannot be read.
     #[error(transparent)]
     Result(#[from] ResultError),
     /// A picture cannot be drawn.
@@ -58,7 +58,7 @@ pub enum ExperimentReportError {
     Write {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         #[source]
         source: std::io::Error,
     },
@@ -67,29 +67,29 @@ pub enum ExperimentReportError {
 /// A picture of a report.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Picture {
-    /// Its file's name.
+    /// Name of its file.
     pub file: String,
-    /// What it shows.
+    /// Caption of the picture.
     pub caption: String,
 }
 
-/// A report that was written.
+/// A written report.
 #[derive(Debug)]
-pub struct Written {
-    /// The document, beside which lie its pictures and the figures of each run.
+pub struct WrittenReport {
+    /// Path of the document. Its pictures and the figures of each run lie beside it.
     pub document: PathBuf,
-    /// Its text.
+    /// Text of the document.
     pub text: String,
-    /// Its pictures, in its folder.
+    /// Pictures, in the document's folder.
     pub pictures: Vec<Picture>,
 }
 
 impl Findings<'_> {
-    /// Draws all of it into the experiment's folder.
+    /// Writes the report with its pictures into the experiment's folder.
     ///
     /// # Errors
     /// [`ExperimentReportError`] names the file.
-    pub fn write(&self) -> Result<Written, ExperimentReportError> {
+    pub fn write(&self) -> Result<WrittenReport, ExperimentReportError> {
         let folder = self.plan.root.join(REPORT);
         if self.results.is_empty() {
             return Err(ExperimentReportError::Nothing(self.plan.root.clone()));
@@ -103,34 +103,34 @@ impl Findings<'_> {
         let runs = folder.join(RUNS);
         self.write_runs(&runs).map_err(write(&runs))?;
         let text = format!(
-            "{}{}{LEGEND}{}",
+            "{}{}\n\n{LEGEND}{}",
             self.heading(),
             self.body(&pictures, RUNS),
             self.how_to_repeat()
         );
         let document = folder.join("report.md");
         fs::write(&document, &text).map_err(write(&document))?;
-        Ok(Written {
+        Ok(WrittenReport {
             document,
             text,
             pictures,
         })
     }
 
-    /// Whether every run is complete.
+    /// Returns `true` if every run is complete.
     pub fn is_whole(&self) -> bool {
         self.plan
             .runs
             .iter()
-            .all(|run| run.state == State::Complete)
+            .all(|run| run.state == RunState::Complete)
     }
 
-    /// The complete runs of an arm, by its place.
+    /// Returns the complete runs of the arm with this index.
     fn of_arm(&self, arm: usize) -> impl Iterator<Item = &RunResult> {
         self.results.iter().filter(move |result| result.arm == arm)
     }
 
-    /// Resamples of the complete runs of an arm.
+    /// Returns resamples of the complete runs of an arm.
     fn bootstrap(&self, arm: usize, resamples: usize) -> Bootstrap {
         Bootstrap::new(self.of_arm(arm).count(), resamples)
     }

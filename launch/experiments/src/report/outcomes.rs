@@ -1,10 +1,9 @@
-//! How the evaluation episodes of an experiment went: wall by wall, and what ended those that did
-//! not get through.
+//! Outcomes of evaluation episodes: walls passed, and causes of failure, per wall.
 
 use skein_protocol::evaluation::{CourseEvaluation, Failures};
 
 use super::Findings;
-use super::tables::{NOTHING, Titled, course_of, grid};
+use super::tables::{NOTHING, TitledTable, course_of, grid};
 use crate::results::RunResult;
 
 const HEADER: [&str; 10] = [
@@ -21,13 +20,13 @@ const HEADER: [&str; 10] = [
 ];
 
 impl Findings<'_> {
-    /// Of the evaluation courses, and of the entries of the suite, if there is one.
-    pub(super) fn outcomes(&self) -> Vec<Titled> {
-        let courses = Titled {
+    /// Returns the tables for the evaluation courses and, if there is one, the suite.
+    pub(super) fn outcomes(&self) -> Vec<TitledTable> {
+        let courses = TitledTable {
             title: "How the evaluation episodes ended, all seeds together".to_owned(),
             table: self.outcomes_of(&self.courses(), course_of),
         };
-        let suite = self.experiment.suite.as_ref().map(|flown| Titled {
+        let suite = self.experiment.suite.as_ref().map(|flown| TitledTable {
             title: format!(
                 "How the episodes of the suite `{}` ended, all seeds together",
                 flown.file_name()
@@ -37,7 +36,7 @@ impl Findings<'_> {
         [courses].into_iter().chain(suite).collect()
     }
 
-    /// A row for each arm and course.
+    /// Returns a table with a row per arm and course.
     fn outcomes_of(
         &self,
         courses: &[String],
@@ -59,13 +58,13 @@ impl Findings<'_> {
     }
 }
 
-/// How a run flew an entry of the suite.
+/// Returns a run's evaluation on an entry of the suite.
 pub(super) fn entry_of<'a>(result: &'a RunResult, name: &str) -> Option<&'a CourseEvaluation> {
     let courses = &result.suite.as_ref()?.courses;
     courses.iter().find(|course| course.course == name)
 }
 
-/// What stands behind the arm and the course: the episodes of all seeds.
+/// Returns the cells after arm and course, over the episodes of all seeds.
 fn cells(of_seeds: &[&CourseEvaluation]) -> [String; HEADER.len() - 2] {
     let sum = |count: fn(&CourseEvaluation) -> u64| {
         of_seeds.iter().map(|course| count(course)).sum::<u64>()
@@ -76,7 +75,7 @@ fn cells(of_seeds: &[&CourseEvaluation]) -> [String; HEADER.len() - 2] {
     let passed = summed(of_seeds, |course| course.walls_passed.clone());
     let could_be_passed = sum(|course| course.episodes * course.walls_passed.len() as u64);
     let mut hit_wall = failed(|failures| failures.hit_wall);
-    // Behind the last wall there is none to hit.
+    // No wall follows the last one.
     hit_wall.truncate(passed.len());
     [
         of_seeds.len().to_string(),
@@ -93,7 +92,7 @@ fn cells(of_seeds: &[&CourseEvaluation]) -> [String; HEADER.len() - 2] {
     ]
 }
 
-/// Counts wall by wall, added up over the seeds.
+/// Returns the sums over the seeds of counts per wall.
 fn summed(
     of_seeds: &[&CourseEvaluation],
     counts: impl Fn(&CourseEvaluation) -> Vec<u64>,
@@ -108,7 +107,7 @@ fn summed(
     sums
 }
 
-/// Counts one after the other; one 0 for nothing at all.
+/// Joins counts by blanks; zeros only become a single 0.
 fn joined(counts: &[u64]) -> String {
     if counts.iter().all(|&count| count == 0) {
         return "0".to_owned();

@@ -1,12 +1,11 @@
-//! Publishes a report in the documents: `docs/results/NAME.md`, its pictures and the figures of
-//! each run.
+//! Publishes reports in `docs/results/NAME.md`, with their pictures and the figures of each run.
 
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use super::runs::RUNS;
-use super::{Findings, Picture, Written};
+use super::{Findings, Picture, WrittenReport};
 use crate::plan::REPORT;
 
 /// Folder of the published reports, relative to the repository.
@@ -17,24 +16,25 @@ const PICTURES: &str = "pictures";
 const FIGURES: &str = "runs";
 /// Line before the report in its document.
 const BEGIN: &str = "<!-- report -->";
-/// Line after it.
+/// Line after the report in its document.
 const END: &str = "<!-- end -->";
-/// Line under the report. The documents explain tables in one place.
-const LEGEND: &str = "[How to read these tables and pictures](README.md#how-to-read-a-table).";
+/// Link below the report to the legend of all reports.
+const LEGEND: &str =
+    "How to read the tables and pictures: [README.md](README.md#how-to-read-a-table).";
 
-/// The document of an experiment, with a place for its report.
+/// Document of an experiment, with a place for its report. It may not exist yet.
 #[derive(Debug)]
 pub struct Publication {
     document: PathBuf,
 }
 
-/// The document without the report.
+/// Document without the report.
 struct Surroundings {
     before: String,
     after: String,
 }
 
-/// Why a report cannot be published.
+/// Reason why a report cannot be published.
 #[derive(Debug, thiserror::Error)]
 pub enum PublicationError {
     /// A file cannot be read or written.
@@ -42,24 +42,24 @@ pub enum PublicationError {
     Io {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         #[source]
         source: io::Error,
     },
-    /// The document does not say where the report belongs.
+    /// The markers of the report are missing or repeated.
     #[error(
-        "{}: the report belongs between a line {BEGIN} and a line {END} after it: write both, once",
+        "{}: the report belongs between {BEGIN} and {END}: write each marker once, in this order",
         .0.display()
     )]
     Markers(PathBuf),
 }
 
 impl Publication {
-    /// Finds the place of the report of the experiment called `name` in `repository`. Nothing is
-    /// written.
+    /// Finds the document of the experiment called `name` in `repository`, and checks its markers.
+    /// Nothing is written.
     ///
     /// # Errors
-    /// [`PublicationError`] names the document and what to write into it.
+    /// [`PublicationError`] names the document and the remedy.
     pub fn find(repository: &Path, name: &str) -> Result<Self, PublicationError> {
         let found = Self {
             document: repository.join(RESULTS).join(format!("{name}.md")),
@@ -67,7 +67,7 @@ impl Publication {
         found.surroundings().map(|_| found)
     }
 
-    /// What the document has around the report now; `None` if there is no document yet.
+    /// Reads the present surroundings of the report; `None` if there is no document.
     fn surroundings(&self) -> Result<Option<Surroundings>, PublicationError> {
         let text = match fs::read_to_string(&self.document) {
             Ok(text) => text,
@@ -90,15 +90,15 @@ impl Publication {
         }
     }
 
-    /// Puts the report into its document, and its pictures and the figures of each run beside it.
-    /// Returns the files written.
+    /// Writes the report into its document, with its pictures and the figures of each run beside
+    /// it. Returns the paths of the files written.
     ///
     /// # Errors
     /// [`PublicationError`] names the file.
     pub fn publish(
         &self,
         findings: &Findings<'_>,
-        report: &Written,
+        report: &WrittenReport,
     ) -> Result<Vec<PathBuf>, PublicationError> {
         let results = self.document.parent().unwrap_or(Path::new(""));
         let name = &findings.experiment.name;
@@ -129,8 +129,8 @@ impl Publication {
         Ok(written)
     }
 
-    /// Puts `report` into the document as it is now: hours have passed since its place was found. A
-    /// document that is not there is made with the surroundings in `new`.
+    /// Writes `report` into the document, which is read again because it may have changed while the
+    /// runs were under way. A missing document is created with the surroundings in `new`.
     fn write(&self, report: &str, new: Surroundings) -> Result<(), PublicationError> {
         let Surroundings { before, after } = self.surroundings()?.unwrap_or(new);
         let text = format!(
@@ -153,8 +153,8 @@ fn at(path: &Path) -> impl FnOnce(io::Error) -> PublicationError {
 mod tests {
     use super::*;
 
-    /// What the document becomes when `new` is published, and somebody has made it `changed` since
-    /// its place was found.
+    /// Returns the document after a publication of `new`, if its text was `found` at the beginning
+    /// and is `changed` since.
     fn published(found: Option<&str>, changed: Option<&str>) -> Result<String, String> {
         let repository = tempfile::tempdir().unwrap();
         let results = repository.path().join(RESULTS);
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_lies_between_the_markers_is_replaced() {
+    fn only_the_part_between_the_markers_is_replaced() {
         let (old, new) = (
             with("old", "Because."),
             with(&format!("new\n\n{LEGEND}"), "Because."),
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn a_document_that_is_not_there_is_made_with_the_question() {
+    fn a_missing_document_is_created_with_the_question() {
         assert_eq!(
             published(None, None).unwrap(),
             format!("# Why?\n\n{BEGIN}\nnew\n\n{LEGEND}\n{END}\n")
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_written_while_runs_were_under_way_stays() {
+    fn text_written_while_runs_were_under_way_is_kept() {
         let (before, since) = (with("old", "Before."), with("old", "Since."));
         assert_eq!(
             published(Some(&before), Some(&since)).unwrap(),
@@ -206,12 +206,12 @@ mod tests {
     }
 
     #[test]
-    fn markers_that_leave_a_doubt_are_refused() {
+    fn ambiguous_markers_are_refused() {
         let twice = format!("{BEGIN}\n{END}\n{BEGIN}\n{END}");
         for text in ["no marker", BEGIN, "<!-- end -->\n<!-- report -->", &twice] {
             let refusal = published(Some(text), None).unwrap_err();
             assert!(
-                refusal.contains("lag.md") && refusal.contains("write both, once"),
+                refusal.contains("lag.md") && refusal.contains("write each marker once"),
                 "{refusal}"
             );
         }

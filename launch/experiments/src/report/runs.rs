@@ -1,5 +1,5 @@
-//! Each run's own figures: what the estimates of a report are made of, and what another run of the
-//! same configuration and seed must come to.
+//! Figures of each run: the values behind a report's estimates, which a repeated run with the same
+//! configuration and seed must reproduce.
 
 use std::io;
 use std::path::Path;
@@ -12,11 +12,11 @@ use super::outcomes::entry_of;
 use super::tables::course_of;
 use crate::results::RunResult;
 
-/// The file's name in a report's folder.
+/// Name of the file in a report's folder.
 pub(super) const RUNS: &str = "runs.csv";
 
 impl Findings<'_> {
-    /// Writes a line for every complete run, in the plan's order.
+    /// Writes a row per complete run, in the plan's order.
     pub(super) fn write_runs(&self, path: &Path) -> io::Result<()> {
         let mut writer = csv::Writer::from_path(path)?;
         for (number, result) in self.results.iter().enumerate() {
@@ -29,7 +29,7 @@ impl Findings<'_> {
         writer.flush()
     }
 
-    /// Name and value of every column; the value is empty where the run has none.
+    /// Returns the name and value of every column; the value is empty if the run has none.
     fn columns(&self, run: &RunResult) -> Vec<(String, String)> {
         let summary = &run.summary;
         let trained =
@@ -85,7 +85,7 @@ impl Findings<'_> {
         columns
     }
 
-    /// Names of the suite's entries, if there is one.
+    /// Returns the names of the suite's entries; none without a suite.
     pub(super) fn entries(&self) -> Vec<String> {
         let suite = self.experiment.suite.as_ref();
         suite.map_or(Vec::new(), |flown| {

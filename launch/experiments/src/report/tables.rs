@@ -1,4 +1,4 @@
-//! The tables of a report, as Markdown.
+//! Tables of a report, as Markdown.
 
 use comfy_table::presets::ASCII_MARKDOWN;
 use comfy_table::{CellAlignment, Table};
@@ -13,21 +13,21 @@ use crate::results::RunResult;
 use crate::statistics::{Estimate, RESAMPLES, interquartile_mean};
 use skein_reports::Clock;
 
-/// What is shown where there is nothing to show.
+/// Content of a cell without a value.
 pub(super) const NOTHING: &str = "–";
 
-/// What is measured of a run; `None` where there is too little to measure.
-type Measured = fn(&RunResult) -> Option<f64>;
+/// Measure of a run; `None` if the run is too short for it.
+type RunMeasure = fn(&RunResult) -> Option<f64>;
 
-/// A table and what stands above it.
-pub(super) struct Titled {
+/// A table and its title.
+pub(super) struct TitledTable {
     pub(super) title: String,
     pub(super) table: String,
 }
 
 impl Findings<'_> {
-    /// The tables of one kind.
-    pub(super) fn tables(&self, kind: TableKind) -> Vec<Titled> {
+    /// Returns the tables of one kind.
+    pub(super) fn tables(&self, kind: TableKind) -> Vec<TitledTable> {
         match kind {
             TableKind::Evaluation => self.evaluation(),
             TableKind::Outcomes => self.outcomes(),
@@ -38,21 +38,24 @@ impl Findings<'_> {
         }
     }
 
-    fn evaluation(&self) -> Vec<Titled> {
+    fn evaluation(&self) -> Vec<TitledTable> {
         let episodes = self.experiment.arms[0].config.evaluation.episodes;
         vec![
-            Titled {
-                title: format!("R of the best snapshot, {episodes} episodes a course"),
+            TitledTable {
+                title: format!(
+                    "R, the share of walls passed, of the best snapshot in {episodes} episodes a \
+                     course without exploration"
+                ),
                 table: self.by_course(|course| course.r, rate),
             },
-            Titled {
+            TitledTable {
                 title: format!("Share of these {episodes} episodes that completed the course"),
                 table: self.by_course(|course| course.completed, percent),
             },
         ]
     }
 
-    /// A row an arm, a column a course.
+    /// Returns a table with a row per arm and a column per course.
     fn by_course(
         &self,
         value: impl Fn(&CourseEvaluation) -> f64,
@@ -75,8 +78,8 @@ impl Findings<'_> {
         grid(header.collect(), rows, 1)
     }
 
-    /// A row for each arm and entry of the suite.
-    fn suite(&self) -> Option<Titled> {
+    /// Returns a table with a row per arm and suite entry.
+    fn suite(&self) -> Option<TitledTable> {
         let flown = self.experiment.suite.as_ref()?;
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
@@ -110,16 +113,20 @@ impl Findings<'_> {
             "completed",
             "R",
         ];
-        Some(Titled {
-            title: format!("The best snapshot in the suite `{}`", flown.file_name()),
+        Some(TitledTable {
+            title: format!(
+                "The best snapshot in the suite `{}`, without exploration: \
+                     share of episodes that completed the course, and R",
+                flown.file_name()
+            ),
             table: grid(header.map(str::to_owned).to_vec(), rows, 2),
         })
     }
 
-    fn learning(&self) -> Titled {
+    fn learning(&self) -> TitledTable {
         let evaluation = &self.experiment.arms[0].config.evaluation;
         let window = evaluation.window_episodes;
-        let mut at_the_end: Vec<(String, Measured)> = vec![(
+        let mut at_the_end: Vec<(String, RunMeasure)> = vec![(
             format!("walls passed, last {window}"),
             RunResult::final_walls_passed,
         )];
@@ -173,9 +180,11 @@ impl Findings<'_> {
             "time".to_owned(),
         ];
         header.extend(names);
-        Titled {
+        TitledTable {
             title: format!(
-                "Learning, with R ≥ {} confirmed in {} episodes on {}",
+                "Learning: episodes until the average of {window} reached one wall; \
+                     when R ≥ {} was first confirmed, in {} evaluation episodes on {}; \
+                     the last {window} training episodes",
                 evaluation.trained_rate,
                 evaluation.confirm_episodes,
                 match evaluation.confirm_on {
@@ -187,7 +196,7 @@ impl Findings<'_> {
         }
     }
 
-    fn steadiness(&self) -> Titled {
+    fn steadiness(&self) -> TitledTable {
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
             let mut row = self.head(number, arm).to_vec();
@@ -210,15 +219,17 @@ impl Findings<'_> {
             "dispersion across time",
             "largest drawdown",
         ];
-        Titled {
-            title: "Steadiness of the walls passed in training".to_owned(),
+        TitledTable {
+            title: "Steadiness of the walls passed in training: \
+                        at the same level, smaller is steadier"
+                .to_owned(),
             table: grid(header.map(str::to_owned).to_vec(), rows, 1),
         }
     }
 
-    /// Cells of what is measured of the runs of an arm.
-    fn measured(&self, arm: usize, measures: &[Measured]) -> Vec<String> {
-        let cell = |of_run: &Measured| {
+    /// Returns the cells of `measures` of the runs of an arm.
+    fn measured(&self, arm: usize, measures: &[RunMeasure]) -> Vec<String> {
+        let cell = |of_run: &RunMeasure| {
             let estimate = self.estimate(arm, of_run);
             estimate.map_or(NOTHING.to_owned(), |estimate| {
                 with_interval(estimate, |value| format!("{value:.2}"))
@@ -227,7 +238,7 @@ impl Findings<'_> {
         measures.iter().map(cell).collect()
     }
 
-    /// When the runs of an arm were trained.
+    /// Returns the cell for the time `at` which the runs of an arm were trained.
     fn until_trained(
         &self,
         arm: usize,
@@ -243,8 +254,8 @@ impl Findings<'_> {
         )
     }
 
-    /// When the runs of an arm had `reached` something. A run that never had counts with the
-    /// `whole` that it took, which is the least it would have taken.
+    /// Returns the cell for the time at which the runs of an arm `reached` something. A run that
+    /// never did counts with its `whole` length, a lower bound.
     fn until(
         &self,
         arm: usize,
@@ -261,7 +272,7 @@ impl Findings<'_> {
         }
     }
 
-    fn cost(&self) -> Titled {
+    fn cost(&self) -> TitledTable {
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
             let mean = |of: &dyn Fn(&RunResult) -> f64| {
@@ -293,13 +304,13 @@ impl Findings<'_> {
             "evaluation episodes",
             "wall time",
         ];
-        Titled {
-            title: "Cost of a run".to_owned(),
+        TitledTable {
+            title: "Cost of a run, with other runs beside it".to_owned(),
             table: grid(header.map(str::to_owned).to_vec(), rows, 1),
         }
     }
 
-    /// The first cells of an arm's row: its label, and how many of its runs are complete.
+    /// Returns the first cells of an arm's row: its label and the number of its complete runs.
     fn head(&self, number: usize, arm: &Arm) -> [String; 2] {
         let (complete, planned) = (self.of_arm(number).count() as u64, self.plan.seeds);
         let seeds = match complete == planned {
@@ -309,20 +320,19 @@ impl Findings<'_> {
         [arm.label.clone(), seeds]
     }
 
-    /// The estimate of what `of_run` says of the complete runs of an arm; `None` when it says
-    /// nothing of one of them.
+    /// Returns the estimate of `of_run` over the complete runs of an arm; `None` if a run has no
+    /// value.
     fn estimate(&self, arm: usize, of_run: impl Fn(&RunResult) -> Option<f64>) -> Option<Estimate> {
         self.bootstrap(arm, RESAMPLES)
             .interquartile_mean(&self.values(arm, of_run)?)
     }
 
-    /// What `of_run` says of each of the complete runs of an arm; `None` when it says nothing of
-    /// one of them.
+    /// Returns the value of `of_run` for each complete run of an arm; `None` if a run has no value.
     fn values(&self, arm: usize, of_run: impl Fn(&RunResult) -> Option<f64>) -> Option<Vec<f64>> {
         self.of_arm(arm).map(of_run).collect()
     }
 
-    /// Names of the evaluation courses.
+    /// Returns the names of the evaluation courses.
     pub(super) fn courses(&self) -> Vec<String> {
         let first = self.results.first();
         first.map_or(Vec::new(), |result| {
@@ -352,7 +362,7 @@ fn share(value: f64) -> String {
     format!("{:.1} %", 100.0 * value)
 }
 
-/// `value [low, high]`.
+/// Returns `value [low, high]`.
 fn with_interval(estimate: Estimate, show: impl Fn(f64) -> String) -> String {
     let value = show(estimate.value);
     match estimate.interval {
@@ -361,7 +371,7 @@ fn with_interval(estimate: Estimate, show: impl Fn(f64) -> String) -> String {
     }
 }
 
-/// A Markdown table whose first `left` columns are aligned left, all others right.
+/// Returns a Markdown table with its first `left` columns aligned left and all others right.
 pub(super) fn grid(header: Vec<String>, rows: Vec<Vec<String>>, left: usize) -> String {
     let mut table = Table::new();
     table.load_preset(ASCII_MARKDOWN).set_header(header);
@@ -373,7 +383,7 @@ pub(super) fn grid(header: Vec<String>, rows: Vec<Vec<String>>, left: usize) -> 
     }
     let text = table.to_string();
     let mut lines: Vec<_> = text.lines().map(str::to_owned).collect();
-    // Those who render Markdown learn of the alignment from the line under the header alone.
+    // Markdown renderers read the alignment only from the line below the header.
     if let Some(rule) = lines.get_mut(1) {
         let mut column = 0;
         *rule = rule
@@ -395,7 +405,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn columns_of_figures_are_aligned_right_for_those_who_render_it_too() {
+    fn numeric_columns_are_aligned_right_in_text_and_when_rendered() {
         let row = |cells: [&str; 3]| cells.map(str::to_owned).to_vec();
         let text = grid(
             row(["arm", "seeds", "R"]),
@@ -404,12 +414,13 @@ mod tests {
         );
         assert_eq!(
             text,
-            "| arm | seeds |              R |\n|-----|------:|---------------:|\n| one |     3 | 0.5 [0.4, 0.6] |"
+            "| arm | seeds |              R |\n|-----|------:|---------------:|\n| one |     3 | \
+             0.5 [0.4, 0.6] |"
         );
     }
 
     #[test]
-    fn an_interval_is_shown_where_there_is_one() {
+    fn an_interval_is_shown_if_it_exists() {
         let show = |value: f64| format!("{value:.1}");
         let of = |interval| {
             with_interval(

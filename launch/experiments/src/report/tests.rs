@@ -1,4 +1,4 @@
-//! Tables from the files that runs leave.
+//! Reports made from the files that runs leave.
 
 use std::fs;
 use std::path::Path;
@@ -12,12 +12,15 @@ use crate::definition::{Axis, Measure, TableKind};
 use crate::plan::PlannedRun;
 use crate::results;
 
-const SUMMARY: &str = r#"{"skein_version":"0","run":7,"seed":1,"ending":"completed","policy_sha256":"","final_version":8,"best_version":7,
-    "best_confirmed_walls_passed":4.9,"episodes":8,"steps":4,"updates":2,"vae_updates":4,"evaluation_episodes":4,
+const SUMMARY: &str = r#"{"skein_version":"0","run":7,"seed":1,"ending":"completed",
+        "policy_sha256":"",
+        "final_version":8,"best_version":7,
+    "best_confirmed_walls_passed":4.9,"episodes":8,"steps":4,"updates":2,
+        "vae_updates":4,"evaluation_episodes":4,
     "tickets_reissued":0,"records_refused":0,"wall_secs":3.3}"#;
 
-/// `completed` of four episodes passed both walls of a course, the others none.
-fn flown(entry: &str, completed: usize) -> CourseEvaluation {
+/// Returns an entry of four episodes: `completed` of them passed both walls, the others none.
+fn entry_result(entry: &str, completed: usize) -> CourseEvaluation {
     let score = |number: usize| EpisodeScore {
         walls_passed: if number < completed { 2 } else { 0 },
         episode_return: 0.0,
@@ -52,9 +55,9 @@ fn leave(run: &PlannedRun, suite: &[CourseEvaluation]) {
     .unwrap();
 }
 
-/// An experiment in `folder` of one arm and two seeds, and its runs, which are complete: the first
-/// completed half of its calm episodes, the second all.
-fn two_runs(folder: &Path) -> (Experiment, Plan) {
+/// Creates an experiment in `folder` with one arm and two complete runs: the first completed half
+/// of its calm episodes, the second all.
+fn two_runs(folder: &Path) -> (Experiment, ExperimentPlan) {
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
     let (base, course) = (
         configs.join("smoke.toml"),
@@ -68,21 +71,24 @@ fn two_runs(folder: &Path) -> (Experiment, Plan) {
     );
     fs::write(folder.join("few.toml"), suite).unwrap();
     let experiment = format!(
-        "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = [\"suite\"]\npaper_episodes = 4000\ncurves = []\n[settings]\nevaluation.window_episodes = 2\nlearning.warmup_steps = 20\nsac.batch_size = 16\n[[arm]]\nname = \"a\"\nlabel = \"A\"\n"
+        "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = \
+         [\"suite\"]\npaper_episodes = 4000\ncurves = []\n[settings]\nevaluation.window_episodes \
+         = 2\nlearning.warmup_steps = 20\nsac.batch_size = 16\n[[arm]]\nname = \"a\"\nlabel = \
+         \"A\"\n"
     );
     fs::write(folder.join("test.toml"), experiment).unwrap();
     let experiment = Experiment::load(folder, "test", None).unwrap();
-    let mut plan = Plan::new(&experiment, &folder.join("runs"), 2).unwrap();
+    let mut plan = ExperimentPlan::new(&experiment, &folder.join("runs"), 2).unwrap();
     for (run, calm) in plan.runs.iter_mut().zip([2, 4]) {
-        leave(run, &[flown("calm", calm), flown("windy", 1)]);
-        run.state = State::Complete;
+        leave(run, &[entry_result("calm", calm), entry_result("windy", 1)]);
+        run.state = RunState::Complete;
     }
     (experiment, plan)
 }
 
-fn findings<'a>(
+pub(super) fn findings<'a>(
     experiment: &'a Experiment,
-    plan: &'a Plan,
+    plan: &'a ExperimentPlan,
     results: &'a [RunResult],
 ) -> Findings<'a> {
     Findings {
@@ -94,10 +100,10 @@ fn findings<'a>(
 }
 
 #[test]
-fn a_suite_is_told_entry_by_entry_over_the_seeds() {
+fn a_suite_has_a_row_per_entry_over_the_seeds() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, mut plan) = two_runs(folder.path());
-    let told = |plan: &Plan| {
+    let report_text = |plan: &ExperimentPlan| {
         let runs = results::read(plan).unwrap();
         let findings = findings(&experiment, plan, &runs);
         let tables = findings.tables(TableKind::Suite);
@@ -108,16 +114,25 @@ fn a_suite_is_told_entry_by_entry_over_the_seeds() {
         );
         tables[0].table.clone()
     };
+    let compact = |line: &str| line.split_whitespace().collect::<Vec<_>>().join(" ");
+    let rows: Vec<_> = report_text(&plan).lines().map(compact).collect();
     assert_eq!(
-        told(&plan),
-        "| arm | entry | seeds | episodes |          completed, mean |                completed |                    R |\n\
-         |-----|-------|------:|--------:|-------------------------:|-------------------------:|---------------------:|\n\
-         | A   | calm  |     2 |       4 | 75.0 % [50.0 %, 100.0 %] | 75.0 % [50.0 %, 100.0 %] | 0.750 [0.500, 1.000] |\n\
-         | A   | windy |     2 |       4 |  25.0 % [25.0 %, 25.0 %] |  25.0 % [25.0 %, 25.0 %] | 0.250 [0.250, 0.250] |"
+        [&*rows[0], &*rows[2], &*rows[3]],
+        [
+            "| arm | entry | seeds | episodes | completed, mean | completed | R |",
+            "| A | calm | 2 | 4 | 75.0 % [50.0 %, 100.0 %] | 75.0 % [50.0 %, 100.0 %] \
+             | 0.750 [0.500, 1.000] |",
+            "| A | windy | 2 | 4 | 25.0 % [25.0 %, 25.0 %] | 25.0 % [25.0 %, 25.0 %] \
+             | 0.250 [0.250, 0.250] |",
+        ]
     );
-    // A run that did not fly it says nothing, and nothing is made up for it.
-    plan.runs[1].state = State::Trained;
-    assert!(told(&plan).contains("| 1 of 2 |"), "{}", told(&plan));
+    // A run without a suite result contributes nothing.
+    plan.runs[1].state = RunState::Trained;
+    assert!(
+        report_text(&plan).contains("| 1 of 2 |"),
+        "{}",
+        report_text(&plan)
+    );
 
     let result = plan.runs[0].suite_json.clone().unwrap();
     fs::write(&result, "{").unwrap();
@@ -129,14 +144,14 @@ fn a_suite_is_told_entry_by_entry_over_the_seeds() {
 }
 
 #[test]
-fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
+fn runs_of_several_builds_are_marked() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, plan) = two_runs(folder.path());
-    let told = || {
+    let report_text = || {
         let runs = results::read(&plan).unwrap();
         findings(&experiment, &plan, &runs).body(&[], "runs.csv")
     };
-    let (one, several) = (told(), "**Of several builds**");
+    let (one, several) = (report_text(), "**Several builds**");
     let shortened = "**Shortened**: 300 training episodes a run instead of the 4000 of the paper.";
     assert!(one.contains(shortened), "{one}");
     assert!(
@@ -146,7 +161,7 @@ fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
 
     let newer = SUMMARY.replace(r#""skein_version":"0""#, r#""skein_version":"0+b873565""#);
     fs::write(plan.runs[1].directory.summary_json(), newer).unwrap();
-    let two = told();
+    let two = report_text();
     assert!(
         two.contains("Skein 0, 0+b873565.\n") && two.contains(several),
         "{two}"
@@ -154,12 +169,12 @@ fn runs_of_several_builds_are_not_told_as_if_they_were_of_one() {
 }
 
 #[test]
-fn every_run_has_a_line_of_its_own() {
+fn every_run_has_its_own_row() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, plan) = two_runs(folder.path());
-    let mut calm = flown("calm", 2);
+    let mut calm = entry_result("calm", 2);
     calm.r = 0.75;
-    leave(&plan.runs[0], &[calm, flown("windy", 1)]);
+    leave(&plan.runs[0], &[calm, entry_result("windy", 1)]);
     let learned = SUMMARY.replace(r#""policy_sha256":"""#, r#""policy_sha256":"ab""#);
     fs::write(plan.runs[1].directory.summary_json(), learned).unwrap();
     let runs = results::read(&plan).unwrap();
@@ -189,10 +204,10 @@ fn every_run_has_a_line_of_its_own() {
     );
 }
 
-/// Two runs of ten episodes, told by hand: the first rises and is trained after six of them, the
-/// second never comes to a wall.
+/// Two runs of ten episodes: the first rises and is trained after six of them, the second never
+/// reaches a wall.
 #[test]
-fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
+fn learning_steadiness_and_cost_match_the_runs_files() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, plan) = two_runs(folder.path());
     let episodes = |walls: [u8; 10], steps: u32| {
@@ -286,7 +301,7 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
         walls(Axis::Steps),
         over([20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0])
     );
-    // None before the warm-up is over, all behind the last episode.
+    // None before the warm-up ends, all of them after the last episode.
     assert_eq!(
         walls(Axis::Updates),
         over([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0])
@@ -300,20 +315,20 @@ fn learning_steadiness_and_cost_are_those_of_the_runs_files() {
 }
 
 #[test]
-fn returns_of_different_rewards_are_in_no_table() {
+fn returns_with_different_rewards_are_not_tabulated() {
     let folder = tempfile::tempdir().unwrap();
     let (mut experiment, plan) = two_runs(folder.path());
     let runs = results::read(&plan).unwrap();
-    let told = |experiment: &Experiment| {
+    let report_text = |experiment: &Experiment| {
         let tables = findings(experiment, &plan, &runs).tables(TableKind::Learning);
         tables[0].table.contains("return, last 2")
     };
-    assert!(told(&experiment));
+    assert!(report_text(&experiment));
     let mut other = experiment.arms[0].clone();
     other
         .config
         .simulator
         .insert("reward".to_owned(), toml::Table::new().into());
     experiment.arms.push(other);
-    assert!(!told(&experiment));
+    assert!(!report_text(&experiment));
 }

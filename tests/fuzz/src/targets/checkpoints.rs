@@ -1,5 +1,5 @@
-//! What a learner resumes from: each file of a checkpoint under a manifest that matches it, so that
-//! what stands behind the checksums is reached; and the metrics that it goes on with.
+//! Files that a learner resumes from: each file of a checkpoint under a matching manifest, so that
+//! the code behind the checksums is reached; and the metrics that it continues.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -24,12 +24,13 @@ use tch::Tensor;
 use tempfile::TempDir;
 
 use super::replay::{config, episode};
-use super::{Target, USUAL, Verdict, tagged};
+use super::{ReaderDecision, Target, USUAL, tagged};
 use crate::scratch::{folder, with_files};
 
 pub(super) const FILES: Target = Target {
     name: "checkpoint",
-    reads: "the files of a checkpoint, which one says the first byte, of tensors the header only; then what is loaded is used",
+    reads: "the files of a checkpoint, selected by the first byte (only the header of tensors); \
+            what is loaded is used",
     longest_bytes: 4096,
     weight: USUAL / 4,
     samples,
@@ -38,7 +39,7 @@ pub(super) const FILES: Target = Target {
 
 pub(super) const EPISODES_CSV: Target = Target {
     name: "episodes_csv",
-    reads: "episodes.csv, after a byte that says after how many episodes it is to be continued",
+    reads: "episodes.csv, after a byte with the number of episodes to continue from",
     longest_bytes: 2048,
     weight: USUAL / 2,
     samples: csv_samples,
@@ -47,7 +48,7 @@ pub(super) const EPISODES_CSV: Target = Target {
 
 pub(super) const EVENT_FILES: Target = Target {
     name: "event_files",
-    reads: "names and lengths of the event files that a checkpoint counts on, one a line",
+    reads: "names and lengths of the event files of a checkpoint, one per line",
     longest_bytes: 256,
     weight: USUAL / 5,
     samples: || {
@@ -59,10 +60,10 @@ pub(super) const EVENT_FILES: Target = Target {
     run: event_files,
 };
 
-/// Episodes that the checkpoint is of.
+/// Number of episodes before the checkpoint.
 const EPISODES: u64 = 7;
-/// What the first byte of an input counts through. The configuration is read only to say what
-/// differs, the manifest before all else.
+/// Files that the first byte of an input selects. The configuration is only read to report
+/// differences; the manifest is read first of all.
 const FILE_NAMES: [&str; 6] = [
     "tensors.safetensors",
     "replay.safetensors",
@@ -72,7 +73,7 @@ const FILE_NAMES: [&str; 6] = [
     "manifest.json",
 ];
 
-/// A small state with everything in it.
+/// Returns a small state with all kinds of content.
 fn state() -> CheckpointState {
     let mut replay = Replay::new(&config());
     replay.insert(episode()).unwrap();
@@ -110,13 +111,13 @@ fn state() -> CheckpointState {
     }
 }
 
-/// A folder with one sound checkpoint, and what its files hold.
-struct Sound {
+/// A folder with one valid checkpoint, and the contents of its files.
+struct ValidCheckpoint {
     folder: TempDir,
     files: BTreeMap<&'static str, Vec<u8>>,
 }
 
-impl Sound {
+impl ValidCheckpoint {
     fn write() -> Self {
         let folder = folder();
         let place = store(folder.path(), &config()).save(&state(), &[]).unwrap();
@@ -133,21 +134,21 @@ impl Sound {
 }
 
 thread_local! {
-    static SOUND: Sound = Sound::write();
+    static SOUND: ValidCheckpoint = ValidCheckpoint::write();
 }
 
 fn store(folder: &Path, config: &Config) -> CheckpointStore {
     CheckpointStore::new(folder, config)
 }
 
-/// Of a safetensors file: length, header, values.
+/// Splits a safetensors file: length, header, values.
 fn parts(file: &[u8]) -> (&[u8], &[u8], &[u8]) {
     let (length, rest) = file.split_at(8);
     let (header, values) = rest.split_at(u64::from_le_bytes(length.try_into().unwrap()) as usize);
     (length, header, values)
 }
 
-/// What comes before the manifest's own checksum, which is made right for whatever comes before it.
+/// Returns the part of the manifest before its own checksum, which is recomputed for any contents.
 fn manifest_body(manifest: &[u8]) -> &[u8] {
     let before = b",\n  \"xxh3\"";
     &manifest[..manifest
@@ -170,7 +171,7 @@ fn samples() -> Vec<Vec<u8>> {
                     assert_eq!(
                         &manifest(manifest_body(file)),
                         file,
-                        "manifests are written otherwise now"
+                        "the format of manifests has changed"
                     );
                     manifest_body(file).to_vec()
                 }
@@ -185,9 +186,9 @@ fn samples() -> Vec<Vec<u8>> {
     })
 }
 
-fn checkpoint(bytes: &[u8]) -> Verdict {
+fn checkpoint(bytes: &[u8]) -> ReaderDecision {
     let Some((&kind, content)) = bytes.split_first() else {
-        return Verdict::Refused;
+        return ReaderDecision::Refused;
     };
     let name = FILE_NAMES[usize::from(kind) % FILE_NAMES.len()];
     SOUND.with(|sound| {
@@ -207,7 +208,7 @@ fn checkpoint(bytes: &[u8]) -> Verdict {
                 .unwrap();
         }
         let mut reader = config();
-        // Under the configuration it was written under, nobody looks at it.
+        // It is only compared if the configurations differ.
         reader.run.seed += u64::from(name == "config.toml");
         let loaded = store(sound.folder.path(), &reader).load(EPISODES);
         fs::write(path, &sound.files[name]).unwrap();
@@ -215,11 +216,11 @@ fn checkpoint(bytes: &[u8]) -> Verdict {
             let folder = sound.folder.path().display().to_string();
             assert!(error.to_string().contains(&folder), "{error}");
         }
-        Verdict::of(loaded.ok().map(go_on))
+        ReaderDecision::of(loaded.ok().map(go_on))
     })
 }
 
-/// Uses what was loaded as far as it can be used without networks.
+/// Uses the loaded state as far as possible without networks.
 fn go_on(state: CheckpointState) {
     assert_eq!(state.progress.episodes, EPISODES);
     let mut windows = state.progress.metrics.windows;
@@ -245,7 +246,7 @@ fn go_on(state: CheckpointState) {
     }
 }
 
-/// A state of one part, of each sort that there is.
+/// A state of one part, of each existing kind.
 struct Own {
     part: &'static str,
     tensor: Tensor,
@@ -268,7 +269,7 @@ impl Stateful for Own {
     }
 }
 
-/// A disk that nobody waits for.
+/// A disk on which no write waits.
 static DISK: LazyLock<Disk> = LazyLock::new(|| Disk::new(Arc::new(AtomicBool::new(true))));
 
 fn row(episode: u64) -> EpisodeRow {
@@ -300,9 +301,9 @@ fn csv_samples() -> Vec<Vec<u8>> {
     ]
 }
 
-fn episodes_csv(bytes: &[u8]) -> Verdict {
+fn episodes_csv(bytes: &[u8]) -> ReaderDecision {
     let Some((&episodes, content)) = bytes.split_first() else {
-        return Verdict::Refused;
+        return ReaderDecision::Refused;
     };
     let episodes = u64::from(episodes);
     with_files(&[("episodes.csv", content)], |folder| {
@@ -311,17 +312,17 @@ fn episodes_csv(bytes: &[u8]) -> Verdict {
             Ok(csv) => csv,
             Err(error) => {
                 assert!(error.to_string().contains("episodes.csv"), "{error}");
-                return Verdict::Refused;
+                return ReaderDecision::Refused;
             }
         };
         csv.write(&row(episodes)).unwrap();
         csv.flush().unwrap();
         EpisodesCsv::resume(&path, episodes + 1, &DISK).unwrap();
-        Verdict::Accepted
+        ReaderDecision::Accepted
     })
 }
 
-fn event_files(bytes: &[u8]) -> Verdict {
+fn event_files(bytes: &[u8]) -> ReaderDecision {
     let file = |line: &[u8]| {
         let line = String::from_utf8_lossy(line).into_owned();
         let (name, bytes) = line.rsplit_once(' ')?;
@@ -353,7 +354,7 @@ fn event_files(bytes: &[u8]) -> Verdict {
             b"untouched",
             "{files:?}"
         );
-        // The last one is the file just begun.
-        Verdict::of(resumed.filter(|writer| writer.files().len() == files.len() + 1))
+        // The last file is the one just begun.
+        ReaderDecision::of(resumed.filter(|writer| writer.files().len() == files.len() + 1))
     })
 }

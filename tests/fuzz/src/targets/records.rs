@@ -1,5 +1,5 @@
-//! Transition and status records in any sequence, through the learner's dispatcher: whatever comes,
-//! an episode is committed whole, once and finite, or not at all.
+//! Transition and status records in any sequence, through the learner's dispatcher. Whatever
+//! arrives, an episode is committed once, complete and finite, or not at all.
 
 use std::collections::BTreeSet;
 use std::mem::offset_of;
@@ -19,26 +19,26 @@ use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
 
 use super::signals::pod;
-use super::{Target, USUAL, Verdict};
+use super::{ReaderDecision, Target, USUAL};
 use crate::script::Script;
 
 pub(super) const RECORDS: Target = Target {
     name: "records",
-    reads: "transition and status records, spelt by a script of what actors do",
+    reads: "transition and status records, built from a script of actions by actors",
     longest_bytes: 512,
     weight: 2 * USUAL,
     samples,
-    run: |bytes| Learner::new().follow(&mut Script::new(bytes)),
+    run: |bytes| FuzzedLearner::new().follow(&mut Script::new(bytes)),
 };
 
 const RUN: RunId = RunId(1);
-/// Episodes ordered in the beginning.
+/// Number of episodes ordered initially.
 const EPISODES: u64 = 6;
-/// Records of the longest episode.
+/// Number of records of the longest episode.
 const LONGEST_EPISODE: usize = 8;
 /// Length of the latent codes.
 const LATENT: usize = 16;
-/// Bytes of a record before its image.
+/// Number of bytes of a record before its image.
 const HEADER: usize = offset_of!(TransitionRecord, depth);
 
 pub(super) fn sample_ticket(episode: u64) -> Ticket {
@@ -55,13 +55,13 @@ pub(super) fn sample_ticket(episode: u64) -> Ticket {
     }
 }
 
-/// Scripts in which episodes are flown as they should be, and some in which they are not.
+/// Returns scripts in which episodes are flown correctly, and some in which they are not.
 fn samples() -> Vec<Vec<u8>> {
     /// Actor 0, in incarnation 1, serves.
     const ATTACH: [u8; 4] = [1, 0, 1, 0];
     const ISSUE: [u8; 1] = [2];
     const STEP: [u8; 3] = [3, 0, 0];
-    // The last step, and the closing record after it.
+    // The last step, then the closing record.
     const CLOSE: [u8; 6] = [3, 0, 2, 3, 0, 1];
     let changed = |place: usize, value: u8| {
         let [low, high] = (place as u16).to_le_bytes();
@@ -110,7 +110,7 @@ fn samples() -> Vec<Vec<u8>> {
             &changed(44, 3),
         ]
         .concat(),
-        // A number behind the latent code.
+        // A number after the latent code.
         [
             &ATTACH[..],
             &ISSUE,
@@ -121,23 +121,23 @@ fn samples() -> Vec<Vec<u8>> {
     ]
 }
 
-/// The learner's dispatcher, and what its actors hold.
-struct Learner {
+/// The learner's dispatcher, and the tickets of its actors.
+struct FuzzedLearner {
     dispatcher: Dispatcher,
     now: Instant,
-    held: Vec<Held>,
+    held: Vec<HeldTicket>,
     committed: BTreeSet<BatchPlace>,
 }
 
-/// A ticket, as the incarnation of an actor that holds it knows it.
-struct Held {
+/// A ticket as known to the actor incarnation that holds it.
+struct HeldTicket {
     ticket: Ticket,
     actor: ActorId,
     incarnation: ActorIncarnation,
     step: u32,
 }
 
-impl Learner {
+impl FuzzedLearner {
     fn new() -> Self {
         let limits = TransportSection {
             max_records_per_episode: LONGEST_EPISODE,
@@ -163,7 +163,7 @@ impl Learner {
         }
     }
 
-    fn follow(mut self, script: &mut Script<'_>) -> Verdict {
+    fn follow(mut self, script: &mut Script<'_>) -> ReaderDecision {
         while !script.is_over() {
             match script.u8() % 7 {
                 0 => {
@@ -188,13 +188,13 @@ impl Learner {
                 }
             }
             let open = self.dispatcher.open_orders() + self.committed.len();
-            // An episode that was given up for good ends the run; it alone may be missing.
+            // An episode that was given up for good ends the run; only that one may be missing.
             assert!(open <= EPISODES as usize, "{open} of {EPISODES} episodes");
         }
-        Verdict::of(self.committed.first())
+        ReaderDecision::of(self.committed.first())
     }
 
-    /// An actor of three, in one of four incarnations, comes or goes.
+    /// Lets one of three actors, in one of four incarnations, come or go.
     fn attach(&mut self, script: &mut Script<'_>) {
         let status = ActorStatus {
             actor: ActorId(u32::from(script.u8() % 3)),
@@ -222,11 +222,12 @@ impl Learner {
             let incarnations = (0..3).flat_map(|actor| {
                 (0..4).map(move |incarnation| (ActorId(actor), ActorIncarnation(incarnation)))
             });
-            // Other actors came by records of random bytes and hold theirs for ever.
+            // Other actors appeared through records of random bytes; they hold their tickets for
+            // ever.
             for (actor, incarnation) in
                 incarnations.filter(|&(actor, incarnation)| message.is_for(actor, incarnation))
             {
-                self.held.push(Held {
+                self.held.push(HeldTicket {
                     ticket: ticket.clone(),
                     actor,
                     incarnation,
@@ -236,7 +237,7 @@ impl Learner {
         }
     }
 
-    /// The next record of a ticket, as it should be but for what `change` makes of it.
+    /// Sends the next record of a ticket, correct except for `change`.
     fn send(
         &mut self,
         script: &mut Script<'_>,
@@ -261,7 +262,7 @@ impl Learner {
     }
 
     fn receive(&mut self, record: &TransitionRecord) {
-        // A hopeless episode ends a run; here the others are flown on.
+        // A hopeless episode ends a run; here the others continue.
         if let Ok(Some((place, episode))) = self.dispatcher.on_record(record, self.now) {
             assert!(
                 self.committed.insert(place),
@@ -280,7 +281,7 @@ fn keep(episode: u64) -> KeptData {
     }
 }
 
-/// Up to three bytes of the record's header are something else.
+/// Replaces up to three bytes of the record's header.
 fn change(record: &mut TransitionRecord, script: &mut Script<'_>) {
     for _ in 0..script.u8() % 4 {
         let place = usize::from(script.u16()) % HEADER;
@@ -319,7 +320,7 @@ fn assert_sound(episode: &CommittedEpisode) {
     let numbers = seen
         .chain(episode.rewards.iter().copied())
         .chain(episode.reward_terms.iter().flatten().copied());
-    // Squares of what is learned from must be finite too.
+    // Squares of learned values must be finite too.
     numbers.for_each(|number| assert!((number * number).is_finite(), "{number}"));
     assert!(episode.total_reward().is_finite());
 }

@@ -1,5 +1,5 @@
-//! The replay buffer's content, as a checkpoint whose checksums are right may hold it: what is
-//! restored can be drawn from and goes on.
+//! Contents of the replay buffer, as found in a checkpoint with valid checksums. Restored contents
+//! can be sampled and continued.
 
 use std::sync::Arc;
 
@@ -12,12 +12,12 @@ use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LONGEST_LATENT};
 
-use super::{Target, USUAL, Verdict};
+use super::{ReaderDecision, Target, USUAL};
 use crate::script::Script;
 
 pub(super) const REPLAY: Target = Target {
     name: "replay",
-    reads: "contents of a replay buffer, spelt by a script of lengths and numbers",
+    reads: "contents of a replay buffer, built from a script of lengths and numbers",
     longest_bytes: 512,
     weight: USUAL / 10,
     samples: || {
@@ -33,7 +33,7 @@ pub(super) const REPLAY: Target = Target {
 
 /// Length of the latent codes, the default.
 const LATENT: usize = 32;
-/// Values in a row of the smallest buffer: two observations, an action, a reward, an end.
+/// Values in a row of the smallest buffer: two observations, action, reward, end.
 const ROW: usize = 2 * LATENT + ACTION + 2;
 
 pub(super) fn config() -> Config {
@@ -45,7 +45,7 @@ pub(super) fn config() -> Config {
     config
 }
 
-fn restore(bytes: &[u8]) -> Verdict {
+fn restore(bytes: &[u8]) -> ReaderDecision {
     let (config, mut script) = (config(), Script::new(bytes));
     let state = ReplayState {
         images: images(&mut script),
@@ -54,7 +54,7 @@ fn restore(bytes: &[u8]) -> Verdict {
     };
     restore_end_to_end(state.clone());
     let Ok(mut replay) = Replay::restore(&config, state.clone()) else {
-        return Verdict::Refused;
+        return ReaderDecision::Refused;
     };
     assert_eq!(replay.state(), state);
     let mut rng = Pcg64Mcg::seed_from_u64(1);
@@ -64,18 +64,18 @@ fn restore(bytes: &[u8]) -> Verdict {
     if replay.image_count().is_some_and(|images| images > 0) {
         replay.sample_images(&mut rng, 2, &mut Vec::new());
     }
-    // An episode more: taken in, or refused for want of room for its images.
+    // One more episode: stored, or refused because its images do not fit.
     let _ = replay.insert(episode());
     let encode =
         |images: &[u8]| Ok::<_, ()>(vec![[0.5; LONGEST_LATENT]; images.len() / IMAGE_PIXELS]);
     replay.recode_latents(8, encode).unwrap();
     replay.freeze();
     assert_eq!(replay.image_count(), None);
-    Verdict::Accepted
+    ReaderDecision::Accepted
 }
 
-/// The same content where a policy learns from the images: what is taken is drawn from, with its
-/// images, and gone on with until images are given up.
+/// Restores the same contents where a policy learns from the images. Accepted contents can be
+/// sampled with their images, and continued until images are dropped.
 fn restore_end_to_end(state: ReplayState) {
     let mut config = config();
     config.learning.encoder = EncoderTraining::EndToEnd;
@@ -103,7 +103,7 @@ fn images(script: &mut Script<'_>) -> Option<Vec<Arc<Vec<u8>>>> {
     (!blocks.is_multiple_of(3)).then(|| (0..blocks % 6).map(|_| block(script)).collect())
 }
 
-/// Mostly as many rows and image numbers as were inserted.
+/// Returns mostly as many rows and image numbers as were inserted.
 fn ring(script: &mut Script<'_>, capacity: usize) -> RingState {
     let inserted = match script.u8() {
         255 => script.u64(),

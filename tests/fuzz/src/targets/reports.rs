@@ -1,31 +1,32 @@
-//! What plots are drawn from: `episodes.csv`, `evaluation_trajectories.csv`, and the images beside
-//! their reconstructions.
+//! Inputs of plots: `episodes.csv`, `evaluation_trajectories.csv`, and images with their
+//! reconstructions.
 
 use std::sync::LazyLock;
 
 use skein_chaos::read_curves;
-use skein_reports::{Material, NamedCourse, draw_all};
+use skein_reports::{NamedCourse, RunMaterial, draw_all};
 use skein_run::RunDirectory;
 use skein_simulator::course::{Course, CourseLayout};
 
 use super::courses::layout;
-use super::{Target, USUAL, Verdict, shipped, tagged};
+use super::{ReaderDecision, Target, USUAL, shipped, tagged};
 use crate::scratch::with_files;
 use crate::script::Script;
 
 pub(super) const FILES: Target = Target {
     name: "report_files",
-    reads: "episodes.csv (after a 0), evaluation_trajectories.csv (after a 1), reconstructions.safetensors (after a 2)",
+    reads: "episodes.csv (after a 0), evaluation_trajectories.csv (after a 1), \
+            reconstructions.safetensors (after a 2)",
     longest_bytes: 4096,
     weight: USUAL / 2,
     samples,
     run: |bytes| {
-        with_run(bytes, |run| match Material::read(run) {
-            Ok(_) => Verdict::Accepted,
+        with_run(bytes, |run| match RunMaterial::read(run) {
+            Ok(_) => ReaderDecision::Accepted,
             Err(error) => {
                 let folder = run.root().display().to_string();
                 assert!(error.to_string().contains(&folder), "{error}");
-                Verdict::Refused
+                ReaderDecision::Refused
             }
         })
     },
@@ -33,7 +34,8 @@ pub(super) const FILES: Target = Target {
 
 pub(super) const CURVES: Target = Target {
     name: "curves",
-    reads: "TensorBoard event files: the messages, a line each, in sound frames; after a byte above 127 the file as it is",
+    reads: "TensorBoard event files: messages, one per line, in valid frames; \
+            after a byte above 127 the whole file",
     longest_bytes: 1024,
     weight: USUAL / 2,
     samples: curve_samples,
@@ -51,14 +53,14 @@ pub(super) const CURVES: Target = Target {
                     error.to_string().contains("events.out.tfevents.1"),
                     "{error}"
                 );
-                return Verdict::Refused;
+                return ReaderDecision::Refused;
             }
-            Verdict::Accepted
+            ReaderDecision::Accepted
         })
     },
 };
 
-/// One message as it stands in an event file: length, masked CRC-32C of the length, message, masked
+/// Returns one message as in an event file: length, masked CRC-32C of the length, message, masked
 /// CRC-32C of the message.
 fn framed(message: &[u8]) -> Vec<u8> {
     let length = (message.len() as u64).to_le_bytes();
@@ -71,7 +73,7 @@ fn framed(message: &[u8]) -> Vec<u8> {
     [&length[..], &masked(&length), message, &masked(message)].concat()
 }
 
-/// A step and two values; the same whole, with its frame.
+/// Returns a step with two values, bare and as a complete file with its frame.
 fn curve_samples() -> Vec<Vec<u8>> {
     let value = |tag: &[u8]| {
         [
@@ -96,12 +98,12 @@ fn curve_samples() -> Vec<Vec<u8>> {
 
 pub(super) const PICTURES: Target = Target {
     name: "report_pictures",
-    reads: "the same, and draws what is accepted, beside courses of any geometry",
+    reads: "the same files; draws what is accepted, with courses of any geometry",
     longest_bytes: 2048,
     weight: 1,
     samples,
     run: |bytes| {
-        // What follows a zero byte spells a course.
+        // The bytes after a zero byte describe a course.
         let (files, course) = bytes.split_at(
             bytes
                 .iter()
@@ -114,7 +116,7 @@ pub(super) const PICTURES: Target = Target {
         with_run(files, |run| {
             let pictures = draw_all(run, &courses, 50, 3.0).ok();
             assert!(pictures.iter().flatten().all(|picture| picture.exists()));
-            Verdict::of(pictures)
+            ReaderDecision::of(pictures)
         })
     },
 };
@@ -135,15 +137,15 @@ fn fuzzed_course(script: &[u8]) -> Option<NamedCourse> {
     })
 }
 
-/// A run that left one file, of the kind that the first byte says.
-fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory) -> Verdict) -> Verdict {
+/// Creates a run that left one file, of the kind selected by the first byte.
+fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory) -> ReaderDecision) -> ReaderDecision {
     const NAMES: [&str; 3] = [
         "episodes.csv",
         "evaluation_trajectories.csv",
         "reconstructions.safetensors",
     ];
     let Some((&kind, content)) = bytes.split_first() else {
-        return Verdict::Refused;
+        return ReaderDecision::Refused;
     };
     let name = NAMES[usize::from(kind) % NAMES.len()];
     with_files(&[(name, content)], |folder| {
@@ -154,10 +156,13 @@ fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory) -> Verdict) -> Verdic
 fn samples() -> Vec<Vec<u8>> {
     let episodes = "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
                    0,0,0,0,1,12,0,-0.9,collided\n1,0,0,1,1,33,1,0.2,timed_out\n";
-    let paths = "course,episode,step,x_m,y_m,z_m,outcome\n\
-                 training,0,0,1.5,0,3,collided\ntraining,0,1,9.7,1,3,collided\nfuzzed,1,0,1.5,0.5,3.5,reached_end\n";
-    // Empty images: a header is what there is to damage.
-    let images = r#"{"depth":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]},"reconstruction":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]}}"#;
+    let paths = "course,episode,step,x_m,y_m,z_m,outcome\ntraining,0,0,1.5,0,3,collided\n\
+                 training,0,1,9.7,1,3,collided\nfuzzed,1,0,1.5,0.5,3.5,reached_end\n";
+    // Empty images: only the header can be damaged.
+    let images = concat!(
+        r#"{"depth":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]},"#,
+        r#""reconstruction":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]}}"#
+    );
     let images = [&(images.len() as u64).to_le_bytes()[..], images.as_bytes()].concat();
     vec![
         tagged(0, episodes.as_bytes()),

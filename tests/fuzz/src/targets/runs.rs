@@ -1,10 +1,10 @@
-//! What lies in a run's directory besides configuration and snapshots, and what its learner says on
-//! standard output.
+//! Files in a run's directory besides configuration and snapshots, and standard output of its
+//! learner.
 
 use std::sync::LazyLock;
 
 use skein_launch::conclusion::conclusion;
-use skein_launch::display::Display;
+use skein_launch::display::ProgressDisplay;
 use skein_launch::supervisor::Restarts;
 use skein_protocol::PROTOCOL_VERSION;
 use skein_protocol::config::Config;
@@ -15,7 +15,7 @@ use skein_protocol::summary::Summary;
 use skein_protocol::transition::Outcome;
 use skein_run::{Announcement, LearnerIncarnation, RunDirectory, RunIdentity};
 
-use super::{Target, USUAL, Verdict, tagged};
+use super::{ReaderDecision, Target, USUAL, tagged};
 use crate::scratch::with_files;
 
 pub(super) const IDENTITY: Target = Target {
@@ -29,7 +29,7 @@ pub(super) const IDENTITY: Target = Target {
 
 pub(super) const ANNOUNCEMENT: Target = Target {
     name: "announcement",
-    reads: "what a learner announces of its present incarnation",
+    reads: "the learner's announcement of its present incarnation",
     longest_bytes: 1024,
     weight: USUAL,
     samples: || {
@@ -42,20 +42,21 @@ pub(super) const ANNOUNCEMENT: Target = Target {
         let joined =
             read.filter(|announcement| announcement.check(&IDENTIFIED.0, &IDENTIFIED.1).is_ok());
         if let Some(announcement) = &joined {
-            // LearnerIncarnation and process are the learner's to choose; in all else it is what we
-            // would say.
+            // The learner chooses incarnation and process id; all else must equal what this code
+            // would write.
             let mut mine =
                 Announcement::new(&IDENTIFIED.0, announcement.incarnation, &IDENTIFIED.1);
             mine.pid = announcement.pid;
             assert_eq!(announcement, &mine);
         }
-        Verdict::of(joined)
+        ReaderDecision::of(joined)
     },
 };
 
 pub(super) const RESULTS: Target = Target {
     name: "results",
-    reads: "evaluation.json (after a 0) and summary.json (after a 1), as a run's conclusion reads them",
+    reads: "evaluation.json (after a 0) and summary.json (after a 1), as read by a run's \
+            conclusion",
     longest_bytes: 4096,
     weight: USUAL,
     samples: result_samples,
@@ -64,7 +65,7 @@ pub(super) const RESULTS: Target = Target {
 
 pub(super) const PROGRESS: Target = Target {
     name: "progress",
-    reads: "what a learner says on standard output, line by line, as it is shown",
+    reads: "standard output of a learner, line by line, as it is shown",
     longest_bytes: 4096,
     weight: USUAL,
     samples: progress_samples,
@@ -89,21 +90,21 @@ fn opened() -> (RunIdentity, Config) {
     .unwrap()
 }
 
-fn identity(bytes: &[u8]) -> Verdict {
+fn identity(bytes: &[u8]) -> ReaderDecision {
     with_files(
         &[("run.json", bytes), ("config.toml", &RUN.1)],
         |folder| match RunDirectory::new(folder).open() {
             Ok((identity, config)) => {
                 assert_eq!(identity.protocol_version, PROTOCOL_VERSION);
                 assert_eq!(identity.config_digest, config.digest());
-                Verdict::Accepted
+                ReaderDecision::Accepted
             }
             Err(error) => {
                 assert!(
                     error.to_string().contains(&folder.display().to_string()),
                     "{error}"
                 );
-                Verdict::Refused
+                ReaderDecision::Refused
             }
         },
     )
@@ -121,12 +122,17 @@ fn result_samples() -> Vec<Vec<u8>> {
         policy_sha256: "1024266715d59141".to_owned(),
         courses: vec![CourseEvaluation::of("training", 5, &scores)],
     };
-    // Read, not made: it has fields for whatever a run may come to, and a reader that knows fewer
-    // of them reads it too.
-    let summary = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"1024266715d59141","final_version":80,
-        "best_version":70,"best_confirmed_walls_passed":4.9,"episodes":800,"steps":42837,"updates":20418,"vae_updates":400,
+    // Constant rather than generated: it lists all possible fields, and a reader that knows fewer
+    // of them must read it too.
+    let summary = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed",
+        "policy_sha256":"1024266715d59141",
+        "final_version":80,
+        "best_version":70,"best_confirmed_walls_passed":4.9,
+        "episodes":800,"steps":42837,"updates":20418,
+        "vae_updates":400,
         "evaluation_episodes":400,"tickets_reissued":0,"records_refused":0,"wall_secs":333.3,
-        "stages":[{"thread":"actors","stage":"physics","count":42000,"secs":12.5},{"thread":"training","stage":"idle","count":80,"secs":200.0}]}"#;
+        "stages":[{"thread":"actors","stage":"physics","count":42000,"secs":12.5},
+            {"thread":"training","stage":"idle","count":80,"secs":200.0}]}"#;
     let read: Summary = serde_json::from_str(summary).unwrap();
     let written = serde_json::to_vec(&read).unwrap();
     vec![
@@ -135,9 +141,9 @@ fn result_samples() -> Vec<Vec<u8>> {
     ]
 }
 
-fn results(bytes: &[u8]) -> Verdict {
+fn results(bytes: &[u8]) -> ReaderDecision {
     let Some((&kind, content)) = bytes.split_first() else {
-        return Verdict::Refused;
+        return ReaderDecision::Refused;
     };
     let name = if kind % 2 == 0 {
         "evaluation.json"
@@ -145,20 +151,27 @@ fn results(bytes: &[u8]) -> Verdict {
         "summary.json"
     };
     with_files(&[(name, content)], |folder| {
-        let told = conclusion(&RunDirectory::new(folder));
-        assert!(told.contains(name), "{told}");
-        // What cannot be read is left out.
+        let text = conclusion(&RunDirectory::new(folder));
+        assert!(text.contains(name), "{text}");
+        // Invalid files are left out.
         let shown = ["Best snapshot (", "Final policy ("]
             .into_iter()
-            .find(|words| told.contains(words));
-        Verdict::of(shown)
+            .find(|words| text.contains(words));
+        ReaderDecision::of(shown)
     })
 }
 
 fn progress_samples() -> Vec<Vec<u8>> {
     let line = |phase: &str, episodes: u64, secs: f64| {
         format!(
-            r#"{{"phase":"{phase}","episodes":{episodes},"total_episodes":2000,"evaluation_episodes":[0,20],"steps":10000,"updates":4000,"vae_updates":100,"steps_per_sec":151.6,"updates_per_sec":63.2,"walls_passed":1.25,"mean_return":null,"temperature":0.05,"vae_loss":50.1,"actors":2,"elapsed_secs":{secs}}}"#
+            concat!(
+                r#"{{"phase":"{}","episodes":{},"total_episodes":2000,"#,
+                r#""evaluation_episodes":[0,20],"steps":10000,"updates":4000,"vae_updates":100,"#,
+                r#""steps_per_sec":151.6,"updates_per_sec":63.2,"walls_passed":1.25,"#,
+                r#""mean_return":null,"temperature":0.05,"vae_loss":50.1,"actors":2,"#,
+                r#""elapsed_secs":{}}}"#
+            ),
+            phase, episodes, secs
         )
     };
     let lines = [
@@ -173,19 +186,19 @@ fn progress_samples() -> Vec<Vec<u8>> {
         .all(|line| serde_json::from_slice::<Progress>(line).is_ok());
     assert!(
         understood,
-        "the samples are the progress of another version"
+        "the samples are progress lines of another version"
     );
     vec![sample]
 }
 
-fn progress(bytes: &[u8]) -> Verdict {
-    let mut display = Display::new();
-    let mut verdict = Verdict::Refused;
+fn progress(bytes: &[u8]) -> ReaderDecision {
+    let mut display = ProgressDisplay::new();
+    let mut verdict = ReaderDecision::Refused;
     for line in bytes.split(|byte| *byte == b'\n') {
         if let Ok(progress) = serde_json::from_slice::<Progress>(line) {
             let (head, figures) = display.text(&progress, Restarts::default());
             assert!(!head.is_empty() && !figures.is_empty());
-            verdict = Verdict::Accepted;
+            verdict = ReaderDecision::Accepted;
         }
     }
     verdict

@@ -1,5 +1,5 @@
-//! Status and control records and tickets of segments, bit for bit: what is believed says the same
-//! when it is written again.
+//! Status and control records and tickets of segments, bit for bit: an accepted record is identical
+//! when written again.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use skein_protocol::ticket::{Control, ControlRecord};
 use skein_run::tables::stages_table;
 
 use super::records::sample_ticket;
-use super::{Target, USUAL, Verdict};
+use super::{ReaderDecision, Target, USUAL};
 
 pub(super) const SIGNALS: Target = Target {
     name: "signals",
@@ -27,7 +27,7 @@ pub(super) const SIGNALS: Target = Target {
             control(pod(bytes), run),
             segment(pod(bytes), run),
         ];
-        Verdict::of(read.into_iter().flatten().next())
+        ReaderDecision::of(read.into_iter().flatten().next())
     },
 };
 
@@ -71,7 +71,7 @@ fn signal_samples() -> Vec<Vec<u8>> {
     ]
 }
 
-/// The record that `bytes` are, zeros where they end too early.
+/// Interprets `bytes` as a record, filled up with zeros.
 pub(super) fn pod<T: Pod + Zeroable>(bytes: &[u8]) -> T {
     let mut padded = vec![0; size_of::<T>()];
     let given = bytes.len().min(padded.len());
@@ -79,8 +79,8 @@ pub(super) fn pod<T: Pod + Zeroable>(bytes: &[u8]) -> T {
     pod_read_unaligned(&padded)
 }
 
-/// All kinds of records begin with their run: taken from there, it never hides the rest from its
-/// reader.
+/// Returns the run of a record. All records begin with it; taking it from the input lets the reader
+/// see the rest.
 fn run_of(bytes: &[u8]) -> RunId {
     RunId(pod(bytes))
 }
@@ -89,7 +89,7 @@ fn status(record: StatusRecord, run: RunId) -> Option<()> {
     assert_eq!(record.read(RunId(!run.0)), None);
     let status = record.read(run)?;
     assert_eq!(StatusRecord::new(run, &status).read(run), Some(status));
-    // What is believed of 1024 actors can be summed up and shown.
+    // Accepted values of 1024 actors can be added and shown.
     let ten_times = (0..10).fold(status.times, |sum, _| sum.plus(&sum));
     assert!(stages_table(&ten_times).lines().count() >= 3);
     Some(())

@@ -1,5 +1,5 @@
-//! What it costs to survive: the same training with checkpoints and without, in turn, and what the
-//! receiving thread takes.
+//! CheckpointCost of fault tolerance: the same training with and without checkpoints, alternately,
+//! and the processor time of the receiving thread.
 
 use anyhow::{Context, Result};
 use skein_protocol::config::Config;
@@ -9,23 +9,23 @@ use skein_protocol::summary::Summary;
 use crate::stage::Recipe;
 use crate::statistics::median;
 
-/// What may be lost of the training's speed.
+/// Tolerated loss of training speed.
 const TOLERANCE: f64 = 0.03;
 
-/// What it came to.
+/// Trainings with and without checkpoints.
 #[derive(Debug)]
-pub(crate) struct Cost {
+pub(crate) struct CheckpointCost {
     every_episodes: u64,
     with: Vec<Summary>,
     without: Vec<Summary>,
 }
 
-impl Cost {
-    /// Trains by `recipe` so many times with checkpoints and so many times without, in turn.
-    /// `train` trains in the folder it is given the name of.
+impl CheckpointCost {
+    /// Trains `recipe` this many times with and without checkpoints, alternately. `train` trains in
+    /// the folder with the given name.
     ///
     /// # Errors
-    /// When a training fails, or the configuration cannot be read.
+    /// Returns an error if a training fails or the configuration cannot be read.
     pub(crate) fn measure(
         recipe: &Recipe,
         times: u32,
@@ -33,7 +33,7 @@ impl Cost {
     ) -> Result<Self> {
         let config = Config::load(&recipe.config, &recipe.overrides)?;
         let mut bare = recipe.clone();
-        // Beyond the last episode: one is written at the end all the same, as in the others.
+        // Beyond the last episode. A checkpoint at the end is written in both cases.
         bare.overrides.push(format!(
             "checkpoints.every_episodes={}",
             config.run.episodes + 1
@@ -53,8 +53,8 @@ impl Cost {
         Ok(cost)
     }
 
-    /// Prints it; whether it is little.
-    pub(crate) fn tell(&self) -> bool {
+    /// Prints the costs. Returns `true` if they are within the tolerance.
+    pub(crate) fn print(&self) -> bool {
         let wall = |summary: &Summary| summary.wall_secs;
         let (with, without) = (median_of(&self.with, wall), median_of(&self.without, wall));
         let slower = with / without - 1.0;
@@ -73,19 +73,19 @@ impl Cost {
         });
         let receives = cpu("receiver") / all;
         println!(
-            "Cost, medians of {} trainings each, seconds:",
+            "CheckpointCost in seconds, medians of {} trainings each:",
             self.with.len()
         );
         println!(
             "  {:<44} {with:8.2}",
-            format!("with a checkpoint each {} episodes", self.every_episodes)
+            format!("with a checkpoint every {} episodes", self.every_episodes)
         );
-        println!("  {:<44} {without:8.2}", "without");
-        println!("  {:<44} {:7.2} %", "slower by", slower * 100.0);
-        println!("  {:<44} {waits:8.2}", "training waited for checkpoints");
+        println!("  {:<44} {without:8.2}", "without checkpoints");
+        println!("  {:<44} {:7.2} %", "slowdown", slower * 100.0);
+        println!("  {:<44} {waits:8.2}", "training waiting for checkpoints");
         println!(
             "  {:<44} {:8.2}",
-            "processor time of writing them",
+            "processor time of writing checkpoints",
             cpu("checkpoints")
         );
         println!(
@@ -96,7 +96,7 @@ impl Cost {
         println!("  {:<44} {all:8.2}", "processor time of the learner");
         println!(
             "  {:<44} {:7.2} %",
-            "assembling, of the learner's",
+            "share of assembling episodes",
             receives * 100.0
         );
         slower.max(0.0) + receives < TOLERANCE

@@ -1,5 +1,4 @@
-//! `skein-chaos`: trains a run in peace and once more under fire, and tells whether it made a
-//! difference.
+//! `skein-chaos`: trains once undisturbed and once with disturbances, and compares the results.
 
 mod cost;
 mod plan;
@@ -25,26 +24,26 @@ use skein_protocol::summary::Summary;
 use skein_run::RunDirectory;
 use skein_run::failure::with_causes;
 
-use cost::Cost;
-use plan::{Subject, Wanted};
-use planned::Planning;
+use cost::CheckpointCost;
+use plan::{DisturbanceCounts, Subject};
+use planned::PlannedScript;
 use points::Points;
 use recorder::Recorder;
 use soak::Soak;
-use stage::{Recipe, Stage};
+use stage::{Recipe, TestedRun};
 use storm::{Calm, Spared, Storm};
 
-/// Kills, freezes, attaches and detaches the processes of a training at random, and compares what
-/// it learned with an undisturbed one.
+/// Kills, freezes, attaches and detaches the processes of a training at random, and compares its
+/// results with an undisturbed training.
 ///
-/// Trains the configuration undisturbed, then once more with the disturbances, and compares bit for
-/// bit: policy, episodes, best snapshot, evaluation, curves. Then it looks for what is left of the
-/// run on the machine. DIR/disturbances.jsonl lists everything that was done; the same seed does
-/// the same. --points, --soak and --cost do something else instead.
+/// Trains the configuration undisturbed, then again with disturbances, and compares bit for bit:
+/// policy, episodes, best snapshot, evaluation, curves. Then it looks for leftovers of the run on
+/// the machine. DIR/disturbances.jsonl lists all disturbances; a seed always gives the same ones.
+/// --points, --soak and --cost run other tests instead.
 #[derive(Debug, Parser)]
 #[command(version, after_long_help = EXIT_STATUS)]
 struct Arguments {
-    /// What to train, and how; tests/chaos.sh sets configs/smoke.toml by default.
+    /// Configuration of the training; tests/chaos.sh sets configs/smoke.toml by default.
     #[arg(
         long,
         value_name = "FILE",
@@ -52,74 +51,85 @@ struct Arguments {
         overrides_with = "config"
     )]
     config: Option<PathBuf>,
-    /// Change one setting of the config, for example --set run.seed=7; may be repeated.
+    /// Change one setting of the configuration, for example --set run.seed=7; may be repeated.
     #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
     overrides: Vec<String>,
-    /// Compare with this finished run and train by its configuration, instead of training in peace
+    /// Compare with this finished run, and use its configuration, instead of training undisturbed
     /// first.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["config", "overrides"])]
     calm: Option<PathBuf>,
-    /// Where everything goes; must be new or empty. tests/chaos.sh sets runs/chaos_<date>_<time> by
+    /// Folder of all results; must be new or empty. tests/chaos.sh sets runs/chaos_<date>_<time> by
     /// default.
     #[arg(long, value_name = "DIR", overrides_with = "run_dir")]
     run_dir: PathBuf,
-    /// What is done and when follows from it.
+    /// Seed of the disturbances and their times.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Actors to start.
-    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..))]
+    /// Number of actors.
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 4,
+        value_parser = clap::value_parser!(u32).range(1..)
+    )]
     actors: u32,
-    /// Actors to kill.
+    /// Number of actors to kill.
     #[arg(long, value_name = "N", default_value_t = 50)]
     actor_kills: u32,
-    /// Learners to kill.
+    /// Number of learners to kill.
     #[arg(long, value_name = "N", default_value_t = 5)]
     learner_kills: u32,
-    /// Supervisors to kill, every other one together with all other processes; the run is resumed
-    /// each time.
+    /// Number of supervisors to kill, every other one together with all other processes. The run is
+    /// resumed each time.
     #[arg(long, value_name = "N", default_value_t = 2)]
     supervisor_kills: u32,
-    /// Processes to stop with SIGSTOP and to continue later, half of them after their deadline.
+    /// Number of processes to stop with SIGSTOP and continue later, half of them after their
+    /// deadline.
     #[arg(long, value_name = "N", default_value_t = 6)]
     freezes: u32,
-    /// Times to attach one or two actors, and to take them away.
+    /// Number of times to attach one or two actors and remove them again.
     #[arg(long, value_name = "N", default_value_t = 3)]
     attachments: u32,
-    /// Instead, train for so long with actors coming and going, sample what every process holds
-    /// (DIR/soak.csv), and look for anything that grows.
+    /// Soak test instead: train for this long while actors come and go, sample the resources of
+    /// every process (DIR/soak.csv), and look for anything that grows.
     #[arg(long, value_name = "MINUTES", conflicts_with_all = ["calm", "points"])]
     soak: Option<f64>,
-    /// Instead, train so many times with checkpoints and so many times without, in turn, and print
-    /// what checkpoints and assembling episodes cost; on a machine that does nothing else.
-    #[arg(long, value_name = "TIMES", conflicts_with_all = ["calm", "points", "soak"], value_parser = clap::value_parser!(u32).range(1..))]
+    /// Cost test instead: train this many times with and without checkpoints, alternately, and
+    /// print the cost of checkpoints and of assembling episodes. Needs an otherwise idle machine.
+    #[arg(
+        long,
+        value_name = "TIMES",
+        conflicts_with_all = ["calm", "points", "soak"],
+        value_parser = clap::value_parser!(u32).range(1..)
+    )]
     cost: Option<u32>,
-    /// Instead, let a process die at each of the points named in the source (fault.rs).
+    /// Fault-point test instead: let a process die at each fault point named in fault.rs.
     #[arg(long)]
     points: bool,
 }
 
 const EXIT_STATUS: &str = "\
-Exit status: 0 everything was done, and nothing differs, grew, is left or costs 3 % or more; 1 \
-otherwise; 2 wrong arguments.";
+Exit status: 0 all disturbances happened, and nothing differs, grew, is left or costs 3 % or more; \
+1 otherwise; 2 wrong arguments.";
 
-/// What a soak sets, unless it is set otherwise: a run that outlasts it, and a replay buffer that
-/// is full, both parts of it, while it is still warming up.
+/// Settings of a soak test, unless overridden: a run that outlasts it, and a replay buffer whose
+/// two parts fill during the warm-up.
 const SOAK_SETTINGS: [&str; 2] = ["run.episodes=100000000", "replay.capacity=8192"];
 
-/// What a death at each point sets, unless it is set otherwise: a checkpoint after each epoch, so
-/// that the points of writing one are passed soon after each death.
+/// Settings of a fault-point test, unless overridden: a checkpoint after each epoch, so that its
+/// fault points are reached soon after each death.
 const POINTS_SETTINGS: [&str; 1] = ["checkpoints.every_episodes=1"];
 
-/// How it went.
+/// Outcome of a test.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Verdict {
-    /// Everything asked for was done, and it made no difference.
+enum TestOutcome {
+    /// All requested disturbances happened, and no difference was found.
     Passed,
-    /// Something differs, is left behind, or was not done.
+    /// A difference or leftover was found, or a disturbance did not happen.
     Failed,
 }
 
-impl Verdict {
+impl TestOutcome {
     #[allow(clippy::fn_params_excessive_bools)] // the condition is the point
     fn of(all_is_well: bool) -> Self {
         if all_is_well {
@@ -131,7 +141,7 @@ impl Verdict {
 }
 
 impl Arguments {
-    /// What to train, with `settings` unless they are set otherwise.
+    /// Returns the training to run, with `settings` unless overridden.
     fn recipe(&self, settings: &[&str]) -> Result<Recipe> {
         let mut overrides: Vec<_> = settings.iter().map(ToString::to_string).collect();
         overrides.extend_from_slice(&self.overrides);
@@ -144,8 +154,8 @@ impl Arguments {
 
 fn main() -> ExitCode {
     match run(&Arguments::parse()) {
-        Ok(Verdict::Passed) => ExitCode::SUCCESS,
-        Ok(Verdict::Failed) => ExitCode::FAILURE,
+        Ok(TestOutcome::Passed) => ExitCode::SUCCESS,
+        Ok(TestOutcome::Failed) => ExitCode::FAILURE,
         Err(error) => {
             eprintln!("skein-chaos: {}", with_causes(error.as_ref()));
             ExitCode::FAILURE
@@ -153,7 +163,7 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(arguments: &Arguments) -> Result<Verdict> {
+fn run(arguments: &Arguments) -> Result<TestOutcome> {
     let folder = new_folder(&arguments.run_dir)?;
     match (arguments.soak, arguments.cost) {
         (Some(minutes), _) => soak(arguments, &folder, Duration::from_secs_f64(minutes * 60.0)),
@@ -162,25 +172,25 @@ fn run(arguments: &Arguments) -> Result<Verdict> {
     }
 }
 
-/// Trains with checkpoints and without, and tells what they cost.
-fn cost(arguments: &Arguments, folder: &Path, times: u32) -> Result<Verdict> {
+/// Runs the cost test.
+fn cost(arguments: &Arguments, folder: &Path, times: u32) -> Result<TestOutcome> {
     let recipe = arguments.recipe(&[])?;
-    let cost = Cost::measure(&recipe, times, |name, recipe| {
-        summary(&train_in_peace(folder, name, recipe, arguments.actors)?)
+    let cost = CheckpointCost::measure(&recipe, times, |name, recipe| {
+        summary(&train_undisturbed(folder, name, recipe, arguments.actors)?)
     })?;
-    Ok(Verdict::of(cost.tell()))
+    Ok(TestOutcome::of(cost.print()))
 }
 
-/// Trains in peace, then under fire, and compares.
-fn disturb(arguments: &Arguments, folder: &Path) -> Result<Verdict> {
+/// Trains undisturbed and disturbed, and compares the results.
+fn disturb(arguments: &Arguments, folder: &Path) -> Result<TestOutcome> {
     let (calm, recipe) = calm_run(arguments, folder)?;
     let (identity, config) = calm.open()?;
     let summary = summary(&calm)?;
 
     let faults = arguments.points.then(|| folder.join("faults"));
-    let stage = Stage::new(folder, "disturbed", faults.clone())?;
+    let stage = TestedRun::new(folder, "disturbed", faults.clone())?;
     eprintln!(
-        "skein-chaos: the same under fire, in {}",
+        "skein-chaos: training with disturbances, in {}",
         stage.run.root().display()
     );
     let started = Instant::now();
@@ -188,12 +198,12 @@ fn disturb(arguments: &Arguments, folder: &Path) -> Result<Verdict> {
     let all_done = match faults {
         Some(faults) => {
             let mut points = Points::new(faults, config.run.episodes)?;
-            storm.rage(&mut points)?;
+            storm.run(&mut points)?;
             report::points(&points)
         }
         None => {
             let mut planning = planning(arguments, &config, &summary);
-            storm.rage(&mut planning)?;
+            storm.run(&mut planning)?;
             report::disturbances(&storm, &planning)
         }
     };
@@ -201,34 +211,39 @@ fn disturb(arguments: &Arguments, folder: &Path) -> Result<Verdict> {
 
     if stage.run.open()?.0.config_digest != identity.config_digest {
         bail!(
-            "{} was trained by another configuration",
+            "{} was trained with another configuration",
             calm.root().display()
         );
     }
     let same = report::comparison(&compare(&calm, &stage.run));
     let clean = report::leftovers(&leftovers(&stage.run));
-    Ok(Verdict::of(all_done && same && clean))
+    Ok(TestOutcome::of(all_done && same && clean))
 }
 
-/// Trains for `length` with actors coming and going, and looks for anything that grows.
-fn soak(arguments: &Arguments, folder: &Path, length: Duration) -> Result<Verdict> {
-    let stage = Stage::new(folder, "soaked", None)?;
+/// Runs the soak test for `length`.
+fn soak(arguments: &Arguments, folder: &Path, length: Duration) -> Result<TestOutcome> {
+    let stage = TestedRun::new(folder, "soaked", None)?;
     let recipe = arguments.recipe(&SOAK_SETTINGS)?;
     eprintln!(
-        "skein-chaos: trains for {:.0} minutes in {}",
+        "skein-chaos: training for {:.0} minutes, in {}",
         length.as_secs_f64() / 60.0,
         stage.run.root().display()
     );
     let mut soak = Soak::new(&stage.run, length, arguments.seed, &folder.join("soak.csv"))?;
     let mut storm = start(&stage, &recipe, arguments.actors, Spared::ElderActor)?;
-    storm.rage(&mut soak)?;
+    storm.run(&mut soak)?;
     report::tally(&storm);
     let flat = report::findings(&soak.findings());
     let clean = report::leftovers(&leftovers(&stage.run));
-    Ok(Verdict::of(flat && clean))
+    Ok(TestOutcome::of(flat && clean))
 }
 
-fn start<'a>(stage: &'a Stage, recipe: &Recipe, actors: u32, spared: Spared) -> Result<Storm<'a>> {
+fn start<'a>(
+    stage: &'a TestedRun,
+    recipe: &Recipe,
+    actors: u32,
+    spared: Spared,
+) -> Result<Storm<'a>> {
     let recorder = Recorder::create(&stage.folder().join("disturbances.jsonl"))
         .context("cannot write the recording")?;
     Ok(Storm::new(
@@ -239,7 +254,7 @@ fn start<'a>(stage: &'a Stage, recipe: &Recipe, actors: u32, spared: Spared) -> 
     ))
 }
 
-/// The undisturbed run, and how to train the same.
+/// Returns the undisturbed run, and the training that repeats it.
 fn calm_run(arguments: &Arguments, folder: &Path) -> Result<(RunDirectory, Recipe)> {
     let Some(calm) = &arguments.calm else {
         let recipe = arguments.recipe(if arguments.points {
@@ -248,13 +263,13 @@ fn calm_run(arguments: &Arguments, folder: &Path) -> Result<(RunDirectory, Recip
             &[]
         })?;
         return Ok((
-            train_in_peace(folder, "calm", &recipe, arguments.actors)?,
+            train_undisturbed(folder, "calm", &recipe, arguments.actors)?,
             recipe,
         ));
     };
     let calm = calm
         .canonicalize()
-        .with_context(|| format!("{} is no directory of a run", calm.display()))?;
+        .with_context(|| format!("{} is not a run directory", calm.display()))?;
     let calm = RunDirectory::new(calm);
     let recipe = Recipe {
         config: calm.config(),
@@ -263,7 +278,7 @@ fn calm_run(arguments: &Arguments, folder: &Path) -> Result<(RunDirectory, Recip
     Ok((calm, recipe))
 }
 
-/// The folder by its absolute path, created: processes of a run compare paths.
+/// Creates the folder and returns its absolute path, because processes of a run compare paths.
 fn new_folder(path: &Path) -> Result<PathBuf> {
     let context = || format!("cannot create {}", path.display());
     fs::create_dir_all(path).with_context(context)?;
@@ -273,15 +288,20 @@ fn new_folder(path: &Path) -> Result<PathBuf> {
     path.canonicalize().with_context(context)
 }
 
-fn train_in_peace(folder: &Path, name: &str, recipe: &Recipe, actors: u32) -> Result<RunDirectory> {
-    let stage = Stage::new(folder, name, None)?;
+fn train_undisturbed(
+    folder: &Path,
+    name: &str,
+    recipe: &Recipe,
+    actors: u32,
+) -> Result<RunDirectory> {
+    let stage = TestedRun::new(folder, name, None)?;
     eprintln!(
-        "skein-chaos: trains in peace, in {}",
+        "skein-chaos: training undisturbed, in {}",
         stage.run.root().display()
     );
     let supervisor = stage.start(recipe, actors)?;
     Storm::new(&stage, supervisor, Recorder::silent(), Spared::Nobody)
-        .rage(&mut Calm)
+        .run(&mut Calm)
         .context("the undisturbed run failed")?;
     let left = leftovers(&stage.run);
     if !left.is_empty() {
@@ -292,11 +312,11 @@ fn train_in_peace(folder: &Path, name: &str, recipe: &Recipe, actors: u32) -> Re
 
 fn summary(run: &RunDirectory) -> Result<Summary> {
     let path = run.summary_json();
-    let context = || format!("{}: is this a finished run?", path.display());
+    let context = || format!("cannot read {}: the run may be incomplete", path.display());
     serde_json::from_slice(&fs::read(&path).with_context(context)?).with_context(context)
 }
 
-fn planning(arguments: &Arguments, config: &Config, calm: &Summary) -> Planning {
+fn planning(arguments: &Arguments, config: &Config, calm: &Summary) -> PlannedScript {
     let subject = Subject {
         episodes: config.run.episodes,
         episodes_per_epoch: config.learning.episodes_per_epoch,
@@ -304,7 +324,7 @@ fn planning(arguments: &Arguments, config: &Config, calm: &Summary) -> Planning 
         actor_silence_secs: config.transport.actor_silence_secs,
         learner_silence_secs: config.transport.learner_silence_secs,
     };
-    let wanted = Wanted {
+    let wanted = DisturbanceCounts {
         actor_kills: arguments.actor_kills,
         learner_kills: arguments.learner_kills,
         supervisor_kills: arguments.supervisor_kills,
@@ -313,7 +333,7 @@ fn planning(arguments: &Arguments, config: &Config, calm: &Summary) -> Planning 
     };
     let epochs = config.run.episodes as f64 / config.learning.episodes_per_epoch as f64;
     let epoch = Duration::from_secs_f64(calm.wall_secs / epochs.max(1.0));
-    Planning::new(
+    PlannedScript::new(
         wanted.plan(&subject, arguments.seed),
         subject.episodes_per_epoch,
         epoch,

@@ -1,9 +1,8 @@
-//! What is done to a run, and when: drawn from a seed before the run starts, so that the same seed
-//! disturbs in the same way.
+//! Plan of disturbances, drawn from a seed before the run starts, so that a seed always disturbs in
+//! the same way.
 //!
-//! Moments are given in training episodes, not in seconds, so that a plan fits a run whatever
-//! machine it is on. Some disturbances follow another within moments, to meet a run that is just
-//! getting up again.
+//! Moments are given in training episodes, not in seconds, so that a plan fits a run on any
+//! machine. Some disturbances follow another closely, to hit a run that is just recovering.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -13,7 +12,7 @@ use serde::Serialize;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(tag = "what", rename_all = "snake_case")]
 pub(crate) enum Disturbance {
-    /// SIGKILL to an actor. `choice` says which of those that live.
+    /// SIGKILL to an actor; `choice` selects among the live ones.
     KillActor { choice: u32 },
     /// SIGSTOP to an actor, and SIGCONT after `secs`.
     FreezeActor { choice: u32, secs: f64 },
@@ -21,61 +20,61 @@ pub(crate) enum Disturbance {
     KillLearner,
     /// SIGSTOP to the learner, and SIGCONT after `secs`.
     FreezeLearner { secs: f64 },
-    /// SIGKILL to the supervisor, and to whatever `reach` says; the run is resumed after
-    /// `pause_secs` with so many actors.
+    /// SIGKILL to the supervisor and to the processes within `reach`. The run is resumed after
+    /// `pause_secs` with `actors` actors.
     KillSupervisor {
         reach: Reach,
         pause_secs: f64,
         actors: u32,
     },
-    /// `skein attach` with so many actors.
+    /// `skein attach` with this many actors.
     Attach { count: u32 },
-    /// Ends one of those that attached actors, with all it attached.
-    Detach { choice: u32, manner: Manner },
+    /// Ends one of the `skein attach` processes, with all its actors.
+    Detach { choice: u32, manner: DetachSignal },
 }
 
-/// Who else dies with the supervisor.
+/// Processes that die with the supervisor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Reach {
-    /// Nobody: the others are orphaned.
+    /// None: the others are orphaned.
     Alone,
-    /// All processes of the run at once, as when the power is cut.
+    /// All processes of the run at once, as in a power cut.
     Everybody,
 }
 
-/// How attached actors are taken away.
+/// Signal that ends attached actors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Manner {
+pub(crate) enum DetachSignal {
     /// SIGINT, as Ctrl-C.
     Interrupt,
     /// SIGKILL.
     Kill,
 }
 
-/// When something is due.
+/// Moment of a disturbance.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum When {
-    /// Once so many training episodes were learned from for the first time, and then this share of
-    /// the time an epoch takes.
+pub(crate) enum Moment {
+    /// When this many training episodes were first learned from, plus this share of an epoch's
+    /// duration.
     Episode { episode: u64, share: f64 },
-    /// So long after the disturbance before it.
+    /// This long after the previous disturbance.
     After { secs: f64 },
 }
 
 /// A disturbance and its moment.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub(crate) struct Planned {
-    pub(crate) when: When,
+pub(crate) struct PlannedDisturbance {
+    pub(crate) when: Moment,
     #[serde(flatten)]
     pub(crate) what: Disturbance,
 }
 
-/// How often each thing is to be done.
+/// Number of disturbances of each kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Wanted {
+pub(crate) struct DisturbanceCounts {
     pub(crate) actor_kills: u32,
     pub(crate) learner_kills: u32,
     pub(crate) supervisor_kills: u32,
@@ -83,7 +82,7 @@ pub(crate) struct Wanted {
     pub(crate) attachments: u32,
 }
 
-/// The run that is to be disturbed.
+/// Run to be disturbed.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Subject {
     pub(crate) episodes: u64,
@@ -93,20 +92,20 @@ pub(crate) struct Subject {
     pub(crate) learner_silence_secs: f64,
 }
 
-/// Nothing is planned for later than this share of the run: what is late must still find it
+/// Latest moment of a disturbance, as a share of the run: delayed disturbances must still find it
 /// running.
 const LAST: f64 = 0.9;
-/// Share of the kills that follow the kill of a learner or supervisor within moments.
+/// Share of the kills that closely follow the kill of a learner or supervisor.
 const AFTERSHOCKS: f64 = 0.3;
-/// Longest time between a kill and its aftershock: a start takes about as long.
+/// Longest time between a kill and its aftershock, about the time of a start.
 const AFTERSHOCK_SECS: f64 = 2.0;
-/// Every so many freezes is the learner's.
+/// Interval of freezes that hit the learner.
 const LEARNER_FREEZES: u32 = 6;
 
-impl Wanted {
-    /// A plan for `subject`: all that is wanted, in the order in which it is due.
-    pub(crate) fn plan(self, subject: &Subject, seed: u64) -> Vec<Planned> {
-        let mut draw = Draw {
+impl DisturbanceCounts {
+    /// Plans all wanted disturbances for `subject`, in chronological order.
+    pub(crate) fn plan(self, subject: &Subject, seed: u64) -> Vec<PlannedDisturbance> {
+        let mut draw = DisturbanceDraws {
             subject: *subject,
             generator: Pcg64Mcg::seed_from_u64(seed),
         };
@@ -116,7 +115,7 @@ impl Wanted {
         shocks.extend((0..self.freezes).map(|number| draw.freeze(number)));
         let mut kills: Vec<_> = (0..self.actor_kills).map(|_| draw.actor_kill()).collect();
 
-        let mut moments: Vec<(u64, f64, Disturbance, Vec<Planned>)> = Vec::new();
+        let mut moments: Vec<(u64, f64, Disturbance, Vec<PlannedDisturbance>)> = Vec::new();
         for what in shocks {
             let mut after = Vec::new();
             let gets_up_again = matches!(
@@ -128,8 +127,8 @@ impl Wanted {
                 && let Some(what) = kills.pop()
             {
                 let secs = draw.generator.random_range(0.0..AFTERSHOCK_SECS);
-                after.push(Planned {
-                    when: When::After { secs },
+                after.push(PlannedDisturbance {
+                    when: Moment::After { secs },
                     what,
                 });
             }
@@ -159,20 +158,20 @@ impl Wanted {
         let in_order = moments
             .into_iter()
             .flat_map(|(episode, share, what, after)| {
-                let when = When::Episode { episode, share };
-                std::iter::once(Planned { when, what }).chain(after)
+                let when = Moment::Episode { episode, share };
+                std::iter::once(PlannedDisturbance { when, what }).chain(after)
             });
         in_order.collect()
     }
 }
 
-/// Draws what is done.
-struct Draw {
+/// Random draws of disturbances.
+struct DisturbanceDraws {
     subject: Subject,
     generator: Pcg64Mcg,
 }
 
-impl Draw {
+impl DisturbanceDraws {
     fn moment(&mut self) -> (u64, f64) {
         let Subject {
             episodes,
@@ -205,7 +204,7 @@ impl Draw {
         }
     }
 
-    /// Half of them shorter than the silence that the peer puts up with, half of them longer.
+    /// Freezes half of them for less than the peer's tolerated silence, and half for longer.
     fn freeze(&mut self, number: u32) -> Disturbance {
         let learner = number % LEARNER_FREEZES == LEARNER_FREEZES - 1;
         let silence_secs = if learner {
@@ -231,9 +230,9 @@ impl Draw {
         Disturbance::Detach {
             choice: self.generator.random(),
             manner: if self.generator.random_bool(0.5) {
-                Manner::Interrupt
+                DetachSignal::Interrupt
             } else {
-                Manner::Kill
+                DetachSignal::Kill
             },
         }
     }
@@ -250,7 +249,7 @@ mod tests {
         actor_silence_secs: 5.0,
         learner_silence_secs: 30.0,
     };
-    const WANTED: Wanted = Wanted {
+    const WANTED: DisturbanceCounts = DisturbanceCounts {
         actor_kills: 50,
         learner_kills: 5,
         supervisor_kills: 2,
@@ -259,7 +258,7 @@ mod tests {
     };
 
     #[test]
-    fn a_plan_holds_all_that_is_wanted_and_depends_on_the_seed_alone() {
+    fn a_plan_holds_all_wanted_disturbances_and_depends_only_on_the_seed() {
         let plan = WANTED.plan(&SUBJECT, 7);
         let count =
             |is: fn(&Disturbance) -> bool| plan.iter().filter(|planned| is(&planned.what)).count();
@@ -286,12 +285,12 @@ mod tests {
     }
 
     #[test]
-    fn moments_come_in_order_and_before_the_end() {
+    fn moments_are_in_order_and_before_the_end() {
         let episodes: Vec<_> = (0..20)
             .flat_map(|seed| WANTED.plan(&SUBJECT, seed))
             .filter_map(|planned| match planned.when {
-                When::Episode { episode, .. } => Some(episode),
-                When::After { .. } => None,
+                Moment::Episode { episode, .. } => Some(episode),
+                Moment::After { .. } => None,
             })
             .collect();
         assert!(
@@ -301,12 +300,12 @@ mod tests {
         );
         let one = WANTED.plan(&SUBJECT, 1);
         assert!(
-            matches!(one[0].when, When::Episode { .. }),
-            "an aftershock of nothing"
+            matches!(one[0].when, Moment::Episode { .. }),
+            "an aftershock without a preceding kill"
         );
         let mut last = (0, 0.0);
         for planned in &one {
-            if let When::Episode { episode, share } = planned.when {
+            if let Moment::Episode { episode, share } = planned.when {
                 assert!((episode, share) >= last);
                 last = (episode, share);
             }
@@ -314,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn actors_are_frozen_for_less_and_for_more_than_is_put_up_with() {
+    fn actors_are_frozen_for_less_and_for_more_than_the_tolerated_silence() {
         let frozen: Vec<_> = WANTED
             .plan(&SUBJECT, 3)
             .into_iter()

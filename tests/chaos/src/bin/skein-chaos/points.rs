@@ -1,4 +1,4 @@
-//! Arms one fault point after the other while a run goes on.
+//! Arms one fault point after another during a run.
 
 use std::fs;
 use std::path::PathBuf;
@@ -10,29 +10,29 @@ use skein_run::fault::FaultPoint;
 use crate::plan::Disturbance;
 use crate::storm::{Script, Storm};
 
-/// After this share of the run's episodes the next point is armed as well: some are passed seldom,
-/// and the last ones only at the end.
+/// Share of the run's episodes after which the next point is armed as well. Some points are reached
+/// rarely, and the last ones only at the end.
 const PATIENCE: f64 = 1.0 / 6.0;
 
-/// The fault points, in the order in which they are armed.
+/// Fault points, in the order of arming.
 #[derive(Debug)]
 pub(crate) struct Points {
     folder: PathBuf,
     total_episodes: u64,
-    /// The next one last.
+    /// Points still to arm, the next one last.
     to_arm: Vec<FaultPoint>,
-    /// With the episodes learned from at most by then.
+    /// Armed points, with the highest number of episodes learned from at that time.
     armed: Vec<(FaultPoint, u64)>,
     fired: Vec<FaultPoint>,
-    /// Episodes learned from at most when a point fired, until there are more.
+    /// Highest number of episodes learned from when a point fired, until there are more.
     recovering_from: Option<u64>,
 }
 
 impl Points {
-    /// All of them, to be armed in `folder`, over a run of so many episodes.
+    /// Creates a script that arms all points in `folder`, over a run of this many episodes.
     ///
     /// # Errors
-    /// When the folder cannot be made.
+    /// Returns an error if the folder cannot be created.
     pub(crate) fn new(folder: PathBuf, total_episodes: u64) -> Result<Self> {
         fs::create_dir_all(&folder)
             .with_context(|| format!("cannot create {}", folder.display()))?;
@@ -46,12 +46,12 @@ impl Points {
         })
     }
 
-    /// Where somebody died.
+    /// Points at which a process died.
     pub(crate) fn fired(&self) -> &[FaultPoint] {
         &self.fired
     }
 
-    /// Where nobody did.
+    /// Points at which no process died.
     pub(crate) fn unfired(&self) -> Vec<FaultPoint> {
         let unfired = |point: &&FaultPoint| !self.fired.contains(point);
         FaultPoint::ALL.iter().filter(unfired).copied().collect()
@@ -71,9 +71,8 @@ impl Points {
         Ok(())
     }
 
-    /// Whether the run has come farther since the last point fired: deaths without that are
-    /// answered with longer and longer pauses. What comes after the last episode, nobody can wait
-    /// for.
+    /// Returns `true` if the run has progressed since the last point fired. Deaths without progress
+    /// would only lead to longer and longer pauses. After the last episode no progress can follow.
     fn has_recovered(&mut self, storm: &Storm<'_>) -> bool {
         let total = self.total_episodes;
         let recovering = |&from: &u64| storm.highest() <= from && from < total;
@@ -82,8 +81,8 @@ impl Points {
     }
 }
 
-/// All points, those first that may be passed only early in a run: the first candidate for the best
-/// snapshot is always better than none, the later ones may all be worse.
+/// Returns all points, first those that may only be reached early in a run: the first candidate for
+/// the best snapshot always replaces none; all later ones may be worse.
 fn order_of_arming() -> Vec<FaultPoint> {
     let mut points = FaultPoint::ALL.to_vec();
     points.sort_by_key(|&point| point != FaultPoint::LearnerBestSaved);
@@ -109,7 +108,7 @@ impl Script for Points {
             storm.note("armed", &json!({ "point": point.name() }))?;
             self.armed.push((point, storm.highest()));
             if point == FaultPoint::LearnerStarted {
-                // Only a learner that starts comes by there.
+                // Only a starting learner reaches this point.
                 storm.disturb(Disturbance::KillLearner)?;
             }
         }

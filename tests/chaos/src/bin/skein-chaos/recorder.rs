@@ -1,5 +1,5 @@
-//! The episode recorder: everything that was done to a run, as one JSON object a line, so that a
-//! failure can be studied.
+//! Recording of everything that was done to a run, as one JSON object per line, so that a failure
+//! can be studied.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -9,19 +9,19 @@ use std::time::Instant;
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-/// Writes what happens as it happens.
+/// Writes events as they happen.
 #[derive(Debug)]
 pub(crate) struct Recorder {
-    /// Of an undisturbed run nothing is recorded.
+    /// Output file; `None` for an undisturbed run.
     file: Option<File>,
     started: Instant,
 }
 
 impl Recorder {
-    /// A recording in a new file.
+    /// Creates a recording in a new file.
     ///
     /// # Errors
-    /// When it cannot be created.
+    /// Returns an error if the file cannot be created.
     pub(crate) fn create(path: &Path) -> io::Result<Self> {
         Ok(Self {
             file: Some(File::create(path)?),
@@ -29,7 +29,7 @@ impl Recorder {
         })
     }
 
-    /// None: for a run that nothing is done to.
+    /// Returns a recorder that writes nothing, for an undisturbed run.
     pub(crate) fn silent() -> Self {
         Self {
             file: None,
@@ -37,11 +37,11 @@ impl Recorder {
         }
     }
 
-    /// Notes what happened: seconds since the start, episodes learned from by then, `event`, and
-    /// the fields of `details`.
+    /// Records an event: seconds since the start, episodes learned from, `event`, and the fields of
+    /// `details`.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if it cannot be written.
     pub(crate) fn note(
         &mut self,
         episodes: u64,
@@ -63,8 +63,8 @@ impl Recorder {
                 line.insert("details".to_owned(), other);
             }
         }
-        // One write a line, and nothing kept back: the recording is whole when this program is
-        // killed as well.
+        // One unbuffered write per line, so that the recording is complete even if this program is
+        // killed.
         file.write_all(format!("{}\n", Value::Object(line)).as_bytes())
     }
 }

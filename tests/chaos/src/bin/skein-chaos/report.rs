@@ -1,19 +1,18 @@
-//! What is told at the end, on standard output: what was done, what came of it, and the verdict on
-//! each.
+//! Report on standard output: the disturbances, their consequences, and a verdict on each.
 
-use skein_chaos::Check;
+use skein_chaos::OutcomeCheck;
 
-use crate::planned::Planning;
+use crate::planned::PlannedScript;
 use crate::points::Points;
 use crate::soak::Finding;
 use crate::storm::Storm;
 
-/// What was done how often, and whether it was all that was planned.
-pub(crate) fn disturbances(storm: &Storm<'_>, planning: &Planning) -> bool {
+/// Prints the number of disturbances. Returns `true` if all planned ones happened.
+pub(crate) fn disturbances(storm: &Storm<'_>, planning: &PlannedScript) -> bool {
     tally(storm);
     if planning.left() > 0 {
         println!(
-            "  {:<32} {}: the run ended too soon; train longer, with a greater run.episodes",
+            "  {:<32} {}: the run ended too early; increase run.episodes",
             "NOT DONE",
             planning.left()
         );
@@ -21,17 +20,17 @@ pub(crate) fn disturbances(storm: &Storm<'_>, planning: &Planning) -> bool {
     planning.left() == 0
 }
 
-/// What was done how often.
+/// Prints the number of disturbances of each kind.
 pub(crate) fn tally(storm: &Storm<'_>) {
-    println!("Done to the run:");
+    println!("Disturbances:");
     for (what, times) in storm.tally() {
         println!("  {what:<32} {times}");
     }
 }
 
-/// Where a process died, and whether that was everywhere.
+/// Prints the points at which processes died. Returns `true` if these are all points.
 pub(crate) fn points(points: &Points) -> bool {
-    println!("Died at:");
+    println!("Processes died at:");
     for point in points.fired() {
         println!("  {}", point.name());
     }
@@ -41,14 +40,14 @@ pub(crate) fn points(points: &Points) -> bool {
     points.unfired().is_empty()
 }
 
-/// How long it took.
+/// Prints the durations.
 pub(crate) fn durations(disturbed_secs: f64, calm_secs: f64) {
-    println!("  {:<32} {disturbed_secs:.0} s", "took");
-    println!("  {:<32} {calm_secs:.0} s", "undisturbed");
+    println!("  {:<32} {disturbed_secs:.0} s", "disturbed run");
+    println!("  {:<32} {calm_secs:.0} s", "undisturbed run");
 }
 
-/// The comparison, and whether nothing differs.
-pub(crate) fn comparison(checks: &[Check]) -> bool {
+/// Prints the comparison. Returns `true` if nothing differs.
+pub(crate) fn comparison(checks: &[OutcomeCheck]) -> bool {
     println!("Compared with the undisturbed run:");
     for check in checks {
         match &check.verdict {
@@ -59,7 +58,7 @@ pub(crate) fn comparison(checks: &[Check]) -> bool {
     checks.iter().all(|check| check.verdict.is_ok())
 }
 
-/// What grew, and whether nothing did.
+/// Prints the trends. Returns `true` if nothing grew.
 pub(crate) fn findings(findings: &[Finding]) -> bool {
     println!(
         "{:<12} {:<24} {:>13} {:>13} {:>12} {:>10}",
@@ -79,10 +78,10 @@ pub(crate) fn findings(findings: &[Finding]) -> bool {
     findings.iter().all(|finding| finding.flat)
 }
 
-/// What is left on the machine, and whether it is nothing.
+/// Prints the leftovers on the machine. Returns `true` if there are none.
 pub(crate) fn leftovers(left: &[String]) -> bool {
     if left.is_empty() {
-        println!("Nothing is left: no process, no shared memory, no file in /tmp.");
+        println!("No leftovers: no process, no shared memory, no file in /tmp.");
     }
     for thing in left {
         println!("LEFT BEHIND: {thing}");

@@ -1,9 +1,9 @@
-//! A long run with actors coming and going, watched for anything that grows.
+//! Soak test: a long run with actors coming and going, watched for anything that grows.
 //!
-//! Learner, supervisor and one actor, the elder, are left alone, so that they grow old. The other
-//! actors are killed, frozen, attached and taken away all the time. What a run may well hold more
-//! of at first, a replay buffer that fills up, is over by the end of the warm-up if its
-//! configuration is chosen so; everything after that is held to be flat.
+//! Learner, supervisor and one actor, the elder, are spared, so that they run throughout. The other
+//! actors are killed, frozen, attached and removed all the time. Some growth at first is normal,
+//! such as a filling replay buffer. A suitable configuration completes it within the warm-up;
+//! everything must be flat afterwards.
 
 use std::fs::File;
 use std::io::Write;
@@ -13,52 +13,52 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use skein_chaos::{Footprint, Process, Role, Usage, footprint};
+use skein_chaos::{Footprint, ListedProcess, Role, Usage, footprint};
 use skein_protocol::ids::RunId;
 use skein_run::RunDirectory;
 
-use crate::plan::{Disturbance, Manner};
-use crate::statistics::{Trend, commonest};
+use crate::plan::{DetachSignal, Disturbance};
+use crate::statistics::{Trend, most_frequent};
 use crate::storm::{Script, Storm};
 
-/// Between two samples.
+/// Time between two samples.
 const SAMPLE: Duration = Duration::from_secs(5);
-/// Between two disturbances, on average.
+/// Average time between two disturbances.
 const CHURN: Duration = Duration::from_secs(3);
-/// Share of the soak that is warm-up: its samples are written, not judged.
+/// Share of the soak that is warm-up. Its samples are written but not judged.
 const WARM_UP: f64 = 0.2;
-/// Crews attached at one time at most.
+/// Largest number of `skein attach` processes at a time.
 const CREWS: usize = 3;
-/// Growth that is put up with, as a share of what is there.
+/// Tolerated growth, as a share of the value.
 const TOLERANCE: f64 = 0.05;
 
-/// What is sampled.
-const SERIES: [Series; 13] = [
-    Series::new("learner", "resident MiB", 4.0),
-    Series::new("learner", "anonymous MiB", 4.0),
-    Series::new("learner", "descriptors", 4.0),
-    Series::new("learner", "threads", 1.0),
-    Series::new("supervisor", "resident MiB", 1.0),
-    Series::new("supervisor", "descriptors", 4.0),
-    Series::new("elder actor", "resident MiB", 1.0),
-    Series::new("elder actor", "anonymous MiB", 1.0),
-    Series::new("elder actor", "descriptors", 4.0),
-    Series::new("elder actor", "threads", 1.0),
-    Series::new("machine", "shared-memory segments", 8.0),
-    Series::new("machine", "shared-memory MiB", 4.0),
-    Series::new("machine", "files in /tmp", 16.0),
+/// Sampled series.
+const SERIES: [SoakSeries; 13] = [
+    SoakSeries::new("learner", "resident MiB", 4.0),
+    SoakSeries::new("learner", "anonymous MiB", 4.0),
+    SoakSeries::new("learner", "descriptors", 4.0),
+    SoakSeries::new("learner", "threads", 1.0),
+    SoakSeries::new("supervisor", "resident MiB", 1.0),
+    SoakSeries::new("supervisor", "descriptors", 4.0),
+    SoakSeries::new("elder actor", "resident MiB", 1.0),
+    SoakSeries::new("elder actor", "anonymous MiB", 1.0),
+    SoakSeries::new("elder actor", "descriptors", 4.0),
+    SoakSeries::new("elder actor", "threads", 1.0),
+    SoakSeries::new("machine", "shared-memory segments", 8.0),
+    SoakSeries::new("machine", "shared-memory MiB", 4.0),
+    SoakSeries::new("machine", "files in /tmp", 16.0),
 ];
 
-/// One figure over time.
+/// One sampled quantity.
 #[derive(Debug, Clone, Copy)]
-struct Series {
+struct SoakSeries {
     whose: &'static str,
     what: &'static str,
-    /// Growth that is put up with whatever is there: what comes and goes with an actor or two.
+    /// Tolerated growth whatever the value: the change caused by an actor or two.
     at_least: f64,
 }
 
-impl Series {
+impl SoakSeries {
     const fn new(whose: &'static str, what: &'static str, at_least: f64) -> Self {
         Self {
             whose,
@@ -68,10 +68,10 @@ impl Series {
     }
 }
 
-/// The figures at one time; `None` of who was not there.
+/// Values of all series at one time; `None` if the process did not exist.
 type Sample = [Option<f64>; SERIES.len()];
 
-/// Disturbs a run for so long, samples what it holds, then ends it.
+/// Disturbs a run for a given time, samples its resources, then ends it.
 #[derive(Debug)]
 pub(crate) struct Soak {
     run: RunDirectory,
@@ -81,31 +81,31 @@ pub(crate) struct Soak {
     generator: Pcg64Mcg,
     next_disturbance: Instant,
     next_sample: Instant,
-    ending: Ending,
+    ending: SoakEnding,
     table: File,
-    samples: Vec<Moment>,
+    samples: Vec<SampledMoment>,
 }
 
-/// What was sampled at one time.
+/// Samples of one time.
 #[derive(Debug)]
-struct Moment {
+struct SampledMoment {
     secs: f64,
-    /// Processes of the run that there were.
+    /// Number of the run's processes.
     processes: usize,
     sample: Sample,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Ending {
+enum SoakEnding {
     NotYet,
-    Told,
+    Interrupted,
 }
 
 impl Soak {
-    /// Of the run in `run`; samples go to the new file `table`, as CSV.
+    /// Creates a soak test of `run`. Samples go to the new file `table`, as CSV.
     ///
     /// # Errors
-    /// When that cannot be written.
+    /// Returns an error if the file cannot be written.
     pub(crate) fn new(
         run: &RunDirectory,
         length: Duration,
@@ -128,7 +128,7 @@ impl Soak {
             generator: Pcg64Mcg::seed_from_u64(seed),
             next_disturbance: now + CHURN,
             next_sample: now + SAMPLE,
-            ending: Ending::NotYet,
+            ending: SoakEnding::NotYet,
             table: file,
             samples: Vec::new(),
         })
@@ -148,13 +148,13 @@ impl Soak {
             _ => Disturbance::Detach {
                 choice,
                 manner: if self.generator.random_bool(0.5) {
-                    Manner::Interrupt
+                    DetachSignal::Interrupt
                 } else {
-                    Manner::Kill
+                    DetachSignal::Kill
                 },
             },
         };
-        // Whoever is not there is not missed: there will be another.
+        // A missing process does not matter: others follow.
         storm.disturb(what)?;
         let pause = CHURN.mul_f64(self.generator.random_range(0.2..1.8));
         self.next_disturbance = Instant::now() + pause;
@@ -168,7 +168,8 @@ impl Soak {
         }
         let processes = storm.processes();
         let usage = |role| {
-            let eldest: Option<&Process> = processes.iter().find(|process| process.role() == role);
+            let eldest: Option<&ListedProcess> =
+                processes.iter().find(|process| process.role() == role);
             eldest.and_then(|process| process.usage().ok())
         };
         let sample = figures(
@@ -189,7 +190,7 @@ impl Soak {
             processes.len(),
             cells.join(",")
         )?;
-        self.samples.push(Moment {
+        self.samples.push(SampledMoment {
             secs,
             processes: processes.len(),
             sample,
@@ -197,9 +198,9 @@ impl Soak {
         Ok(())
     }
 
-    /// The trend of each figure after the warm-up, and whether it is flat: over the moments at
-    /// which as many processes were there as mostly are, because each one that comes brings files,
-    /// segments and descriptors with it.
+    /// Returns the trend of each series after the warm-up. Only the moments with the most common
+    /// number of processes count, because each additional process brings files, segments and
+    /// descriptors with it.
     pub(crate) fn findings(&self) -> Vec<Finding> {
         let warm = self.length.as_secs_f64() * WARM_UP;
         let hours = (self.length.as_secs_f64() - warm) / 3600.0;
@@ -208,8 +209,8 @@ impl Soak {
             .iter()
             .filter(|moment| moment.secs >= warm)
             .collect();
-        let attendance = commonest(judged.iter().map(|moment| moment.processes));
-        let finding = |(index, series): (usize, &Series)| {
+        let attendance = most_frequent(judged.iter().map(|moment| moment.processes));
+        let finding = |(index, series): (usize, &SoakSeries)| {
             let values: Vec<_> = judged
                 .iter()
                 .filter(|moment| Some(moment.processes) == attendance)
@@ -230,20 +231,20 @@ impl Soak {
     }
 }
 
-/// What a figure did over the soak.
+/// Trend of a series over the soak.
 #[derive(Debug)]
 pub(crate) struct Finding {
     pub(crate) whose: &'static str,
     pub(crate) what: &'static str,
-    /// `None` when there were too few samples.
+    /// Trend; `None` with too few samples.
     pub(crate) trend: Option<Trend>,
-    /// Growth that was put up with.
+    /// Tolerated growth.
     pub(crate) tolerance: f64,
-    /// Whether it grew by no more.
+    /// `true` if it grew by no more than that.
     pub(crate) flat: bool,
 }
 
-/// In the order of [`SERIES`].
+/// Returns the values in the order of [`SERIES`].
 fn figures(
     learner: Option<Usage>,
     supervisor: Option<Usage>,
@@ -274,14 +275,14 @@ fn figures(
 
 impl Script for Soak {
     fn step(&mut self, storm: &mut Storm<'_>) -> Result<()> {
-        if self.ending == Ending::Told {
+        if self.ending == SoakEnding::Interrupted {
             return Ok(());
         }
         if Instant::now() >= self.next_sample {
             self.sample(storm)?;
         }
         if self.started.elapsed() >= self.length {
-            self.ending = Ending::Told;
+            self.ending = SoakEnding::Interrupted;
             return storm.interrupt();
         }
         if Instant::now() >= self.next_disturbance {

@@ -1,4 +1,4 @@
-//! The programs under test: started, watched, resumed, cleared away.
+//! Programs under test: started, watched, resumed, cleared away.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom};
@@ -9,42 +9,42 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use rustix::process::Signal;
-use skein_chaos::{Process, processes_of};
+use skein_chaos::{ListedProcess, processes_of};
 use skein_protocol::summary::{Ending, Summary};
 use skein_run::RunDirectory;
 use skein_run::fault::FAULTS;
 use skein_run::orphans::signal_when_orphaned;
 
-/// Between two looks at what is waited for.
+/// Time between two checks of a condition.
 pub(crate) const LOOK: Duration = Duration::from_millis(10);
 
-/// What to train.
+/// Training to run.
 #[derive(Debug, Clone)]
 pub(crate) struct Recipe {
     pub(crate) config: PathBuf,
     pub(crate) overrides: Vec<String>,
 }
 
-/// A run and the programs that carry it.
+/// A run and its programs.
 #[derive(Debug)]
-pub(crate) struct Stage {
+pub(crate) struct TestedRun {
     skein: PathBuf,
     folder: PathBuf,
     pub(crate) run: RunDirectory,
-    /// What all programs of the run say on standard output and standard error.
-    said: PathBuf,
+    /// Log with standard output and standard error of all programs of the run.
+    log: PathBuf,
     faults: Option<PathBuf>,
 }
 
-impl Stage {
-    /// For a run in `folder/name`; what its programs say goes to `folder/name.log`. `faults` is
-    /// where fault points are armed.
+impl TestedRun {
+    /// Prepares a run in `folder/name` with the log `folder/name.log`. Fault points are armed in
+    /// `faults`.
     ///
     /// # Errors
-    /// When `skein` does not lie beside this program.
+    /// Returns an error if `skein` does not lie beside this program.
     pub(crate) fn new(folder: &Path, name: &str, faults: Option<PathBuf>) -> Result<Self> {
         let skein = std::env::current_exe()
-            .context("cannot tell where this program lies")?
+            .context("cannot find the path of this program")?
             .with_file_name("skein");
         if !skein.is_file() {
             bail!(
@@ -56,20 +56,20 @@ impl Stage {
             skein,
             folder: folder.to_owned(),
             run: RunDirectory::new(folder.join(name)),
-            said: folder.join(format!("{name}.log")),
+            log: folder.join(format!("{name}.log")),
             faults,
         })
     }
 
-    /// Where everything about the run goes.
+    /// Folder of all files about the run.
     pub(crate) fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Starts the run anew.
+    /// Starts the run.
     ///
     /// # Errors
-    /// When the program cannot be started.
+    /// Returns an error if the program cannot be started.
     pub(crate) fn start(&self, recipe: &Recipe, actors: u32) -> Result<Child> {
         let mut command = self.command("run")?;
         command.arg("--config").arg(&recipe.config);
@@ -84,10 +84,10 @@ impl Stage {
         self.spawn(command)
     }
 
-    /// Starts it again after everything was killed.
+    /// Resumes the run after everything was killed.
     ///
     /// # Errors
-    /// As [`Stage::start`].
+    /// As [`TestedRun::start`].
     pub(crate) fn resume(&self, actors: u32) -> Result<Child> {
         let mut command = self.command("run")?;
         command.arg("--resume").arg(self.run.root());
@@ -95,10 +95,10 @@ impl Stage {
         self.spawn(command)
     }
 
-    /// Adds actors to it.
+    /// Adds actors to the run.
     ///
     /// # Errors
-    /// As [`Stage::start`].
+    /// As [`TestedRun::start`].
     pub(crate) fn attach(&self, count: u32) -> Result<Child> {
         let mut command = self.command("attach")?;
         command.arg("--run").arg(self.run.root());
@@ -107,25 +107,21 @@ impl Stage {
     }
 
     fn command(&self, what: &str) -> Result<Command> {
-        let said = || -> io::Result<File> {
-            OpenOptions::new()
-                .create(true)
-                .append(true)
-                .open(&self.said)
-        };
-        let context = || format!("cannot write {}", self.said.display());
+        let log =
+            || -> io::Result<File> { OpenOptions::new().create(true).append(true).open(&self.log) };
+        let context = || format!("cannot write {}", self.log.display());
         let mut command = Command::new(&self.skein);
         command.arg(what).stdin(Stdio::null());
-        command.stdout(said().with_context(context)?);
-        command.stderr(said().with_context(context)?);
+        command.stdout(log().with_context(context)?);
+        command.stderr(log().with_context(context)?);
         if let Some(faults) = &self.faults {
             command.env(FAULTS, faults);
         }
         Ok(command)
     }
 
-    /// Starts `command` so that it is interrupted when this program dies: nobody would end a run
-    /// that is made to last for ever.
+    /// Starts `command` so that it is interrupted when this program dies. Otherwise a run without
+    /// end would remain.
     fn spawn(&self, mut command: Command) -> Result<Child> {
         signal_when_orphaned(&mut command, Signal::INT);
         command
@@ -133,31 +129,31 @@ impl Stage {
             .with_context(|| format!("cannot start {}", self.skein.display()))
     }
 
-    /// Its processes, oldest first.
-    pub(crate) fn processes(&self) -> Vec<Process> {
+    /// Returns its processes, oldest first.
+    pub(crate) fn processes(&self) -> Vec<ListedProcess> {
         processes_of(&self.run)
     }
 
-    /// The last lines that its programs said.
+    /// Returns the last lines of its log.
     pub(crate) fn last_words(&self) -> String {
-        let text = fs::read(&self.said).unwrap_or_default();
+        let text = fs::read(&self.log).unwrap_or_default();
         let text = String::from_utf8_lossy(&text);
         let lines: Vec<_> = text.lines().collect();
         lines[lines.len().saturating_sub(12)..].join("\n")
     }
 
-    /// Its summary, once there is one.
+    /// Returns its summary, if it exists.
     pub(crate) fn summary(&self) -> Option<Summary> {
         serde_json::from_slice(&fs::read(self.run.summary_json()).ok()?).ok()
     }
 
-    /// Whether it came to its end.
+    /// Returns `true` if it completed.
     pub(crate) fn is_complete(&self) -> bool {
         self.summary()
             .is_some_and(|summary| summary.ending == Ending::Completed)
     }
 
-    /// Kills whatever is left of it. For the way out of a failure.
+    /// Kills all its processes, after a failure.
     pub(crate) fn clear(&self) {
         let end = Instant::now() + Duration::from_secs(10);
         loop {
@@ -171,10 +167,10 @@ impl Stage {
     }
 }
 
-/// Waits for the end of `child`, but not longer than until `deadline`.
+/// Waits for the end of `child` until `deadline`.
 ///
 /// # Errors
-/// When it cannot be waited for.
+/// Returns an error if it cannot be waited for.
 pub(crate) fn wait(child: &mut Child, deadline: Instant) -> io::Result<Option<ExitStatus>> {
     loop {
         if let Some(status) = child.try_wait()? {
@@ -187,7 +183,7 @@ pub(crate) fn wait(child: &mut Child, deadline: Instant) -> io::Result<Option<Ex
     }
 }
 
-/// Counts the episodes in an `episodes.csv` that grows, and may be cut back.
+/// Counts the episodes in a growing `episodes.csv`, which may also be truncated.
 #[derive(Debug)]
 pub(crate) struct EpisodeCount {
     path: PathBuf,
@@ -196,7 +192,7 @@ pub(crate) struct EpisodeCount {
 }
 
 impl EpisodeCount {
-    /// Of the run in `run`.
+    /// Counts the episodes of `run`.
     pub(crate) fn of(run: &RunDirectory) -> Self {
         Self {
             path: run.episodes_csv(),
@@ -205,9 +201,10 @@ impl EpisodeCount {
         }
     }
 
-    /// Episodes learned from so far; less than before when a learner was resumed from before.
+    /// Returns the number of episodes learned from; it decreases when a learner resumes from an
+    /// earlier state.
     pub(crate) fn now(&mut self) -> u64 {
-        // Before the first epoch there is no file; that is no fault.
+        // Before the first epoch no file exists, which is not an error.
         let _ = self.read_on();
         self.lines.saturating_sub(1)
     }
@@ -231,7 +228,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn episodes_are_counted_as_they_come_and_when_they_are_cut_back() {
+    fn episodes_are_counted_as_they_come_and_after_truncation() {
         let folder = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(folder.path());
         let mut count = EpisodeCount::of(&run);

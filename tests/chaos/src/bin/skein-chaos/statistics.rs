@@ -1,10 +1,10 @@
-//! Whether a series of samples grows: quarters, medians, and a slope that single outliers do not
-//! bend.
+//! Growth of a series of samples: quarters, medians, and a slope that is robust against single
+//! outliers.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-/// What a series shows.
+/// Trend of a series.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Trend {
     /// Median of the first quarter of the samples.
@@ -15,11 +15,11 @@ pub(crate) struct Trend {
     pub(crate) per_hour: f64,
 }
 
-/// More samples than this are thinned out: pairs grow with the square.
+/// Largest number of samples used: the number of pairs grows with its square.
 const SAMPLES: usize = 400;
 
 impl Trend {
-    /// Of `samples`: seconds and values, in order. `None` for fewer than eight.
+    /// Returns the trend of `samples` (seconds and values, in order); `None` for fewer than eight.
     pub(crate) fn of(samples: &[(f64, f64)]) -> Option<Self> {
         if samples.len() < 8 {
             return None;
@@ -33,7 +33,7 @@ impl Trend {
         })
     }
 
-    /// Whether neither the quarters nor the slope, over `hours`, show a growth of more than
+    /// Returns `true` if neither the quarters nor the slope, over `hours`, grow by more than
     /// `tolerance`.
     pub(crate) fn is_flat(&self, tolerance: f64, hours: f64) -> bool {
         self.last - self.first <= tolerance && self.per_hour * hours <= tolerance
@@ -54,8 +54,8 @@ fn slope_per_sec(samples: &[(f64, f64)]) -> f64 {
     median(slopes)
 }
 
-/// The number that is there most often; of several the smallest.
-pub(crate) fn commonest(numbers: impl Iterator<Item = usize>) -> Option<usize> {
+/// Returns the most frequent number, or the smallest of several.
+pub(crate) fn most_frequent(numbers: impl Iterator<Item = usize>) -> Option<usize> {
     let mut counts = BTreeMap::<usize, usize>::new();
     numbers.for_each(|number| *counts.entry(number).or_default() += 1);
     let most = counts
@@ -64,7 +64,7 @@ pub(crate) fn commonest(numbers: impl Iterator<Item = usize>) -> Option<usize> {
     most.map(|(&number, _)| number)
 }
 
-/// The middle value; of an even number the upper of the two. Zero of none.
+/// Returns the median, for an even number of values the upper one; zero for no values.
 pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or_default()
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leak_is_seen_through_noise_and_outliers() {
+    fn a_leak_is_found_despite_noise_and_outliers() {
         let noise =
             |secs: f64| (secs * 1.7).sin() * 30.0 + if secs % 300.0 == 0.0 { 5000.0 } else { 0.0 };
         let leak = Trend::of(&series(|secs| 1000.0 + secs / 36.0 + noise(secs))).unwrap();
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_that_the_slope_does_not_see_is_seen_by_the_quarters() {
+    fn a_step_that_the_slope_misses_is_found_by_the_quarters() {
         let step = Trend::of(&series(|secs| if secs < 3000.0 { 100.0 } else { 200.0 })).unwrap();
         assert!(
             step.per_hour * 1.0 < 150.0 && !step.is_flat(50.0, 1.0),
@@ -102,13 +102,13 @@ mod tests {
     }
 
     #[test]
-    fn the_commonest_number_is_found() {
-        assert_eq!(commonest([7, 9, 9, 8, 7, 3].into_iter()), Some(7));
-        assert_eq!(commonest([].into_iter()), None);
+    fn the_most_frequent_number_is_found() {
+        assert_eq!(most_frequent([7, 9, 9, 8, 7, 3].into_iter()), Some(7));
+        assert_eq!(most_frequent([].into_iter()), None);
     }
 
     #[test]
-    fn what_shrinks_is_no_leak() {
+    fn a_shrinking_series_is_not_a_leak() {
         assert!(
             Trend::of(&series(|secs| 1000.0 - secs))
                 .unwrap()

@@ -1,8 +1,8 @@
-//! A run that is disturbed while it goes on.
+//! A run that is disturbed while it proceeds.
 //!
-//! What is done to it is a [`Script`]'s business. Here is what every script needs: the hand that
-//! kills, freezes and attaches, and the eye on supervisor, crews and episodes, so that what happens
-//! by itself is told from what was done.
+//! A [`Script`] decides on the disturbances. This module carries them out (it kills, freezes and
+//! attaches) and watches supervisor, attached actors and episodes, to distinguish events that
+//! happen by themselves from disturbances.
 
 mod supervisor;
 
@@ -14,32 +14,32 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use rustix::process::Signal;
 use serde_json::json;
-use skein_chaos::{Process, Role};
+use skein_chaos::{ListedProcess, Role};
 
-use supervisor::{Supervisor, Told};
+use supervisor::{StopRequest, Supervisor};
 
-use crate::plan::{Disturbance, Manner, Reach};
+use crate::plan::{DetachSignal, Disturbance, Reach};
 use crate::recorder::Recorder;
-use crate::stage::{EpisodeCount, LOOK, Stage, wait};
+use crate::stage::{EpisodeCount, LOOK, TestedRun, wait};
 
-/// Without a new episode for so long, a run is stuck: the longest pause of a sound one is its
+/// Time without a new episode after which a run is stuck. The longest pause of a sound run is its
 /// evaluation.
 const STUCK: Duration = Duration::from_secs(300);
-/// How long a killed process may take to be gone: the kernel gives its memory back first.
+/// Time for a killed process to disappear: the kernel frees its memory first.
 const DEATH: Duration = Duration::from_secs(2);
-/// How long those that attached actors may outlive the run.
+/// Time for which `skein attach` processes may outlive the run.
 const CREW_GRACE: Duration = Duration::from_secs(40);
 
-/// What is done to a run.
+/// Source of disturbances.
 pub(crate) trait Script {
     /// Called every few milliseconds while the run is under way.
     ///
     /// # Errors
-    /// Whatever makes it pointless to go on.
+    /// Returns any error that makes continuing pointless.
     fn step(&mut self, storm: &mut Storm<'_>) -> Result<()>;
 }
 
-/// Nothing is done.
+/// Script without disturbances.
 #[derive(Debug)]
 pub(crate) struct Calm;
 
@@ -49,22 +49,22 @@ impl Script for Calm {
     }
 }
 
-/// How an attempt to disturb ended.
+/// Result of an attempt to disturb.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Attempt {
-    /// It is done.
+    /// The disturbance was carried out.
     Done,
-    /// Nobody was there to do it to.
+    /// No suitable process existed.
     NobodyThere,
 }
 
-/// A run under way, and what was done to it.
+/// A run under way, with a record of its disturbances.
 #[derive(Debug)]
 pub(crate) struct Storm<'a> {
-    stage: &'a Stage,
+    stage: &'a TestedRun,
     supervisor: Supervisor,
     crews: Vec<Child>,
-    frozen: Vec<(Process, Instant)>,
+    frozen: Vec<(ListedProcess, Instant)>,
     count: EpisodeCount,
     episodes: u64,
     highest: u64,
@@ -74,19 +74,19 @@ pub(crate) struct Storm<'a> {
     tally: BTreeMap<&'static str, u32>,
 }
 
-/// Who is never a victim.
+/// Processes that are never disturbed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Spared {
-    /// Nobody is safe.
+    /// None.
     Nobody,
     /// The actor that was started first.
     ElderActor,
 }
 
 impl<'a> Storm<'a> {
-    /// Over the run that `supervisor` has just been started for.
+    /// Creates the storm over the run of the newly started `supervisor`.
     pub(crate) fn new(
-        stage: &'a Stage,
+        stage: &'a TestedRun,
         supervisor: Child,
         recorder: Recorder,
         spared: Spared,
@@ -95,7 +95,7 @@ impl<'a> Storm<'a> {
             stage,
             supervisor: Supervisor::Running {
                 child: supervisor,
-                told_to_stop: Told::Nothing,
+                stop_request: StopRequest::None,
             },
             crews: Vec::new(),
             frozen: Vec::new(),
@@ -109,12 +109,13 @@ impl<'a> Storm<'a> {
         }
     }
 
-    /// Lets `script` disturb the run until it ends. Nobody is left frozen.
+    /// Lets `script` disturb the run until it ends. No process is left frozen.
     ///
     /// # Errors
-    /// When the run fails or gets stuck, or the script gives up; the run is killed then.
-    pub(crate) fn rage(&mut self, script: &mut impl Script) -> Result<()> {
-        let outcome = self.rage_on(script);
+    /// Returns an error if the run fails or is stuck, or the script gives up. The run is killed
+    /// then.
+    pub(crate) fn run(&mut self, script: &mut impl Script) -> Result<()> {
+        let outcome = self.run_script(script);
         self.thaw(Thaw::All);
         if let Err(error) = &outcome {
             let processes: Vec<_> = self
@@ -133,7 +134,7 @@ impl<'a> Storm<'a> {
         outcome
     }
 
-    fn rage_on(&mut self, script: &mut impl Script) -> Result<()> {
+    fn run_script(&mut self, script: &mut impl Script) -> Result<()> {
         loop {
             self.thaw(Thaw::Due);
             self.watch_episodes();
@@ -144,7 +145,8 @@ impl<'a> Storm<'a> {
             }
             if self.moved.elapsed() > STUCK {
                 bail!(
-                    "nothing was learned from for {} s, after {} episodes; the last that was said:\n{}",
+                    "no episode was learned from for {} s, after {} episodes; the log ends with\n\
+                     {}",
                     STUCK.as_secs(),
                     self.episodes,
                     self.stage.last_words()
@@ -155,10 +157,10 @@ impl<'a> Storm<'a> {
         }
     }
 
-    /// Does `what`, if there is somebody to do it to.
+    /// Carries out `what`, if a suitable process exists.
     ///
     /// # Errors
-    /// When a program cannot be started or the recording not be written.
+    /// Returns an error if a program cannot be started or the recording cannot be written.
     pub(crate) fn disturb(&mut self, what: Disturbance) -> Result<Attempt> {
         let victims = match what {
             Disturbance::KillActor { choice } => self.strike(Role::Actor, choice, Signal::KILL),
@@ -184,8 +186,8 @@ impl<'a> Storm<'a> {
         Ok(Attempt::Done)
     }
 
-    /// The process of `role` that `choice` means, of those that live and are not frozen.
-    fn choose(&self, role: Role, choice: u32) -> Option<Process> {
+    /// Returns the process of `role` selected by `choice` among those alive and not frozen.
+    fn choose(&self, role: Role, choice: u32) -> Option<ListedProcess> {
         let spared = usize::from(self.spared == Spared::ElderActor && role == Role::Actor);
         let candidates: Vec<_> = self
             .stage
@@ -243,10 +245,10 @@ impl<'a> Storm<'a> {
         Ok(pids)
     }
 
-    fn detach(&mut self, choice: u32, manner: Manner) -> Vec<i32> {
+    fn detach(&mut self, choice: u32, manner: DetachSignal) -> Vec<i32> {
         let signal = match manner {
-            Manner::Interrupt => Signal::INT,
-            Manner::Kill => Signal::KILL,
+            DetachSignal::Interrupt => Signal::INT,
+            DetachSignal::Kill => Signal::KILL,
         };
         self.strike(Role::Crew, choice, signal)
     }
@@ -260,32 +262,32 @@ impl<'a> Storm<'a> {
         }
     }
 
-    /// Learned from at present.
+    /// Returns the present number of episodes learned from.
     pub(crate) fn episodes(&self) -> u64 {
         self.episodes
     }
 
-    /// Learned from at any time.
+    /// Returns the highest number of episodes learned from so far.
     pub(crate) fn highest(&self) -> u64 {
         self.highest
     }
 
-    /// Since the number of episodes has changed.
+    /// Returns the time since the number of episodes last changed.
     pub(crate) fn since_moved(&self) -> Duration {
         self.moved.elapsed()
     }
 
-    /// Crews that were attached and have not ended.
+    /// Returns the number of `skein attach` processes still running.
     pub(crate) fn crews(&self) -> usize {
         self.crews.len()
     }
 
-    /// The run's processes, oldest first.
-    pub(crate) fn processes(&self) -> Vec<Process> {
+    /// Returns the run's processes, oldest first.
+    pub(crate) fn processes(&self) -> Vec<ListedProcess> {
         self.stage.processes()
     }
 
-    /// Waits for those that attached actors, until `deadline`.
+    /// Waits for the `skein attach` processes until `deadline`.
     fn reap_crews(&mut self, deadline: Instant) -> Result<()> {
         let mut ended = Vec::new();
         let mut there = Vec::new();
@@ -302,7 +304,7 @@ impl<'a> Storm<'a> {
         Ok(())
     }
 
-    /// How often each thing was done.
+    /// Returns the number of disturbances of each kind.
     pub(crate) fn tally(&self) -> &BTreeMap<&'static str, u32> {
         &self.tally
     }
@@ -310,7 +312,7 @@ impl<'a> Storm<'a> {
     /// Writes `event` into the recording.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if it cannot be written.
     pub(crate) fn note(&mut self, event: &str, details: &impl serde::Serialize) -> Result<()> {
         self.recorder
             .note(self.episodes, event, details)
@@ -318,29 +320,29 @@ impl<'a> Storm<'a> {
     }
 }
 
-/// Who is woken.
+/// Processes to continue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Thaw {
-    /// Those whose time has come.
+    /// Processes whose freeze is over.
     Due,
-    /// Everybody.
+    /// All frozen processes.
     All,
 }
 
-/// Waits until those that were killed are dead, so that nobody is killed twice; not for ever,
-/// because the kernel may have them in its hands.
-fn await_death(victims: &[Process]) {
+/// Waits until the killed processes are dead, so that none is killed twice. The wait is limited,
+/// because the kernel may delay their end.
+fn await_death(victims: &[ListedProcess]) {
     let end = Instant::now() + DEATH;
-    while victims.iter().any(Process::is_alive) && Instant::now() < end {
+    while victims.iter().any(ListedProcess::is_alive) && Instant::now() < end {
         sleep(Duration::from_millis(1));
     }
 }
 
-fn pid(process: &Process) -> i32 {
+fn pid(process: &ListedProcess) -> i32 {
     process.pid.as_raw_nonzero().get()
 }
 
-/// What a disturbance is called in the table.
+/// Returns the name of a disturbance in the table.
 fn name(what: &Disturbance) -> &'static str {
     match what {
         Disturbance::KillActor { .. } => "actors killed",
@@ -355,7 +357,7 @@ fn name(what: &Disturbance) -> &'static str {
             reach: Reach::Everybody,
             ..
         } => "power cuts",
-        Disturbance::Attach { .. } => "crews attached",
-        Disturbance::Detach { .. } => "crews taken away",
+        Disturbance::Attach { .. } => "groups of actors attached",
+        Disturbance::Detach { .. } => "groups of actors removed",
     }
 }

@@ -1,5 +1,5 @@
-//! The supervisor of a run under fire: its end is told from its death, and after its death the run
-//! is resumed.
+//! Supervisor of a disturbed run. A normal end is distinguished from a death, and the run is
+//! resumed after a death.
 
 use std::process::{Child, ExitStatus};
 use std::time::{Duration, Instant};
@@ -12,40 +12,43 @@ use skein_chaos::Role;
 use super::{Storm, await_death, pid};
 use crate::plan::Reach;
 
-/// How long a killed run's processes may keep it from being resumed: a learner that was orphaned
-/// ends its epoch and saves.
+/// Time for which processes of a killed run may prevent its resumption: an orphaned learner
+/// finishes its epoch and saves.
 const RESUME: Duration = Duration::from_secs(120);
-/// Between two attempts to resume.
+/// Time between two attempts to resume.
 const RESUME_PAUSE: Duration = Duration::from_millis(500);
-/// Status of a process that was interrupted, as shells report it: 128 + SIGINT.
+/// Exit status of an interrupted process, as shells report it: 128 + SIGINT.
 const INTERRUPTED: i32 = 130;
 
-/// Who supervises the run.
+/// State of the run's supervisor.
 #[derive(Debug)]
 pub(super) enum Supervisor {
-    /// A process of ours.
-    Running { child: Child, told_to_stop: Told },
-    /// Nobody, until it is resumed.
+    /// Its process was started by this program.
+    Running {
+        child: Child,
+        stop_request: StopRequest,
+    },
+    /// It was killed, and the run is to be resumed.
     Killed {
         resume_at: Instant,
         give_up_at: Instant,
         actors: u32,
     },
-    /// Was started again, and may find that the orphans of the one before are still ending.
+    /// It was restarted, but orphans of its predecessor may still be ending.
     Resuming {
         child: Child,
         give_up_at: Instant,
         actors: u32,
     },
-    /// Nobody any more: the run has ended.
+    /// The run has ended.
     Ended,
 }
 
-/// Whether a supervisor was interrupted from here.
+/// Request that this program sent to a supervisor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Told {
-    Nothing,
-    ToStop,
+pub(super) enum StopRequest {
+    None,
+    Sent,
 }
 
 impl Storm<'_> {
@@ -81,17 +84,17 @@ impl Storm<'_> {
     /// Ends the run in order.
     ///
     /// # Errors
-    /// When the supervisor is not there to be told.
+    /// Returns an error if no supervisor is running.
     pub(crate) fn interrupt(&mut self) -> Result<()> {
         let Supervisor::Running {
             child,
-            told_to_stop,
+            stop_request,
         } = &mut self.supervisor
         else {
-            bail!("there is no supervisor to be told to stop");
+            bail!("no supervisor is running that could be stopped");
         };
-        *told_to_stop = Told::ToStop;
-        let pid = Pid::from_raw(child.id().cast_signed()).context("a process has a number")?;
+        *stop_request = StopRequest::Sent;
+        let pid = Pid::from_raw(child.id().cast_signed()).context("a process has an id")?;
         kill_process(pid, Signal::INT).context("cannot interrupt the supervisor")?;
         self.note("interrupted", &())
     }
@@ -101,14 +104,14 @@ impl Storm<'_> {
             Supervisor::Ended => Supervisor::Ended,
             Supervisor::Running {
                 mut child,
-                told_to_stop,
+                stop_request,
             } => match child.try_wait()? {
                 None => Supervisor::Running {
                     child,
-                    told_to_stop,
+                    stop_request,
                 },
                 Some(status) => {
-                    self.ended(status, told_to_stop)?;
+                    self.ended(status, stop_request)?;
                     Supervisor::Ended
                 }
             },
@@ -148,8 +151,8 @@ impl Storm<'_> {
         actors: u32,
     ) -> Result<Supervisor> {
         let Some(status) = child.try_wait()? else {
-            // It starts actors once its learner has reported: then nothing of the former
-            // incarnation is in its way any more.
+            // It starts actors once its learner has reported. From then on nothing of the previous
+            // incarnation blocks it.
             let accepted = self.stage.processes().iter().any(|process| {
                 process.role() == Role::Actor && process.parent() == Some(child.id())
             });
@@ -157,7 +160,7 @@ impl Storm<'_> {
                 self.note("resumed", &json!({ "pid": child.id(), "actors": actors }))?;
                 Supervisor::Running {
                     child,
-                    told_to_stop: Told::Nothing,
+                    stop_request: StopRequest::None,
                 }
             } else {
                 Supervisor::Resuming {
@@ -171,12 +174,12 @@ impl Storm<'_> {
             self.note("ended", &json!({ "status": status.to_string() }))?;
             return Ok(Supervisor::Ended);
         }
-        let said = self.stage.last_words();
-        let said = said.lines().last().unwrap_or_default();
+        let log = self.stage.last_words();
+        let log = log.lines().last().unwrap_or_default();
         if Instant::now() > give_up_at {
-            bail!("the run cannot be resumed: {said}");
+            bail!("the run cannot be resumed: {log}");
         }
-        self.note("not resumed yet", &json!({ "said": said }))?;
+        self.note("not resumed yet", &json!({ "log": log }))?;
         Ok(Supervisor::Killed {
             resume_at: Instant::now() + RESUME_PAUSE,
             give_up_at,
@@ -184,12 +187,12 @@ impl Storm<'_> {
         })
     }
 
-    fn ended(&mut self, status: ExitStatus, told: Told) -> Result<()> {
+    fn ended(&mut self, status: ExitStatus, stop_request: StopRequest) -> Result<()> {
         self.note("ended", &json!({ "status": status.to_string() }))?;
-        match (status.code(), told) {
-            (Some(0), _) | (Some(INTERRUPTED), Told::ToStop) => Ok(()),
+        match (status.code(), stop_request) {
+            (Some(0), _) | (Some(INTERRUPTED), StopRequest::Sent) => Ok(()),
             _ => bail!(
-                "the run ended with {status} after {} episodes; the last that was said:\n{}",
+                "the run ended with {status} after {} episodes; the log ends with\n{}",
                 self.episodes,
                 self.stage.last_words()
             ),
