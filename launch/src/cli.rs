@@ -1,6 +1,5 @@
 //! The command line of `skein`, and with it every help text of the commands in `launch/`.
 
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use clap::error::ErrorKind;
@@ -28,8 +27,7 @@ pub(crate) enum Command {
     Run(RunArguments),
     #[command(after_long_help = ATTACH_NOTES)]
     Attach(AttachArguments),
-    #[command(disable_help_flag = true)]
-    Evaluate(EvaluateArguments),
+    Evaluate(skein_rollout::evaluate::Arguments),
     #[command(after_long_help = EXPERIMENT_NOTES)]
     Experiment(ExperimentArguments),
     Report(ReportArguments),
@@ -109,16 +107,6 @@ const ATTACH_NOTES: &str = "\
 Ctrl-C removes these actors again; the run continues without them.
 
 Exit status: 0 the run ended, 1 failed, 2 wrong arguments, 130 interrupted.";
-
-/// Flies a trained snapshot without exploration, and prints how far it gets.
-///
-/// This is the program `skein-evaluate`, which lies beside this one.
-#[derive(Args)]
-pub(crate) struct EvaluateArguments {
-    /// Options of `skein-evaluate`.
-    #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
-    pub(crate) arguments: Vec<OsString>,
-}
 
 /// Trains several configurations with several seeds, and reports how they compare.
 ///

@@ -15,7 +15,6 @@ use skein_launch::display::bar_on_terminal;
 use skein_launch::interrupts::{interrupts, runtime};
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
 
-use crate::beside_this;
 use crate::cli::ExperimentArguments;
 
 /// Carries out the command. The exit status shows whether every run is complete.
@@ -110,12 +109,11 @@ impl ExperimentArguments {
             Some(jobs) => jobs.into(),
             None => thread::available_parallelism().map_or(1, Into::into),
         };
-        let (skein, evaluate) = (beside_this("skein")?, beside_this("skein-evaluate")?);
+        let skein = std::env::current_exe().context("cannot find where this program lies")?;
         announce(experiment, &plan, jobs);
         let mut board = ExperimentDisplay::new(bar_on_terminal());
         let manner = RunnerOptions {
             skein: &skein,
-            evaluate: &evaluate,
             jobs,
         };
         let session = runtime()

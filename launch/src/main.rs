@@ -4,9 +4,8 @@
 mod cli;
 mod experiment;
 
-use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{self, ExitCode};
+use std::process::ExitCode;
 use std::thread;
 use std::time::Duration;
 
@@ -30,7 +29,7 @@ use skein_run::ActorClaim;
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
 use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
 
-use cli::{AttachArguments, Cli, Command, EvaluateArguments, ReportArguments, RunArguments, Task};
+use cli::{AttachArguments, Cli, Command, ReportArguments, RunArguments, Task};
 
 /// Contexts of errors that the operating system may return.
 const RUNTIME: &str = "cannot start the runtime";
@@ -51,7 +50,9 @@ fn main() -> ExitCode {
     let outcome = match Cli::parse().command {
         Command::Run(arguments) => run(&arguments).map(status),
         Command::Attach(arguments) => attach(&arguments).map(status),
-        Command::Evaluate(arguments) => evaluate(&arguments),
+        Command::Evaluate(arguments) => {
+            skein_rollout::evaluate::run(&arguments).map(|()| ExitCode::SUCCESS)
+        }
         Command::Experiment(arguments) => experiment::carry_out(&arguments),
         Command::Report(arguments) => report(&arguments),
     };
@@ -259,28 +260,6 @@ fn draw(run: &RunDirectory, config: &Config) -> anyhow::Result<Vec<PathBuf>> {
     let window = config.evaluation.window_episodes as usize;
     let ideal = ideal_walls_passed(config)?;
     Ok(skein_reports::draw_all(run, &courses, window, ideal)?)
-}
-
-/// Becomes the program `skein-evaluate`.
-fn evaluate(arguments: &EvaluateArguments) -> anyhow::Result<ExitCode> {
-    let program = beside_this("skein-evaluate")?;
-    let error = process::Command::new(&program)
-        .args(&arguments.arguments)
-        .exec();
-    Err(error).with_context(|| format!("cannot start {}", program.display()))
-}
-
-/// The program `name`, which is built beside this one.
-fn beside_this(name: &str) -> anyhow::Result<PathBuf> {
-    let this = std::env::current_exe().context("cannot find where this program lies")?;
-    let program = this.with_file_name(name);
-    if !program.is_file() {
-        bail!(
-            "{} is missing: build it with `cargo build --release --workspace --bins`",
-            program.display()
-        );
-    }
-    Ok(program)
 }
 
 /// Removes the remains of this user's runs whose processes were all killed.

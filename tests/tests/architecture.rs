@@ -169,9 +169,12 @@ fn every_package_has_only_its_allowed_dependencies() {
             "skein-launch",
             &[
                 "skein-experiments",
+                "skein-inference",
+                "skein-kernels",
                 "skein-prepare",
                 "skein-protocol",
                 "skein-reports",
+                "skein-rollout",
                 "skein-run",
                 "skein-simulator",
                 "skein-transport",

@@ -299,7 +299,7 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     assert_eq!(output.code, Some(1), "{}", output.stderr);
     for part in [
         "4 runs of 2 arms with 2 seeds each, 3 complete already, 1 trained already",
-        "half/seed-1 failed: its `skein-evaluate` exited with status 1",
+        "half/seed-1 failed: its `skein evaluate` exited with status 1",
         "holds neither snapshots/best.safetensors",
         "the same command tries them again",
     ] {

@@ -1,6 +1,6 @@
 //! Carries out the runs of an experiment: as many at a time as there are cores, each as a separate
 //! `skein run`, exactly as a user would start it. Once a run is trained, its best snapshot flies
-//! the experiment's suite in a separate `skein-evaluate`.
+//! the experiment's suite in a separate `skein evaluate`.
 //!
 //! A run that fails is reported, and the others continue. An interruption is forwarded to every
 //! active run, which stops in order and can be resumed; no further run starts. An incomplete suite
@@ -40,8 +40,6 @@ const LOOKS_A_UPDATE: u32 = 5;
 pub struct RunnerOptions<'a> {
     /// The program `skein`.
     pub skein: &'a Path,
-    /// The program `skein-evaluate`.
-    pub evaluate: &'a Path,
     /// Number of simultaneous runs.
     pub jobs: usize,
 }
@@ -89,7 +87,7 @@ pub async fn run(
             && let Some((place, run, stage)) = waiting.pop_front()
         {
             let (what, started) = match (stage, &experiment.suite) {
-                (RunStage::Suite, Some(suite)) => ("its suite", fly(suite, run, manner.evaluate)),
+                (RunStage::Suite, Some(suite)) => ("its suite", fly(suite, run, manner.skein)),
                 _ => ("it", train(experiment, run, manner.skein)),
             };
             match started {
@@ -165,7 +163,7 @@ fn train(experiment: &Experiment, run: &PlannedRun, skein: &Path) -> io::Result<
 
 /// Flies the suite with the best snapshot of a run. The result is moved to its final path once it
 /// is complete: see [`SessionOutcome::flown`].
-fn fly(suite: &FlownSuite, run: &PlannedRun, evaluate: &Path) -> io::Result<Child> {
+fn fly(suite: &FlownSuite, run: &PlannedRun, skein: &Path) -> io::Result<Child> {
     // The other program reads the file again, possibly hours later.
     if FlownSuite::load(&suite.path, suite.each).as_ref() != Ok(suite) {
         let file = suite.path.display();
@@ -177,8 +175,11 @@ fn fly(suite: &FlownSuite, run: &PlannedRun, evaluate: &Path) -> io::Result<Chil
     if let Some(folder) = result.parent() {
         durable::create_private_directory(folder)?;
     }
-    let mut command = Command::new(evaluate);
-    command.arg("--run").arg(run.directory.root());
+    let mut command = Command::new(skein);
+    command
+        .arg("evaluate")
+        .arg("--run")
+        .arg(run.directory.root());
     command.arg("--suite").arg(&suite.path);
     if let Some(each) = suite.each {
         command.args(["--episodes", &each.to_string()]);
@@ -249,10 +250,10 @@ impl SessionOutcome {
         board: &ExperimentDisplay,
     ) -> RunState {
         let ActiveRun { run, stage, .. } = *one;
-        // `skein-evaluate` has nothing to save: the first interruption ends it.
+        // `skein evaluate` has nothing to save: the first interruption ends it.
         let (program, before, kills) = match stage {
             RunStage::Training => ("skein run", RunState::Begun, 3),
-            RunStage::Suite => ("skein-evaluate", RunState::Trained, 1),
+            RunStage::Suite => ("skein evaluate", RunState::Trained, 1),
         };
         let how = match (code, stage) {
             (Some(0), RunStage::Training) => return self.trained(run, board),
