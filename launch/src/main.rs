@@ -22,7 +22,7 @@ use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, Superviso
 use skein_prepare::room::{check_shared_memory_for_more, scarce_disk};
 use skein_prepare::{Prepared, prepare};
 use skein_protocol::config::{Config, CoursesSection};
-use skein_protocol::summary::Ending;
+use skein_protocol::summary::RunEnding;
 use skein_reports::{ideal_walls_passed, load_courses};
 use skein_run::ActorClaim;
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
@@ -142,8 +142,8 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     // Whoever told the learner alone to stop has interrupted the run as well, and a run may be
     // complete before it heeds an interruption.
     let ended = match run.summary().map(|summary| summary.ending) {
-        Some(Ending::Completed) => Ended::Finished,
-        Some(Ending::Interrupted) => Ended::Interrupted,
+        Some(RunEnding::Completed) => Ended::Finished,
+        Some(RunEnding::Interrupted) => Ended::Interrupted,
         None => ended,
     };
     if ended == Ended::Interrupted {
@@ -204,7 +204,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let (_, config) = run.open()?;
     // Between two incarnations of its learner, a run is under way as long as somebody sees to it
     // that there will be another.
-    if !run.is_under_way()? {
+    if !run.is_running()? {
         let root = run.root().display();
         bail!(
             "the run in {root} is not under way on this machine; one that is not complete is gone on with by launch/run_local.sh --resume {root}"
@@ -238,7 +238,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let mut display = Display::new();
     runtime().context(RUNTIME)?.block_on(async {
         let mut interrupts = interrupts().context(SIGNALS)?;
-        let is_under_way = || run.is_under_way().unwrap_or(false);
+        let is_under_way = || run.is_running().unwrap_or(false);
         Ok(supervisor::attach(&plan, is_under_way, &mut interrupts, &mut display).await?)
     })
 }

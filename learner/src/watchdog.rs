@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use skein_protocol::progress::{Phase, Progress};
+use skein_protocol::progress::{LearnerPhase, ProgressReport};
 
 use crate::episodes::situation::Situation;
 
@@ -50,7 +50,7 @@ impl Watchdog {
     pub fn look(
         &mut self,
         now: Instant,
-        progress: &Progress,
+        progress: &ProgressReport,
         obstacle: Option<String>,
         receiver: Option<(Duration, Situation)>,
     ) -> Option<String> {
@@ -85,12 +85,16 @@ impl Watchdog {
     }
 }
 
-fn who_waits(phase: Phase, still: Duration, receiver: Option<(Duration, Situation)>) -> String {
+fn who_waits(
+    phase: LearnerPhase,
+    still: Duration,
+    receiver: Option<(Duration, Situation)>,
+) -> String {
     let still = still.as_secs();
     let episodes = match phase {
-        Phase::Flying => "episodes",
-        Phase::Evaluating => "evaluation episodes",
-        Phase::Learning => {
+        LearnerPhase::Flying => "episodes",
+        LearnerPhase::Evaluating => "evaluation episodes",
+        LearnerPhase::Learning => {
             return format!(
                 "the training thread has been at one step of its updates for {still} s"
             );
@@ -153,7 +157,7 @@ mod tests {
     fn a_receiving_thread_that_does_not_respond_is_named() {
         let start = Instant::now();
         let mut watchdog = Watchdog::new(start);
-        let progress = Progress::start(40);
+        let progress = ProgressReport::start(40);
         watchdog.look(start, &progress, None, None);
         let stale = no_actor().map(|(_, situation)| (Duration::from_secs(33), situation));
         let stalled = watchdog

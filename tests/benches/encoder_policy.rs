@@ -9,12 +9,12 @@ use skein_learner::algorithm::{Algorithm, Inputs};
 use skein_learner::device::use_threads;
 use skein_learner::sac::TorchSac;
 use skein_learner::vae::{TorchVae, images_from_bytes};
-use skein_protocol::config::{Config, Observation, View};
+use skein_protocol::config::{Config, Observation, ObservationLayout};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{
     ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout,
 };
-use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LONGEST_LATENT, LatentCode};
+use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LatentCode, MAX_LATENT};
 use tch::Device;
 
 /// As in `local.toml`.
@@ -26,7 +26,7 @@ fn main() {
     use_threads(1);
     let mut config = Config::default();
     config.learning.observation = OBSERVATION;
-    let view = config.view();
+    let view = config.observation_layout();
     let vae = TorchVae::new(&config.vae, 1, Device::Cpu);
     let sac = TorchSac::new(&config.sac, Inputs::of(&config), 1, Device::Cpu);
     let layout = SnapshotLayout::of(&config);
@@ -39,7 +39,7 @@ fn main() {
     let image: [u8; IMAGE_PIXELS] = std::array::from_fn(|pixel| (pixel * 7) as u8);
     let mut observation = vec![0.0; view.len()];
     let mut observe = |latent: LatentCode| {
-        view.write_moment(&latent, &[1.0, 0.1, 0.1], &[0.0; ACTION], &mut observation);
+        view.write_step(&latent, &[1.0, 0.1, 0.1], &[0.0; ACTION], &mut observation);
         observation.clone()
     };
     let mut group = criterion.benchmark_group("encoder_policy");
@@ -57,7 +57,7 @@ fn main() {
     });
     group.bench_function("libtorch", |bencher| {
         bencher.iter(|| {
-            let mut latent = [0.0; LONGEST_LATENT];
+            let mut latent = [0.0; MAX_LATENT];
             vae.encode(&images_from_bytes(black_box(&image)))
                 .copy_data(&mut latent, view.latent);
             black_box(sac.mode(&observe(latent)))
@@ -69,7 +69,7 @@ fn main() {
 
 /// Floating-point operations of the products of both networks, a multiplication and an addition
 /// counted as two; nothing else is counted.
-fn operations(view: &View, width: usize) -> u64 {
+fn operations(view: &ObservationLayout, width: usize) -> u64 {
     let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
     let mut products = 0;
     for channels in ENCODER_CHANNELS.windows(2) {

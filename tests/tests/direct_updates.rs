@@ -7,7 +7,7 @@
 )]
 
 use rustix::process::Signal;
-use skein_protocol::summary::Ending;
+use skein_protocol::summary::RunEnding;
 use skein_tests::{Ended, Recipe, Role};
 
 /// Updated after every step, checkpoints every five episodes.
@@ -92,7 +92,7 @@ fn a_run_that_is_stopped_flies_its_episode_to_the_end_and_loses_nothing() {
     run.until_ended();
     let summary: skein_protocol::summary::Summary =
         serde_json::from_slice(&std::fs::read(run.directory().summary_json()).unwrap()).unwrap();
-    assert_eq!(summary.ending, Ending::Interrupted);
+    assert_eq!(summary.ending, RunEnding::Interrupted);
     assert!(summary.episodes >= 25, "{summary:?}");
     run.resume(3);
     run.finish()

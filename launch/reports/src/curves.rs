@@ -24,7 +24,7 @@ pub struct EpisodeRow {
 }
 
 /// No return is larger: an episode has at most 65536 records, of rewards up to
-/// `skein_protocol::transition::LARGEST_NUMBER`. An axis much longer than any return would take for
+/// `skein_protocol::transition::MAX_MAGNITUDE`. An axis much longer than any return would take for
 /// ever to divide.
 const LARGEST_RETURN: f64 = 1e12;
 

@@ -31,7 +31,7 @@ use std::time::Duration;
 
 use skein_protocol::config::Config;
 use skein_protocol::ids::ActorId;
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
 use skein_run::RunDirectory;
 
 use process::Exit;
@@ -46,7 +46,7 @@ const EVENTS: usize = 64;
 /// The programs that a run consists of.
 #[derive(Debug, Clone)]
 pub struct Programs {
-    /// Takes `--run DIR`; writes [`Progress`] as JSON lines on its standard output.
+    /// Takes `--run DIR`; writes [`ProgressReport`] as JSON lines on its standard output.
     pub learner: PathBuf,
     /// Takes `--run DIR --id K`.
     pub actor: PathBuf,
@@ -150,7 +150,7 @@ pub struct Restarts {
 /// Who looks on while a run is supervised.
 pub trait Watcher {
     /// The learner reported.
-    fn progress(&mut self, progress: &Progress, restarts: Restarts);
+    fn progress(&mut self, progress: &ProgressReport, restarts: Restarts);
     /// Something the user should know.
     fn warn(&mut self, text: &str);
 }

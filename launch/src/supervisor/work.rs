@@ -1,6 +1,6 @@
 //! What a run has done so far, as far as the learner's reports show it.
 
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
 
 /// What a run has done so far. More work is greater: episodes come first, then what is made of
 /// them.
@@ -13,7 +13,7 @@ pub(super) struct Work {
 }
 
 impl Work {
-    pub(super) fn of(progress: &Progress) -> Self {
+    pub(super) fn of(progress: &ProgressReport) -> Self {
         Self {
             episodes: progress.episodes,
             vae_updates: progress.vae_updates,

@@ -14,9 +14,9 @@ use std::time::{Duration, Instant};
 
 use skein_protocol::config::TransportSection;
 use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, RunId};
-use skein_protocol::stages::Times;
+use skein_protocol::stages::StageTimes;
 use skein_protocol::status::{ActorState, ActorStatus};
-use skein_protocol::ticket::{ControlRecord, Message, Ticket};
+use skein_protocol::ticket::{ControlMessage, ControlRecord, Ticket};
 use skein_protocol::transition::{RecordFault, TransitionRecord};
 
 use super::assembly::{Assembled, Assembly, SegmentEnd};
@@ -407,7 +407,7 @@ impl Dispatcher {
             let Some(order) = self.waiting.pop_front() else {
                 break;
             };
-            messages.push(Message::fly(&order.ticket, id, actor.incarnation));
+            messages.push(ControlMessage::fly(&order.ticket, id, actor.incarnation));
             let begins = self.segment_end.filter(|end| end.is_before(&order));
             let longest = self.limits.max_records_per_episode;
             let assembly =

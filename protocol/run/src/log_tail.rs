@@ -1,4 +1,4 @@
-//! The last lines of a log file, for errors that should not send the user looking.
+//! The last lines of a log file, for error messages.
 
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -6,10 +6,10 @@ use std::path::Path;
 
 /// Lines shown of a log.
 const LINES: usize = 12;
-/// More of a log than this is never read.
+/// Bytes read from the end of a log.
 const MAX_BYTES: u64 = 16 * 1024;
 
-/// The last lines of the log at `path`, indented; a remark if there are none.
+/// Returns the last lines of the log at `path`, indented, or a remark if there are none.
 pub fn log_tail(path: &Path) -> String {
     let text = read_end(path).unwrap_or_default();
     let lines: Vec<_> = text
@@ -27,8 +27,9 @@ pub fn log_tail(path: &Path) -> String {
         .join("\n")
 }
 
-/// What `program` printed last about why it ended, without its name: programs of ours write `name:
-/// reason` on standard error, which goes to their log. `None` if the log holds no such words.
+/// Returns the last error message of `program` without its name: Skein's programs write `name:
+/// reason` on standard error, which goes to their log. Returns `None` if the log holds no such
+/// message.
 pub fn last_words(path: &Path, program: &Path) -> Option<String> {
     let start = format!("{}: ", program.file_name()?.to_str()?);
     let text = read_end(path).ok()?;
@@ -65,7 +66,7 @@ mod tests {
     }
 
     #[test]
-    fn last_words_are_the_programs_own_and_its_last() {
+    fn the_last_error_message_is_the_programs_own_and_its_newest() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("learner.log");
         let program = Path::new("/bin/skein-learner");
@@ -79,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_log_is_said_to_be_empty() {
+    fn a_missing_log_is_reported_as_empty() {
         assert!(log_tail(Path::new("/nowhere/learner.log")).contains("empty"));
     }
 }

@@ -1,4 +1,4 @@
-//! No process outlives the one that started it and answers for it.
+//! Child processes that end with their parent.
 
 use std::io;
 use std::os::unix::process::CommandExt;
@@ -6,8 +6,9 @@ use std::process::Command;
 
 use rustix::process::{Signal, getppid, set_parent_process_death_signal};
 
-/// The process that `command` starts gets `signal` from the kernel when the *thread* that started
-/// it ends, however that comes about; it is not started at all if that is so already.
+/// Makes the kernel send `signal` to the process that `command` starts when the *thread* that
+/// started it ends, however that happens. If the parent has already died, the process does not
+/// start.
 pub fn signal_when_orphaned(command: &mut Command, signal: Signal) {
     let parent = rustix::process::getpid();
     // SAFETY: between fork and exec only system calls are made (prctl, getppid), no memory is
@@ -15,7 +16,7 @@ pub fn signal_when_orphaned(command: &mut Command, signal: Signal) {
     unsafe {
         command.pre_exec(move || {
             set_parent_process_death_signal(Some(signal))?;
-            // It may have died in between, and no signal would come.
+            // The parent may have died in between, and no signal would come.
             if getppid() == Some(parent) {
                 Ok(())
             } else {

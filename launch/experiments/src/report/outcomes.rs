@@ -1,7 +1,7 @@
 //! How the evaluation episodes of an experiment went: wall by wall, and what ended those that did
 //! not get through.
 
-use skein_protocol::evaluation::{CourseEvaluation, Failures};
+use skein_protocol::evaluation::{CourseEvaluation, WallFailures};
 
 use super::Findings;
 use super::tables::{NOTHING, Titled, course_of, grid};
@@ -70,7 +70,7 @@ fn cells(of_seeds: &[&CourseEvaluation]) -> [String; HEADER.len() - 2] {
     let sum = |count: fn(&CourseEvaluation) -> u64| {
         of_seeds.iter().map(|course| count(course)).sum::<u64>()
     };
-    let failed = |by: fn(&Failures) -> u64| {
+    let failed = |by: fn(&WallFailures) -> u64| {
         summed(of_seeds, |course| course.failures.iter().map(by).collect())
     };
     let passed = summed(of_seeds, |course| course.walls_passed.clone());

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::{Arc, LazyLock};
 
 use skein_experiments::definition::{Experiment, MOST_ARMS};
-use skein_protocol::config::{Config, ConfigError, culprit};
+use skein_protocol::config::{Config, ConfigError, failing_override};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_simulator::course::Course;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
@@ -149,7 +149,7 @@ fn overridden(bytes: &[u8]) -> Verdict {
     if read.is_err() {
         // The empty file is sound: whatever is wrong, an override brought it about.
         let told = |overrides: &[String]| parse(overrides).err().map(|error| error.to_string());
-        assert!(culprit(&overrides, told).is_some());
+        assert!(failing_override(&overrides, told).is_some());
     }
     check(read)
 }
