@@ -1,11 +1,12 @@
-//! One actor's whole step, from the camera to the record sent, against the sum of its stages.
+//! Benchmark of an actor's whole step, from the camera to the sent record, against the sum of its
+//! stages.
 //!
-//! An iteration is a training episode through real shared memory, no longer than it must be: the
-//! shorter, the more of them nobody disturbs. Every stage is given exactly what it was made of, so
-//! that whatever the whole takes beyond the sum of the stages is the loop's own. The learner's end
-//! is emptied after each episode, outside the time taken. What an actor does for the learner's sake
-//! between two steps, to listen and to give heartbeats (`control` in the table of a run), is in
-//! neither: it depends on what the learner says.
+//! An iteration is a training episode through real shared memory, as short as possible: shorter
+//! iterations are disturbed less often. Every stage gets the same inputs as in the whole, so the
+//! excess of the whole over the sum of the stages is the loop's own cost. The learner's buffer is
+//! emptied after each episode, outside the measured time. Neither side includes an actor's reading
+//! of messages and sending of heartbeats between two steps (`control` in the table of a run): it
+//! depends on the learner.
 
 mod common;
 
@@ -18,7 +19,7 @@ use criterion::{BenchmarkGroup, Criterion, Throughput};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_inference::{Network, Scratch};
-use skein_protocol::config::View;
+use skein_protocol::config::ObservationLayout;
 use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::SnapshotLayout;
@@ -46,7 +47,7 @@ fn main() {
         ACTOR,
         INCARNATION,
         Simulators::new(Arc::clone(&courses)),
-        Agent::new(config.view()),
+        Agent::new(config.observation_layout()),
     );
     let episodes: Vec<Vec<TransitionRecord>> = tickets
         .iter()
@@ -80,7 +81,12 @@ fn main() {
         &episodes,
         &mut Simulators::new(courses),
     );
-    inference(&mut group, &episodes, &network, &config.view());
+    inference(
+        &mut group,
+        &episodes,
+        &network,
+        &config.observation_layout(),
+    );
     sending(&mut group, &tickets, &episodes, &transport);
     group.finish();
     criterion.final_summary();
@@ -93,10 +99,10 @@ fn fly(
     transport: &Transport,
 ) {
     let flown = environment_loop.fly(ticket, network, &mut Link(&transport.actor));
-    black_box(flown.expect("memory is free, as all records were taken in"));
+    black_box(flown.expect("memory is free, because all records were read"));
 }
 
-/// Reset, physics and camera: the same starts and actions.
+/// Reset, physics and camera, with the same starts and actions.
 fn environment(
     group: &mut BenchmarkGroup<'_, WallTime>,
     tickets: &[Ticket],
@@ -112,7 +118,7 @@ fn environment(
                     .map(|purpose| Pcg64Mcg::seed_from_u64(derive(ticket.seed, purpose, 0)));
                 simulator
                     .reset(ticket.start_level, &mut start, &mut disturbances)
-                    .expect("it has this level");
+                    .expect("the course has this level");
                 simulator.render(&mut image);
                 for record in steps_of(records) {
                     black_box(
@@ -128,12 +134,12 @@ fn environment(
     });
 }
 
-/// Encoder and policy: the same images and observations.
+/// Encoder and policy, with the same images and observations.
 fn inference(
     group: &mut BenchmarkGroup<'_, WallTime>,
     episodes: &[Vec<TransitionRecord>],
     network: &Network,
-    view: &View,
+    observation_layout: &ObservationLayout,
 ) {
     let mut scratch = Scratch::default();
     group.bench_function("encoder", |bencher| {
@@ -144,11 +150,11 @@ fn inference(
         });
     });
     let mut noise = Pcg64Mcg::seed_from_u64(3);
-    let mut observed = vec![0.0; view.len()];
+    let mut observed = vec![0.0; observation_layout.len()];
     group.bench_function("policy", |bencher| {
         bencher.iter(|| {
             for record in episodes.iter().flat_map(|records| steps_of(records)) {
-                view.write_moment(
+                observation_layout.write_step(
                     &record.latent,
                     &record.velocity_mps,
                     &[0.0; ACTION],
@@ -175,7 +181,7 @@ fn sending(
         let mut record = transport
             .actor
             .loan_transition()
-            .expect("all records were taken in");
+            .expect("all records were read");
         record.begin(ticket, ACTOR, INCARNATION, step);
         record
     };
@@ -183,7 +189,7 @@ fn sending(
         transport
             .actor
             .send_transition(record)
-            .expect("the learner is there")
+            .expect("the learner exists")
     };
     group.bench_function("sending", |bencher| {
         bencher.iter_custom(|iterations| {
@@ -199,8 +205,8 @@ fn sending(
     });
 }
 
-/// Time that `work` takes on all of so many episodes, `iterations` times; the learner's end is
-/// emptied after each, at nobody's cost.
+/// Returns the time of `work` on all episodes, `iterations` times. The learner's buffer is emptied
+/// after each, outside the measured time.
 fn timed(
     iterations: u64,
     episodes: usize,
@@ -225,7 +231,7 @@ fn steps_of(records: &[TransitionRecord]) -> impl Iterator<Item = &TransitionRec
         .filter(|record| record.kind == RecordKind::Step.code())
 }
 
-/// Both ends of a run's services, on one thread.
+/// Ports of actor and learner, on one thread.
 struct Transport {
     actor: ActorPorts,
     learner: Learner,
@@ -235,7 +241,7 @@ impl Transport {
     fn open() -> Self {
         let learner = Learner::open();
         let actor =
-            ActorPorts::join(&learner.identity, &learner.config).expect("the learner is there");
+            ActorPorts::join(&learner.identity, &learner.config).expect("the learner exists");
         learner
             .ports
             .maintain()

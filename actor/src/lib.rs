@@ -1,7 +1,7 @@
-//! The actor: a process that flies against tickets and sends back what it saw.
+//! The actor: a process that flies tickets and sends the records.
 //!
-//! How an episode is flown is [`skein_rollout`]'s; [`service`] is the life cycle of the process
-//! around it, [`weights`] the snapshots it holds.
+//! Episodes are flown by [`skein_rollout`]; [`service`] is the process around it, [`snapshot_cache`] the
+//! cache of its snapshots.
 
 pub mod service;
-pub mod weights;
+pub mod snapshot_cache;

@@ -1,12 +1,10 @@
-//! The incarnation of an actor process: join the learner, take a ticket, fly it, until the run is
-//! over.
+//! The actor process: joins the learner, takes a ticket, flies it, until the run is over.
 //!
-//! Whatever happens on the way is survived by doing nothing about it: an episode that is lost is
-//! flown again on a new ticket, by this actor or another; a learner that is lost is looked for
-//! until it lives again. Only the end of the run, a signal, or no heartbeat from any learner for
-//! too long end the process.
+//! It recovers from failures by starting over: a lost episode is flown again on a new ticket, by
+//! this actor or another; a lost learner is looked for until it is back. The process ends only at
+//! the end of the run, on a signal, or after a long time without a heartbeat from any learner.
 
-mod line;
+mod connection;
 #[cfg(test)]
 mod tests;
 
@@ -18,17 +16,18 @@ use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::status::ActorState;
 use skein_protocol::ticket::Ticket;
-use skein_run::fault::{FaultPoint, pass};
+use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_run::{LearnerIncarnation, RunIdentity};
 use skein_transport::{ActorPorts, JoinError, ServiceError};
 use tracing::{debug, info, info_span, warn};
 
-use self::line::LearnerLine;
+use self::connection::LearnerConnection;
 use skein_inference::Network;
 use skein_rollout::environment_loop::{EnvironmentLoop, EpisodeError};
 
-/// Longest time between two looks for a learner, and between two looks whether to end meanwhile.
-const SEEK_INTERVAL: Duration = Duration::from_millis(100);
+/// Longest time between two tries to join a learner, and between two checks of the exit request
+/// meanwhile.
+const JOIN_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Serves the learners of a run, one incarnation after the other.
 #[derive(Debug)]
@@ -36,114 +35,121 @@ pub struct Service<'a> {
     identity: &'a RunIdentity,
     config: &'a Config,
     actor: ActorId,
-    /// Looked at between two steps and between two looks for a learner.
-    told_to_end: &'a AtomicBool,
+    /// Checked between two steps and between two tries to join.
+    exit_requested: &'a AtomicBool,
     incarnation: ActorIncarnation,
-    /// When a learner last sent a heartbeat; at first, when this service began.
-    last_sign: Instant,
+    /// Time of the last heartbeat from a learner; at first, the start of this service.
+    last_heard: Instant,
     newest_learner: Option<LearnerIncarnation>,
 }
 
-/// Why an actor leaves.
+/// Reason why an actor exits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Ending {
-    /// The learner said that the run is over.
+pub enum ExitReason {
+    /// The learner reported the end of the run.
     Stopped,
-    /// This process was told to end.
+    /// This process received a signal.
     Signalled,
     /// No learner of this run sent a heartbeat for `transport.learner_silence_secs`.
     LearnerSilent,
 }
 
-/// Why an actor lets go of the learner it has joined.
+/// Reason why an actor disconnects from a learner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Parting {
-    /// The actor leaves.
-    Leave(Ending),
-    /// That learner is dead, or another incarnation of it has begun.
+enum DisconnectReason {
+    /// The actor exits.
+    Exit(ExitReason),
+    /// The learner is dead, or its next incarnation has begun.
     LearnerGone,
-    /// This process was stopped for so long that the learner has given it up: its tickets are
-    /// others' now.
-    Overslept,
-    /// The learner hears nothing of what this actor flies.
-    AskedToRejoin,
+    /// This process was suspended for so long that the learner issued its tickets to others.
+    Suspended,
+    /// The learner receives none of this actor's records.
+    RejoinRequested,
 }
 
 impl<'a> Service<'a> {
-    /// A service of `actor` that has not joined a learner yet.
+    /// Creates a service of `actor` that has not joined a learner yet.
     pub fn new(
         identity: &'a RunIdentity,
         config: &'a Config,
         actor: ActorId,
-        told_to_end: &'a AtomicBool,
+        exit_requested: &'a AtomicBool,
     ) -> Self {
         Self {
             identity,
             config,
             actor,
-            told_to_end,
+            exit_requested,
             incarnation: ActorIncarnation(0),
-            last_sign: Instant::now(),
+            last_heard: Instant::now(),
             newest_learner: None,
         }
     }
 
-    /// Flies tickets as they come, until the run is over for this actor.
+    /// Flies tickets as they arrive, until there is a reason to exit.
     ///
     /// # Errors
-    /// [`JoinError`] when no learner of this run can be joined by this process, now or later, or
-    /// one that is there could not for `transport.learner_silence_secs`. A lost episode or learner
-    /// is none.
-    pub fn serve(mut self, environment_loop: &mut EnvironmentLoop) -> Result<Ending, JoinError> {
+    /// [`JoinError`] if this process can never join a learner of this run, or could not join the
+    /// existing one for `transport.learner_silence_secs`. A lost episode or learner is not an
+    /// error.
+    pub fn serve(
+        mut self,
+        environment_loop: &mut EnvironmentLoop,
+    ) -> Result<ExitReason, JoinError> {
         loop {
-            let ports = match self.seek()? {
+            let ports = match self.find_learner()? {
                 Ok(ports) => ports,
                 Err(ending) => return Ok(ending),
             };
             self.incarnation = next_incarnation(self.incarnation);
-            info!(actor = %self.actor, incarnation = %self.incarnation, learner_incarnation = %ports.incarnation(), "learner joined");
-            pass(FaultPoint::ActorJoined);
+            info!(
+                actor = %self.actor,
+                incarnation = %self.incarnation,
+                learner_incarnation = %ports.incarnation(),
+                "learner joined"
+            );
+            die_if_armed(FaultPoint::ActorJoined);
             environment_loop.begin_incarnation(self.incarnation);
-            let mut line = LearnerLine::new(&self, ports);
-            let parting = serve_incarnation(environment_loop, &mut line);
-            self.last_sign = line.last_sign();
-            match parting {
-                Ok(Parting::Leave(ending)) => return Ok(ending),
-                Ok(Parting::LearnerGone) => {
+            let mut connection = LearnerConnection::new(&self, ports);
+            let disconnect_reason = serve_learner(environment_loop, &mut connection);
+            self.last_heard = connection.last_heard();
+            match disconnect_reason {
+                Ok(DisconnectReason::Exit(ending)) => return Ok(ending),
+                Ok(DisconnectReason::LearnerGone) => {
                     warn!("the learner is gone; looking for its next incarnation")
                 }
-                Ok(Parting::Overslept) => {
-                    warn!("this process was stopped for too long; joining anew")
+                Ok(DisconnectReason::Suspended) => {
+                    warn!("this process was suspended for too long; joining again")
                 }
-                Ok(Parting::AskedToRejoin) => {
-                    warn!("nothing that was flown has arrived; joining anew")
+                Ok(DisconnectReason::RejoinRequested) => {
+                    warn!("the learner receives no records; joining again")
                 }
                 Err(error) => {
-                    warn!(%error, "the line to the learner is broken; joining anew");
-                    sleep(SEEK_INTERVAL);
+                    warn!(%error, "the connection to the learner is broken; joining again");
+                    sleep(JOIN_INTERVAL);
                 }
             }
         }
     }
 
-    /// Looks for a learner until it has joined one, or there is a reason to leave.
-    fn seek(&mut self) -> Result<Result<ActorPorts, Ending>, JoinError> {
+    /// Tries to join a learner until it succeeds, or there is a reason to exit.
+    fn find_learner(&mut self) -> Result<Result<ActorPorts, ExitReason>, JoinError> {
         let mut last_refusal = None;
-        let interval = SEEK_INTERVAL.min(self.config.transport.heartbeat());
+        let interval = JOIN_INTERVAL.min(self.config.transport.heartbeat());
         loop {
-            if self.told_to_end.load(Ordering::Relaxed) {
-                return Ok(Err(Ending::Signalled));
+            if self.exit_requested.load(Ordering::Relaxed) {
+                return Ok(Err(ExitReason::Signalled));
             }
             match ActorPorts::join(self.identity, self.config) {
                 Ok(ports) => {
-                    // An incarnation that was not there before shows that a learner incarnations.
-                    // To join the same one again shows nothing.
+                    // A new incarnation proves that a learner is alive. Joining the same one again
+                    // proves nothing.
                     if self
                         .newest_learner
                         .is_none_or(|newest| newest < ports.incarnation())
                     {
                         self.newest_learner = Some(ports.incarnation());
-                        self.last_sign = Instant::now();
+                        self.last_heard = Instant::now();
                     }
                     return Ok(Ok(ports));
                 }
@@ -154,11 +160,11 @@ impl<'a> Service<'a> {
                         info!(error = refusal, "no learner joined yet");
                         last_refusal = Some(refusal);
                     }
-                    if self.last_sign.elapsed()
+                    if self.last_heard.elapsed()
                         > Duration::from_secs_f64(self.config.transport.learner_silence_secs)
                     {
                         return match error {
-                            JoinError::NoLearner(_) => Ok(Err(Ending::LearnerSilent)),
+                            JoinError::NoLearner(_) => Ok(Err(ExitReason::LearnerSilent)),
                             error => Err(error),
                         };
                     }
@@ -169,49 +175,58 @@ impl<'a> Service<'a> {
     }
 }
 
-/// A number that no earlier incarnation of this actor had, as far as the clock tells, and none of
-/// this process.
+/// Returns an incarnation that no earlier start of this actor had, as far as the clock shows, and
+/// that is new in this process.
 fn next_incarnation(last: ActorIncarnation) -> ActorIncarnation {
     let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH);
     let nanos = since_1970.map_or(0, |elapsed| elapsed.as_nanos() as u64);
     ActorIncarnation(nanos.max(last.0 + 1))
 }
 
-/// Serves the learner that was joined.
-fn serve_incarnation(
+/// Serves the joined learner.
+fn serve_learner(
     environment_loop: &mut EnvironmentLoop,
-    line: &mut LearnerLine<'_>,
-) -> Result<Parting, ServiceError> {
-    line.report(ActorState::Serving)?;
-    let parting = loop {
-        line.listen()?;
-        if let Some(parting) = line.parting() {
-            break parting;
+    connection: &mut LearnerConnection<'_>,
+) -> Result<DisconnectReason, ServiceError> {
+    connection.report(ActorState::Serving)?;
+    let disconnect_reason = loop {
+        connection.listen()?;
+        if let Some(disconnect_reason) = connection.disconnect_reason() {
+            break disconnect_reason;
         }
-        match line.take_ticket() {
-            Some((ticket, network)) => fly(environment_loop, &ticket, &network, line)?,
-            None => line.wait()?,
+        match connection.take_ticket() {
+            Some((ticket, network)) => fly(environment_loop, &ticket, &network, connection)?,
+            None => connection.wait()?,
         }
     };
-    info!(?parting, episodes = line.episodes_flown, "leaving");
-    if parting != Parting::LearnerGone {
-        line.report(ActorState::Leaving)?;
+    info!(
+        ?disconnect_reason,
+        episodes = connection.episodes_flown,
+        "disconnecting"
+    );
+    if disconnect_reason != DisconnectReason::LearnerGone {
+        connection.report(ActorState::Leaving)?;
     }
-    Ok(parting)
+    Ok(disconnect_reason)
 }
 
 fn fly(
     environment_loop: &mut EnvironmentLoop,
     ticket: &Ticket,
     network: &Network,
-    line: &mut LearnerLine<'_>,
+    connection: &mut LearnerConnection<'_>,
 ) -> Result<(), ServiceError> {
-    let span = info_span!("episode", episode = %ticket.episode, attempt = %ticket.attempt, policy = %ticket.policy_version);
+    let span = info_span!(
+        "episode",
+        episode = %ticket.episode,
+        attempt = %ticket.attempt,
+        policy = %ticket.policy_version
+    );
     let _entered = span.enter();
-    match environment_loop.fly(ticket, network, line) {
+    match environment_loop.fly(ticket, network, connection) {
         Ok(None) => debug!(steps = ticket.first_step(), "segment flown"),
         Ok(Some(score)) => {
-            line.episodes_flown += 1;
+            connection.episodes_flown += 1;
             debug!(
                 walls = score.walls_passed,
                 outcome = score.outcome.name(),
@@ -221,9 +236,9 @@ fn fly(
         }
         Err(EpisodeError::Abandoned) => info!("episode abandoned"),
         Err(EpisodeError::Fault(fault)) => warn!(%fault, "episode failed"),
-        // The ticket's deadline makes good for it.
+        // The ticket's deadline covers it.
         Err(EpisodeError::Link(error)) => warn!(%error, "episode lost"),
     }
-    // Here, so that the times of an episode that is taken in are known too.
-    line.wake_learner()
+    // Woken here, so that the learner also gets the times of this episode.
+    connection.wake_learner()
 }

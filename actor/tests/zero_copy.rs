@@ -1,5 +1,5 @@
-//! The depth image's bytes are written once: where the camera rendered them, the learner reads
-//! them.
+//! Test that the depth image's bytes are written once: the learner reads them where the camera
+//! rendered them.
 
 #![allow(
     clippy::unwrap_used,
@@ -19,20 +19,20 @@ use skein_rollout::environment_loop::{Directive, EnvironmentLoop, RecordLink};
 use skein_run::{LearnerLock, RunDirectory};
 use skein_transport::{ActorPorts, LearnerPorts, LoanedTransition, ServiceError};
 
-/// A byte of memory, whatever address it is mapped to: a file and an offset in it.
+/// A byte of memory, independent of the address it is mapped to: a file and an offset in it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Place {
+struct FileOffset {
     inode: String,
     offset: usize,
 }
 
-impl Place {
+impl FileOffset {
     fn of(address: *const u8) -> Self {
         let address = address as usize;
         let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
         let number = |text: &str| usize::from_str_radix(text, 16).unwrap();
         // "start-end permissions offset device inode path"
-        let place = maps.lines().find_map(|line| {
+        let location = maps.lines().find_map(|line| {
             let fields: Vec<_> = line.split_whitespace().collect();
             let (start, end) = fields[0].split_once('-')?;
             (number(start) <= address && address < number(end)).then(|| Self {
@@ -40,20 +40,17 @@ impl Place {
                 offset: address - number(start) + number(fields[2]),
             })
         });
-        let place = place.expect("every address of ours is mapped");
-        assert_ne!(
-            place.inode, "0",
-            "memory of one process alone is shared with nobody"
-        );
-        place
+        let location = location.expect("every address of this process is mapped");
+        assert_ne!(location.inode, "0", "private memory has no file");
+        location
     }
 }
 
-/// Notes where each image lies, when it is about to be rendered and when it is sent.
+/// Link that records where each image lies, when loaned and when sent.
 struct Watched<'a> {
     ports: &'a ActorPorts,
-    loaned: Vec<Place>,
-    sent: Vec<Place>,
+    loaned: Vec<FileOffset>,
+    sent: Vec<FileOffset>,
 }
 
 impl RecordLink for Watched<'_> {
@@ -62,12 +59,12 @@ impl RecordLink for Watched<'_> {
 
     fn loan(&mut self) -> Result<LoanedTransition, ServiceError> {
         let record = self.ports.loan_transition()?;
-        self.loaned.push(Place::of(record.depth.as_ptr()));
+        self.loaned.push(FileOffset::of(record.depth.as_ptr()));
         Ok(record)
     }
 
     fn send(&mut self, record: LoanedTransition) -> Result<(), ServiceError> {
-        self.sent.push(Place::of(record.depth.as_ptr()));
+        self.sent.push(FileOffset::of(record.depth.as_ptr()));
         self.ports.send_transition(record)
     }
 
@@ -117,7 +114,7 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
         ActorId(0),
         ActorIncarnation(0),
         simulators,
-        Agent::new(config.view()),
+        Agent::new(config.observation_layout()),
     );
     let mut watched = Watched {
         ports: &actor,
@@ -128,7 +125,7 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
 
     let mut received = Vec::new();
     while let Some(record) = learner.receive_transition().unwrap() {
-        received.push(Place::of(record.depth.as_ptr()));
+        received.push(FileOffset::of(record.depth.as_ptr()));
     }
     flown.unwrap();
     assert!(received.len() > 3);

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::stages::Times;
-use skein_protocol::summary::{Ending, Summary, Trained};
+use skein_protocol::stages::StageTimes;
+use skein_protocol::summary::{RunEnding, Summary, Trained};
 use skein_run::RunDirectory;
 use skein_run::tables::{evaluation_table, stages_table};
 
@@ -31,7 +31,7 @@ pub fn conclusion(run: &RunDirectory) -> String {
             push(&mut text, &trained_sentence(trained));
         }
         push(&mut text, &sentence(&summary));
-        if summary.stages != Times::default() {
+        if summary.stages != StageTimes::default() {
             push(&mut text, &format!("{}\n", stages_table(&summary.stages)));
         }
     }
@@ -69,8 +69,8 @@ fn trained_sentence(trained: &Trained) -> String {
 
 fn sentence(summary: &Summary) -> String {
     let ending = match summary.ending {
-        Ending::Completed => "Completed",
-        Ending::Interrupted => "Interrupted",
+        RunEnding::Completed => "Completed",
+        RunEnding::Interrupted => "Interrupted",
     };
     format!(
         "{ending} after {}: {} episodes, {} steps, {} updates, {} VAE updates. \
@@ -155,13 +155,13 @@ mod tests {
             policy_sha256: "00".to_owned(),
             courses: vec![CourseEvaluation::of("training", 5, &[])],
         };
-        let mut stages = Times::default();
+        let mut stages = StageTimes::default();
         stages.add(Stage::Encoder, 2000, Duration::from_millis(1500));
         let summary = Summary {
             skein_version: "0".to_owned(),
             run: RunId(1),
             seed: 1,
-            ending: Ending::Completed,
+            ending: RunEnding::Completed,
             policy_sha256: "0123456789abcdef0000".to_owned(),
             final_version: PolicyVersion(50),
             best_version: None,

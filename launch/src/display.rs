@@ -10,7 +10,7 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use skein_protocol::progress::{Phase, Progress};
+use skein_protocol::progress::{LearnerPhase, ProgressReport};
 use skein_reports::Clock;
 
 use crate::supervisor::{Restarts, Watcher};
@@ -29,7 +29,9 @@ pub struct ProgressDisplay {
 
 enum Surface {
     Terminal(ProgressBar),
-    Plain { last: Option<(Instant, Phase)> },
+    Plain {
+        last: Option<(Instant, LearnerPhase)>,
+    },
 }
 
 /// Returns a progress bar if standard error is a terminal.
@@ -53,7 +55,7 @@ impl ProgressDisplay {
 
     /// Returns a head line (position in the run and remaining time) and a line of figures that show
     /// whether the training makes progress.
-    pub fn text(&mut self, progress: &Progress, restarts: Restarts) -> (String, String) {
+    pub fn text(&mut self, progress: &ProgressReport, restarts: Restarts) -> (String, String) {
         let left_secs = self.pace.secs_left(progress);
         let figures = ProgressFigures { progress, restarts };
         (
@@ -81,13 +83,13 @@ impl Default for ProgressDisplay {
 }
 
 impl Watcher for ProgressDisplay {
-    fn progress(&mut self, progress: &Progress, restarts: Restarts) {
+    fn progress(&mut self, progress: &ProgressReport, restarts: Restarts) {
         let (head, figures) = self.text(progress, restarts);
         match &mut self.surface {
             Surface::Terminal(bar) => {
                 let (position, length) = match progress.phase {
-                    Phase::Evaluating => progress.evaluation_episodes,
-                    Phase::Flying | Phase::Learning | Phase::Finishing => {
+                    LearnerPhase::Evaluating => progress.evaluation_episodes,
+                    LearnerPhase::Flying | LearnerPhase::Learning | LearnerPhase::Finishing => {
                         (progress.episodes, progress.total_episodes)
                     }
                 };
@@ -98,7 +100,8 @@ impl Watcher for ProgressDisplay {
             Surface::Plain { last } => {
                 let due = last.is_none_or(|(when, phase)| {
                     when.elapsed() >= LINE_INTERVAL
-                        || (phase == Phase::Evaluating) != (progress.phase == Phase::Evaluating)
+                        || (phase == LearnerPhase::Evaluating)
+                            != (progress.phase == LearnerPhase::Evaluating)
                 });
                 if due {
                     *last = Some((Instant::now(), progress.phase));
@@ -118,20 +121,20 @@ impl Watcher for ProgressDisplay {
 
 /// Position in the run and remaining time.
 struct ProgressHead<'a> {
-    progress: &'a Progress,
+    progress: &'a ProgressReport,
     left_secs: Option<f64>,
 }
 
 impl fmt::Display for ProgressHead<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Progress {
+        let ProgressReport {
             episodes,
             total_episodes,
             elapsed_secs,
             ..
         } = *self.progress;
         match self.progress.phase {
-            Phase::Evaluating => {
+            LearnerPhase::Evaluating => {
                 let (flown, total) = self.progress.evaluation_episodes;
                 let what = if episodes < total_episodes {
                     " the newest snapshot"
@@ -143,8 +146,12 @@ impl fmt::Display for ProgressHead<'_> {
                     "evaluating{what} {flown}/{total} · episode {episodes}/{total_episodes}"
                 )?;
             }
-            Phase::Finishing => write!(f, "finishing · episode {episodes}/{total_episodes}")?,
-            Phase::Flying | Phase::Learning => write!(f, "episode {episodes}/{total_episodes}")?,
+            LearnerPhase::Finishing => {
+                write!(f, "finishing · episode {episodes}/{total_episodes}")?
+            }
+            LearnerPhase::Flying | LearnerPhase::Learning => {
+                write!(f, "episode {episodes}/{total_episodes}")?
+            }
         }
         write!(f, " · {}", Clock(elapsed_secs))?;
         match self.left_secs {
@@ -156,7 +163,7 @@ impl fmt::Display for ProgressHead<'_> {
 
 /// ProgressFigures of the training, and restarts of its processes.
 struct ProgressFigures<'a> {
-    progress: &'a Progress,
+    progress: &'a ProgressReport,
     restarts: Restarts,
 }
 
@@ -229,7 +236,7 @@ struct Pace {
 impl Pace {
     /// Returns the seconds until all training episodes are flown at the present pace, or `None`
     /// before a pace is known.
-    fn secs_left(&mut self, progress: &Progress) -> Option<f64> {
+    fn secs_left(&mut self, progress: &ProgressReport) -> Option<f64> {
         let (now_secs, episodes) = (progress.elapsed_secs, progress.episodes);
         // A restarted learner repeats some episodes; they say nothing about the pace.
         if self
@@ -254,8 +261,8 @@ impl Pace {
 mod tests {
     use super::*;
 
-    fn progress(elapsed_secs: f64, episodes: u64) -> Progress {
-        Progress {
+    fn progress(elapsed_secs: f64, episodes: u64) -> ProgressReport {
+        ProgressReport {
             episodes,
             steps: 10_000,
             updates: 4000,
@@ -267,7 +274,7 @@ mod tests {
             actors: 1,
             live_actors: vec![0],
             elapsed_secs,
-            ..Progress::start(2000)
+            ..ProgressReport::start(2000)
         }
     }
 
@@ -295,7 +302,7 @@ mod tests {
 
     #[test]
     fn figures_never_exceed_the_terminal_width() {
-        let progress = Progress {
+        let progress = ProgressReport {
             mean_return: Some(-8.69),
             vae_loss: Some(150.1),
             ..progress(3725.0, 512)
@@ -322,8 +329,8 @@ mod tests {
     #[test]
     fn the_pace_starts_afresh_with_a_restarted_learner() {
         let mut pace = Pace::default();
-        for second in 0..100 {
-            pace.secs_left(&progress(f64::from(second), 100 * second as u64 / 10));
+        for second in 0..100_u32 {
+            pace.secs_left(&progress(f64::from(second), 100 * u64::from(second) / 10));
         }
         assert_eq!(pace.secs_left(&progress(0.5, 500)), None);
         assert_eq!(pace.secs_left(&progress(10.5, 600)), Some(140.0));
@@ -335,8 +342,8 @@ mod tests {
         assert_eq!(pace.secs_left(&progress(0.0, 0)), None);
         assert_eq!(pace.secs_left(&progress(10.0, 100)), Some(190.0));
         // Ten times slower from here on. After a minute the first seconds no longer count.
-        for second in 11..=200 {
-            pace.secs_left(&progress(f64::from(second), 100 + (second as u64 - 10)));
+        for second in 11..=200_u32 {
+            pace.secs_left(&progress(f64::from(second), 100 + (u64::from(second) - 10)));
         }
         let left = pace.secs_left(&progress(201.0, 291)).unwrap();
         assert!((left - 1709.0).abs() < 1.0, "{left}");

@@ -23,7 +23,7 @@ use skein_launch::supervisor::{
 use skein_prepare::room::{check_shared_memory_for_more, scarce_disk};
 use skein_prepare::{Prepared, prepare};
 use skein_protocol::config::{Config, CoursesSection};
-use skein_protocol::summary::Ending;
+use skein_protocol::summary::RunEnding;
 use skein_reports::{ideal_walls_passed, load_courses};
 use skein_run::ActorClaim;
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
@@ -145,8 +145,8 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     // A user who stopped only the learner has interrupted the run as well. Conversely, a run may
     // complete before it acts on an interruption.
     let ended = match run.summary().map(|summary| summary.ending) {
-        Some(Ending::Completed) => Ended::Finished,
-        Some(Ending::Interrupted) => Ended::Interrupted,
+        Some(RunEnding::Completed) => Ended::Finished,
+        Some(RunEnding::Interrupted) => Ended::Interrupted,
         None => ended,
     };
     if ended == Ended::Interrupted {
@@ -207,7 +207,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
     // While the learner restarts, its supervisor keeps the run under way.
-    if !run.is_under_way()? {
+    if !run.is_running()? {
         let root = run.root().display();
         bail!(
             "the run in {root} is not under way on this machine; \
@@ -240,7 +240,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let mut display = ProgressDisplay::new();
     runtime().context(RUNTIME)?.block_on(async {
         let mut interrupts = interrupts().context(SIGNALS)?;
-        let is_under_way = || run.is_under_way().unwrap_or(false);
+        let is_under_way = || run.is_running().unwrap_or(false);
         Ok(supervisor::attach(&plan, is_under_way, &mut interrupts, &mut display).await?)
     })
 }

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use skein_protocol::summary::Ending;
-use skein_run::{LockError, PlaceError, RunDirectory, RunError, SupervisorLock};
+use skein_protocol::summary::RunEnding;
+use skein_run::{LockError, PathError, RunDirectory, RunError, SupervisorLock};
 
 use skein_prepare::room::{check_folders, check_shared_memory};
 use skein_prepare::{PrepareError, Prepared, check};
@@ -61,7 +61,7 @@ pub enum ResumeError {
     Run(#[from] RunError),
     /// Its transport belongs to another user.
     #[error(transparent)]
-    Place(#[from] PlaceError),
+    Path(#[from] PathError),
     /// The run is under way in another directory, of which this one is a copy.
     #[error("the run in {} is under way in another directory, of which this one is a copy: \
              {source}", directory.display())]
@@ -101,7 +101,7 @@ pub fn resume(
     // A process that only checks whether the lock is taken holds it for a moment.
     let lock = in_time(LOOK * 5, || match SupervisorLock::take(&run, &identity) {
         Err(LockError::Taken { lock, .. }) if lock == run.root() => Ok(None),
-        Err(LockError::Place(error)) => Err(error.into()),
+        Err(LockError::Path(error)) => Err(error.into()),
         taken => taken.map(Some).map_err(|source| ResumeError::Copy {
             directory: run.root().to_owned(),
             source,
@@ -109,11 +109,11 @@ pub fn resume(
     })?
     .ok_or_else(under_way)?;
     in_time(patience, || {
-        Ok::<_, PlaceError>((!identity.is_learner_alive()?).then_some(()))
+        Ok::<_, PathError>((!identity.is_learner_alive()?).then_some(()))
     })?
     .ok_or_else(under_way)?;
     if let Some(summary) = run.summary()
-        && summary.ending == Ending::Completed
+        && summary.ending == RunEnding::Completed
     {
         return Err(ResumeError::Complete {
             directory: run.root().to_owned(),

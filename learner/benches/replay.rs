@@ -11,7 +11,7 @@ use skein_learner::replay::{Minibatch, Replay};
 use skein_protocol::config::{Config, Observation};
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, LONGEST_LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, MAX_LATENT};
 
 /// Transitions per minibatch.
 const BATCH: usize = 256;
@@ -70,7 +70,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedEpisode {
         action_before: [0.0; ACTION],
         observations: (0..=STEPS)
             .map(|_| StepObservation {
-                latent: [(); LONGEST_LATENT].map(|()| draw()),
+                latent: [(); MAX_LATENT].map(|()| draw()),
                 velocity_mps: [(); 3].map(|()| draw()),
                 position_m: [0.0; 3],
                 orientation: [0.0, 0.0, 0.0, 1.0],

@@ -9,7 +9,7 @@ use std::fmt;
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::config::{AlgorithmName, Config, CriticInput, Engine};
-use skein_protocol::{ACTION, IMAGE_PIXELS, TRUE_STATE};
+use skein_protocol::{ACTION, IMAGE_PIXELS, PRIVILEGED_STATE};
 use tch::Device;
 
 use crate::error::UpdateError;
@@ -93,12 +93,12 @@ impl Inputs {
     pub fn of(config: &Config) -> Self {
         let same = Self {
             from_image: config.learning.end_to_end().then_some(config.vae.latent),
-            ..Self::same(config.view().len())
+            ..Self::same(config.observation_layout().len())
         };
         match config.learning.critic_input {
             CriticInput::Observation => same,
             CriticInput::GroundTruth => Self {
-                critic: TRUE_STATE,
+                critic: PRIVILEGED_STATE,
                 ..same
             },
         }

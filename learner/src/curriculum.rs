@@ -44,7 +44,7 @@ pub fn training(
         seed: derive(config.run.seed, Purpose::Episode, episode),
         segment: config.learning.in_segments().then(|| Segment {
             steps: config.learning.segment_steps as u32,
-            flown: flown.into(),
+            prior_actions: flown.into(),
         }),
     };
     (first..end).map(ticket).collect()

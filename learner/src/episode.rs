@@ -5,7 +5,7 @@
 //! episode bootstraps from it. An episode flown in segments is committed segment by segment: each
 //! segment is a [`CommittedEpisode`], and so are the segments so far, joined.
 
-use skein_protocol::config::View;
+use skein_protocol::config::ObservationLayout;
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
 use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
@@ -156,11 +156,11 @@ impl CommittedEpisode {
     }
 
     /// Writes the observation vector at the beginning of `step`, at most T, as the actor saw it.
-    pub fn write_observation(&self, step: usize, view: &View, into: &mut [f32]) {
+    pub fn write_observation(&self, step: usize, view: &ObservationLayout, into: &mut [f32]) {
         view.write(step, into, |step, into| self.write_moment(step, view, into));
     }
 
-    /// Writes the critic's input at the beginning of `step`, `[TRUE_STATE]`, where the critic sees
+    /// Writes the critic's input at the beginning of `step`, `[PRIVILEGED_STATE]`, where the critic sees
     /// the [ground truth](skein_protocol::config::CriticInput::GroundTruth).
     ///
     /// It holds the ground truth, the velocity, the tilt, and the action before, which under
@@ -188,10 +188,10 @@ impl CommittedEpisode {
             .map_or(self.action_before, |previous| self.actions[previous])
     }
 
-    fn write_moment(&self, step: usize, view: &View, into: &mut [f32]) {
+    fn write_moment(&self, step: usize, view: &ObservationLayout, into: &mut [f32]) {
         let previous_action = self.action_before(step);
         let seen = &self.observations[step];
-        view.write_moment(&seen.latent, &seen.velocity_mps, &previous_action, into);
+        view.write_step(&seen.latent, &seen.velocity_mps, &previous_action, into);
     }
 
     /// Checks that there is a step, and that every part is as long as the number of actions
@@ -292,7 +292,7 @@ pub(crate) mod samples {
 
 #[cfg(test)]
 mod tests {
-    use skein_protocol::TRUE_STATE;
+    use skein_protocol::PRIVILEGED_STATE;
     use skein_protocol::config::Observation;
 
     use super::*;
@@ -322,7 +322,7 @@ mod tests {
     #[test]
     fn the_previous_action_is_zero_at_reset_and_then_the_one_before() {
         let episode = samples::episode(3, 5, Outcome::Collided);
-        let view = View::present(Observation::LatentVelocityAction, 16);
+        let view = ObservationLayout::present(Observation::LatentVelocityAction, 16);
         let mut vector = [f32::NAN; 16 + 2 + ACTION];
         episode.write_observation(0, &view, &mut vector);
         assert_eq!(vector[18..], [0.0, 0.0]);
@@ -335,8 +335,8 @@ mod tests {
     #[test]
     fn earlier_moments_follow_the_present_and_before_reset_all_was_as_at_reset() {
         let episode = samples::episode(3, 5, Outcome::Collided);
-        let view = View {
-            moment: Observation::LatentVelocity,
+        let view = ObservationLayout {
+            per_step: Observation::LatentVelocity,
             latent: 8,
             history_steps: vec![1, 4],
         };
@@ -354,7 +354,7 @@ mod tests {
     #[test]
     fn the_true_state_is_the_ground_truth_the_motion_and_the_action_before() {
         let episode = samples::episode(3, 5, Outcome::Collided);
-        let mut state = [f32::NAN; TRUE_STATE];
+        let mut state = [f32::NAN; PRIVILEGED_STATE];
         episode.write_true_state(4, &mut state);
         let seen = &episode.observations[4];
         assert_eq!(state[0], seen.ground_truth[0] * TRUTH_SCALE[0]);

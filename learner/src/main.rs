@@ -8,9 +8,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, Result};
 use clap::Parser;
 use skein_learner::training::{self, TrainingError};
-use skein_protocol::summary::Ending;
+use skein_protocol::summary::RunEnding;
 use skein_run::allocation::keep_freed_memory;
-use skein_run::failure::{EXIT_START_AGAIN, with_causes};
+use skein_run::failure::{EXIT_RESTART, with_causes};
 use skein_run::logging::{LogFormat, log_to_file};
 use skein_run::{LearnerLock, RunDirectory};
 use tokio::signal::unix::{SignalKind, signal};
@@ -46,7 +46,7 @@ fn main() -> ExitCode {
 /// Exit status after `error`: says whether starting again may help.
 fn status_of(error: &anyhow::Error) -> ExitCode {
     match error.downcast_ref::<TrainingError>() {
-        Some(error) if error.is_transport_failure() => ExitCode::from(EXIT_START_AGAIN),
+        Some(error) if error.is_transport_failure() => ExitCode::from(EXIT_RESTART),
         _ => ExitCode::FAILURE,
     }
 }
@@ -71,7 +71,7 @@ fn run(arguments: &Arguments) -> Result<()> {
     // An unreadable summary counts as missing: it is written again, from the last checkpoint.
     if directory
         .summary()
-        .is_some_and(|summary| summary.ending == Ending::Completed)
+        .is_some_and(|summary| summary.ending == RunEnding::Completed)
     {
         let root = directory.root().display();
         tracing::info!("the run is complete: nothing left to do");

@@ -1,4 +1,4 @@
-//! Progress lines on standard output while the learner runs.
+//! ProgressReport lines on standard output while the learner runs.
 
 use std::collections::VecDeque;
 use std::io::Write;
@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
 
 use crate::disk::Disk;
 use crate::episodes::receiver::Shared;
@@ -23,7 +23,7 @@ const RATE_INTERVALS: usize = 10;
 /// Prints the learner's progress at intervals, whatever the training thread is doing.
 #[derive(Debug)]
 pub struct Reporter {
-    progress: Arc<Mutex<Progress>>,
+    progress: Arc<Mutex<ProgressReport>>,
     ended: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -42,7 +42,11 @@ impl Reporter {
     ///
     /// # Errors
     /// When the system grants no thread.
-    pub fn start(progress: Progress, receiver: Arc<Shared>, disk: Disk) -> std::io::Result<Self> {
+    pub fn start(
+        progress: ProgressReport,
+        receiver: Arc<Shared>,
+        disk: Disk,
+    ) -> std::io::Result<Self> {
         let progress = Arc::new(Mutex::new(progress));
         let ended = Arc::new(AtomicBool::new(false));
         let (of_thread, end_of_thread) = (progress.clone(), ended.clone());
@@ -57,7 +61,7 @@ impl Reporter {
     }
 
     /// Changes the contents of the next line.
-    pub fn update(&self, change: impl FnOnce(&mut Progress)) {
+    pub fn update(&self, change: impl FnOnce(&mut ProgressReport)) {
         change(&mut self.progress.lock().unwrap_or_else(PoisonError::into_inner));
     }
 }
@@ -81,7 +85,7 @@ impl Drop for Reporter {
     }
 }
 
-fn report(progress: &Mutex<Progress>, ended: &AtomicBool, receiver: &Shared, disk: &Disk) {
+fn report(progress: &Mutex<ProgressReport>, ended: &AtomicBool, receiver: &Shared, disk: &Disk) {
     let started = Instant::now();
     let mut watchdog = Watchdog::new(started);
     let mut marks: VecDeque<(f64, u64, u64)> = VecDeque::new();

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
-use skein_protocol::stages::Times;
+use skein_protocol::stages::StageTimes;
 
 use crate::episodes::receiver::Shared;
 
@@ -15,7 +15,7 @@ pub struct RunCosts {
     /// Seconds from the learner's start to its end.
     pub wall_secs: f64,
     /// Time of the learner's threads and of the actors, by stage.
-    pub stages: Times,
+    pub stages: StageTimes,
     /// Tickets issued again, by reason.
     pub tickets_reissued: BTreeMap<String, u64>,
     /// Records refused, by reason.
@@ -28,7 +28,7 @@ impl RunCosts {
     pub fn with_this_incarnation(
         &self,
         started: Instant,
-        training: &Times,
+        training: &StageTimes,
         shared: &Shared,
     ) -> Self {
         let faults = shared.faults();

@@ -21,11 +21,11 @@ use std::time::Instant;
 
 use skein_protocol::config::Config;
 use skein_protocol::ids::{Epoch, PolicyVersion};
-use skein_protocol::progress::Phase;
+use skein_protocol::progress::LearnerPhase;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
-use skein_protocol::summary::{Ending, Summary};
-use skein_run::fault::{FaultPoint, pass};
+use skein_protocol::summary::{RunEnding, Summary};
+use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity};
 
 use crate::checkpoint::{CheckpointWriter, EpochOrder, TrainingProgress};
@@ -101,13 +101,13 @@ pub fn run(
     let end = match training.train() {
         Ok(()) => training
             .save()
-            .map(|progress| (Ending::Completed, progress)),
+            .map(|progress| (RunEnding::Completed, progress)),
         Err(TrainingError::EpisodeReceiver(ReceiverError::Stopped)) => training
             .save()
-            .map(|progress| (Ending::Interrupted, progress)),
+            .map(|progress| (RunEnding::Interrupted, progress)),
         Err(TrainingError::Abandoned) => training
             .roll_back()
-            .map(|progress| (Ending::Interrupted, progress)),
+            .map(|progress| (RunEnding::Interrupted, progress)),
         Err(error) => Err(error),
     };
     training.conclude(end)
@@ -241,7 +241,7 @@ impl Training<'_> {
     fn collect(&mut self) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         self.reporter
-            .update(|progress| progress.phase = Phase::Flying);
+            .update(|progress| progress.phase = LearnerPhase::Flying);
         let (is_mid_episode, shared) = (self.open_episode.is_some(), self.receiver.shared());
         if let Some(OrderInFlight {
             batch, episodes, ..
@@ -261,7 +261,7 @@ impl Training<'_> {
             }
         }
         self.timer.lap(Stage::TrainingIdle, 1);
-        pass(FaultPoint::LearnerEpochCollected);
+        die_if_armed(FaultPoint::LearnerEpochCollected);
         Ok(self
             .in_flight
             .pop_front()
@@ -279,7 +279,7 @@ impl Training<'_> {
         }
         let windows = self.metrics.windows();
         self.reporter.update(|progress| {
-            progress.phase = Phase::Learning;
+            progress.phase = LearnerPhase::Learning;
             progress.walls_passed = windows.walls_passed.mean();
             progress.mean_return = windows.total_reward.mean();
         });
@@ -327,7 +327,7 @@ impl Training<'_> {
                     progress.vae_updates += 1;
                     progress.vae_loss = Some(metrics.loss.into());
                 });
-                pass(FaultPoint::LearnerMidUpdates);
+                die_if_armed(FaultPoint::LearnerMidUpdates);
                 watch.after_update()
             })?;
         self.curves.vae = trained.or(self.curves.vae);
@@ -350,10 +350,10 @@ impl Training<'_> {
                     progress.updates += 1;
                     progress.temperature = temperature.map(|(_, value)| f64::from(*value));
                 });
-                pass(FaultPoint::LearnerMidUpdates);
+                die_if_armed(FaultPoint::LearnerMidUpdates);
                 watch.after_update()
             })?;
-        pass(FaultPoint::LearnerUpdated);
+        die_if_armed(FaultPoint::LearnerUpdated);
         self.curves.updates += self.trainer.updates() - updates_before;
         self.curves.updating += started.elapsed();
         Ok(())

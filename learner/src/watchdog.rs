@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use skein_protocol::progress::{Phase, Progress};
+use skein_protocol::progress::{LearnerPhase, ProgressReport};
 
 use crate::episodes::situation::Situation;
 
@@ -26,7 +26,7 @@ pub struct Watchdog {
 /// All counters that a healthy run advances.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct WorkDone {
-    phase: Phase,
+    phase: LearnerPhase,
     episodes: u64,
     steps: u64,
     updates: u64,
@@ -50,7 +50,7 @@ impl Watchdog {
     pub fn look(
         &mut self,
         now: Instant,
-        progress: &Progress,
+        progress: &ProgressReport,
         obstacle: Option<String>,
         receiver: Option<(Duration, Situation)>,
     ) -> Option<String> {
@@ -85,17 +85,21 @@ impl Watchdog {
     }
 }
 
-fn who_waits(phase: Phase, still: Duration, receiver: Option<(Duration, Situation)>) -> String {
+fn who_waits(
+    phase: LearnerPhase,
+    still: Duration,
+    receiver: Option<(Duration, Situation)>,
+) -> String {
     let still = still.as_secs();
     let episodes = match phase {
-        Phase::Flying => "episodes",
-        Phase::Evaluating => "evaluation episodes",
-        Phase::Learning => {
+        LearnerPhase::Flying => "episodes",
+        LearnerPhase::Evaluating => "evaluation episodes",
+        LearnerPhase::Learning => {
             return format!(
                 "the training thread has been at one step of its updates for {still} s"
             );
         }
-        Phase::Finishing => {
+        LearnerPhase::Finishing => {
             return format!("the training thread has been writing the last files for {still} s");
         }
     };
@@ -129,7 +133,7 @@ mod tests {
         let start = Instant::now();
         let at = |secs| start + Duration::from_secs(secs);
         let mut watchdog = Watchdog::new(start);
-        let mut progress = Progress::start(40);
+        let mut progress = ProgressReport::start(40);
         assert_eq!(watchdog.look(at(1), &progress, None, no_actor()), None);
         assert_eq!(watchdog.look(at(20), &progress, None, no_actor()), None);
         let stalled = watchdog.look(at(22), &progress, None, no_actor()).unwrap();
@@ -140,7 +144,7 @@ mod tests {
         );
         progress.steps += 1;
         assert_eq!(watchdog.look(at(23), &progress, None, no_actor()), None);
-        progress.phase = Phase::Learning;
+        progress.phase = LearnerPhase::Learning;
         watchdog.look(at(24), &progress, None, no_actor());
         let stalled = watchdog.look(at(50), &progress, None, no_actor()).unwrap();
         assert!(
@@ -153,7 +157,7 @@ mod tests {
     fn a_receiving_thread_that_does_not_respond_is_named() {
         let start = Instant::now();
         let mut watchdog = Watchdog::new(start);
-        let progress = Progress::start(40);
+        let progress = ProgressReport::start(40);
         watchdog.look(start, &progress, None, None);
         let stale = no_actor().map(|(_, situation)| (Duration::from_secs(33), situation));
         let stalled = watchdog
@@ -170,7 +174,12 @@ mod tests {
         let start = Instant::now();
         let mut watchdog = Watchdog::new(start);
         let full = "no room for the checkpoint".to_owned();
-        let stalled = watchdog.look(start, &Progress::start(40), Some(full.clone()), no_actor());
+        let stalled = watchdog.look(
+            start,
+            &ProgressReport::start(40),
+            Some(full.clone()),
+            no_actor(),
+        );
         assert_eq!(stalled, Some(full));
     }
 }

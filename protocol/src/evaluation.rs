@@ -1,11 +1,11 @@
-//! `evaluation.json`: how a snapshot flies, course by course.
+//! Evaluation results, `evaluation.json`: how a snapshot flies, course by course.
 
 use serde::{Deserialize, Serialize};
 
 use crate::ids::PolicyVersion;
 use crate::transition::Outcome;
 
-/// How a snapshot flies: episodes in mode action from the start of level 1.
+/// Evaluation of a snapshot: episodes with mode actions from the start of level 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EvaluationReport {
     /// The snapshot.
@@ -16,19 +16,18 @@ pub struct EvaluationReport {
     pub courses: Vec<CourseEvaluation>,
 }
 
-/// How a snapshot flies one course.
+/// Evaluation of a snapshot on one course.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CourseEvaluation {
     /// The course's name.
     pub course: String,
     /// Episodes flown.
     pub episodes: u64,
-    /// R = (t_1 + … + t_n) / (n · episodes): the average rate of obstacles avoided (paper, section
-    /// 4.4).
+    /// R = (t_1 + … + t_n) / (n · episodes): mean rate of walls passed (paper, section 4.4).
     pub r: f64,
     /// Share of episodes that reached the end wall.
     pub completed: f64,
-    /// How many they are.
+    /// Episodes that reached the end wall.
     pub reached_end: u64,
     /// t_n: episodes that passed wall n, in course order.
     pub walls_passed: Vec<u64>,
@@ -38,39 +37,39 @@ pub struct CourseEvaluation {
     pub collided: u64,
     /// Episodes cut off by the step limit.
     pub timed_out: u64,
-    /// Where and by what episodes failed: an entry for each wall in course order, and one for the
-    /// way from the last wall to the end wall. Their sum is that of `collided` and `timed_out`.
-    pub failures: Vec<Failures>,
+    /// Failures by place and cause: an entry for each wall in course order, and one for the section
+    /// from the last wall to the end wall. They sum to `collided` plus `timed_out`.
+    pub failures: Vec<WallFailures>,
 }
 
-/// Episodes that failed at a wall or on the way to it.
+/// Failed episodes at a wall or on the way to it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Failures {
-    /// Hit this wall or the edge of its opening, from before or from behind.
+pub struct WallFailures {
+    /// Episodes that hit this wall or the edge of its opening, from either side.
     pub hit_wall: u64,
-    /// Hit a side, the floor or the ceiling of the corridor before they had passed this wall, and
-    /// after the one before.
+    /// Episodes that hit a side, the floor or the ceiling of the corridor between the previous wall
+    /// and this one.
     pub hit_corridor: u64,
-    /// Ran out of steps there.
+    /// Episodes that reached the step limit there.
     pub timed_out: u64,
 }
 
-/// What an evaluation counts of one episode.
+/// Score of one episode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EpisodeScore {
     /// Walls passed, from the start of level 1.
     pub walls_passed: u32,
     /// Sum of rewards.
     pub episode_return: f64,
-    /// How it ended.
+    /// Outcome.
     pub outcome: Outcome,
-    /// The wall that it hit, from 1 in course order, if it collided with one and not with the
+    /// The wall that the episode hit, from 1 in course order; `None` without a collision or for the
     /// corridor.
     pub hit_wall: Option<u8>,
 }
 
 impl CourseEvaluation {
-    /// Counts `episodes` of a course of `walls` walls.
+    /// Evaluates `episodes` of a course of `walls` walls.
     pub fn of(course: &str, walls: usize, episodes: &[EpisodeScore]) -> Self {
         let count = |holds: &dyn Fn(&EpisodeScore) -> bool| {
             episodes.iter().filter(|episode| holds(episode)).count() as u64
@@ -101,12 +100,12 @@ impl CourseEvaluation {
             },
             collided: count(&|episode| episode.outcome == Outcome::Collided),
             timed_out: count(&|episode| episode.outcome == Outcome::TimedOut),
-            failures: Failures::of(walls, episodes),
+            failures: WallFailures::of(walls, episodes),
         }
     }
 }
 
-impl Failures {
+impl WallFailures {
     /// Counts the failures of `episodes` from the start of level 1, `[walls + 1]`.
     fn of(walls: usize, episodes: &[EpisodeScore]) -> Vec<Self> {
         let mut failures = vec![Self::default(); walls + 1];
@@ -162,14 +161,14 @@ mod tests {
         let episodes = [
             score(3, Outcome::ReachedEnd, None),
             score(1, Outcome::Collided, Some(2)),
-            // Its centre had left the wall behind when its tail hit it.
+            // The drone's centre had passed the wall when its tail hit it.
             score(2, Outcome::Collided, Some(2)),
             score(2, Outcome::Collided, None),
             score(0, Outcome::TimedOut, None),
             score(3, Outcome::Collided, None),
         ];
         let evaluation = CourseEvaluation::of("training", 3, &episodes);
-        let failures = |hit_wall, hit_corridor, timed_out| Failures {
+        let failures = |hit_wall, hit_corridor, timed_out| WallFailures {
             hit_wall,
             hit_corridor,
             timed_out,
@@ -186,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn no_episodes_are_no_rate() {
+    fn the_rate_of_zero_episodes_is_zero() {
         assert_eq!(CourseEvaluation::of("training", 5, &[]).r, 0.0);
     }
 }

@@ -1,4 +1,4 @@
-//! Typed numbers: what must not be mixed up has a type of its own.
+//! Typed ids: ids that must not be mixed up have different types.
 
 use std::fmt;
 
@@ -20,13 +20,13 @@ macro_rules! id {
 }
 
 id! {
-    /// One start of a training: distinguishes two runs of one configuration. It names shared memory
-    /// and records, and never influences learning.
+    /// A training run. It distinguishes two runs of the same configuration; it appears in names of
+    /// shared memory and in records, and never influences learning.
     RunId(u64)
 }
 id! {
-    /// An episode (episode). Training episodes count from 0 in the order of their commit;
-    /// evaluation episodes lie above [`EpisodeId::FIRST_EVALUATION`].
+    /// An episode. Training episodes count from 0 in the order of their commit; evaluation episodes
+    /// start at [`EpisodeId::FIRST_EVALUATION`].
     EpisodeId(u64)
 }
 id! {
@@ -34,26 +34,24 @@ id! {
     Epoch(u64)
 }
 id! {
-    /// Number of a policy snapshot: the parameters after as many epochs of updates.
+    /// Version of a policy snapshot: the number of epochs of updates behind it.
     PolicyVersion(u64)
 }
 id! {
-    /// An actor process of a run; names its log file.
+    /// Number of an actor process of a run, used in the name of its log file.
     ActorId(u32)
 }
 id! {
-    /// One incarnation of an actor process: a restarted actor keeps its id and gets a new
-    /// incarnation.
+    /// An incarnation of an actor: a restarted actor keeps its id and gets a new incarnation.
     ActorIncarnation(u64)
 }
 id! {
-    /// How often an episode's ticket had been issued before: tells an episode flown again from its
-    /// late twin.
+    /// Number of earlier issues of an episode's ticket. It distinguishes an episode flown again
+    /// from a late copy.
     Attempt(u32)
 }
 
 impl EpisodeId {
-    /// Evaluation episodes are numbered from here, so that they never collide with training
-    /// episodes.
+    /// First evaluation episode; far above all training episodes.
     pub const FIRST_EVALUATION: Self = Self(1 << 63);
 }

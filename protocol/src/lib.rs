@@ -1,11 +1,10 @@
-//! What Skein's processes agree on: types and formats, and nothing that does anything with them.
+//! Types and formats that Skein's processes agree on.
 //!
-//! Who flies what ([`ticket`], [`segment`]), what a flown step looks like on the wire
-//! ([`transition`]), what a policy snapshot contains ([`snapshot`]), what an actor reports
-//! ([`status`], [`stages`]), the configuration of a run ([`config`]), the formats of the files it
-//! leaves ([`evaluation`], [`summary`]) and of its progress ([`progress`]). The transport that
-//! carries the records is `skein-transport`; where files lie and which processes use them is
-//! `skein-run`.
+//! The crate defines the work of an actor ([`ticket`], [`segment`]), one flown step on the wire
+//! ([`transition`]), a policy snapshot ([`snapshot`]), an actor's reports ([`status`], [`stages`]),
+//! the configuration of a run ([`config`]), and the formats of its files ([`evaluation`],
+//! [`summary`]) and progress reports ([`progress`]). It only defines them: the crate
+//! `skein-transport` carries the records; `skein-run` manages files and processes.
 
 pub mod config;
 pub mod evaluation;
@@ -20,9 +19,9 @@ pub mod summary;
 pub mod ticket;
 pub mod transition;
 
-/// Version of everything in this crate that crosses a process boundary; part of every service's
-/// attributes, so that a process of another version is refused when it opens a service.
-pub const PROTOCOL_VERSION: u32 = 8;
+/// Version of everything in this crate that crosses a process boundary. It is an attribute of every
+/// service: a process of another version is refused when it opens one.
+pub const PROTOCOL_VERSION: u32 = 9;
 
 /// Width of the depth image in pixels (paper, section 3.3).
 pub const IMAGE_WIDTH: usize = 128;
@@ -30,23 +29,24 @@ pub const IMAGE_WIDTH: usize = 128;
 pub const IMAGE_HEIGHT: usize = 72;
 /// Pixels, and bytes, of one 8-bit depth image.
 pub const IMAGE_PIXELS: usize = IMAGE_WIDTH * IMAGE_HEIGHT;
-/// Length of the longest latent code that `vae.latent` allows; records have room for it.
-pub const LONGEST_LATENT: usize = 64;
-/// Room for a latent code of any length. What lies behind a shorter one is zero.
-pub type LatentCode = [f32; LONGEST_LATENT];
+/// Length of the longest latent code that `vae.latent` allows. Records have room for it.
+pub const MAX_LATENT: usize = 64;
+/// Room for a latent code of any length. Values after a shorter code are zero.
+pub type LatentCode = [f32; MAX_LATENT];
 /// Length of an action: lateral and vertical velocity, each in [-1, 1].
 pub const ACTION: usize = 2;
-/// Numbers of what the simulator knows of a moment, [`transition::TransitionRecord::ground_truth`].
+/// Length of the simulator's ground truth, [`transition::TransitionRecord::ground_truth`].
 pub const GROUND_TRUTH: usize = 16;
-/// Length of what a critic gets of a moment that is told the ground truth: that, velocity `[3]`,
-/// tilt `[2]` and the action before.
-pub const TRUE_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
-/// Bounds of the logarithm of a policy's standard deviation, for actor and learner alike: beyond
+/// Length of the input of a critic that sees the ground truth: ground truth, velocity `[3]`, tilt
+/// `[2]` and previous action.
+pub const PRIVILEGED_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
+/// Bounds of the logarithm of a policy's standard deviation, for actor and learner alike. Beyond
 /// them tanh saturates or the noise vanishes (as in the authors' implementation of
 /// arXiv:1812.05905).
 pub const LOG_STD: (f32, f32) = (-20.0, 2.0);
 
-/// Sizes of the records that cross the transport; equal in processes that can read each other's.
+/// Returns the sizes of the records on the wire. Processes with equal sizes can read each other's
+/// records.
 pub fn record_layout() -> String {
     format!(
         "transition {} control {} segment {} status {} snapshot header {}",

@@ -1,13 +1,12 @@
-//! What an actor tells the learner besides its episodes: that it is there, and that it
-//! incarnations.
+//! The status of an actor: a heartbeat with its counters.
 
 use bytemuck::{Pod, Zeroable};
 
 use crate::ids::{ActorId, ActorIncarnation, PolicyVersion, RunId};
-use crate::stages::{ACTOR_STAGES, Tally, Times};
+use crate::stages::{ACTOR_STAGES, StageTime, StageTimes};
 
-/// Sign of incarnation of an actor, sent at its start, when it finds nothing to fly, at every
-/// heartbeat and at its end.
+/// Heartbeat of an actor on the wire. It is sent at the actor's start, when it finds no ticket to
+/// fly, at regular intervals, and at its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct StatusRecord {
@@ -19,8 +18,8 @@ pub struct StatusRecord {
     pid: u32,
     state: u32,
     reserved: u32,
-    /// By stage, in the order of [`crate::stages::Stage::ALL`].
-    times: [Tally; ACTOR_STAGES],
+    /// Times by stage, in the order of [`crate::stages::Stage::ALL`].
+    times: [StageTime; ACTOR_STAGES],
 }
 
 // Four 8-byte and four 4-byte fields, then tallies of two 8-byte fields: no padding.
@@ -33,31 +32,31 @@ pub struct ActorStatus {
     pub actor: ActorId,
     /// Its incarnation.
     pub incarnation: ActorIncarnation,
-    /// Its process.
+    /// Process id.
     pub pid: u32,
-    /// What it is about.
+    /// State.
     pub state: ActorState,
-    /// The newest snapshot it holds, if any.
+    /// The newest snapshot that it holds, if any.
     pub newest_policy: Option<PolicyVersion>,
-    /// Episodes it has flown in this incarnation.
+    /// Episodes flown in this incarnation.
     pub episodes_flown: u64,
-    /// What its time in this incarnation has gone into, until its last lap.
-    pub times: Times,
+    /// Times of this incarnation, up to its last lap.
+    pub times: StageTimes,
 }
 
-/// What an actor is about.
+/// State of an actor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ActorState {
-    /// Ready for tickets, or flying.
+    /// Accepts tickets, or flies one.
     Serving,
-    /// Takes no more tickets.
+    /// Accepts no more tickets.
     Leaving,
 }
 
 const NO_POLICY: u64 = u64::MAX;
 
 impl StatusRecord {
-    /// `status` on the wire.
+    /// Builds the record of `status`.
     pub fn new(run: RunId, status: &ActorStatus) -> Self {
         Self {
             run: run.0,
@@ -75,15 +74,15 @@ impl StatusRecord {
         }
     }
 
-    /// The status, or `None` when the record is of another run or holds what no actor of this
-    /// version writes: another state, times of years.
+    /// Reads the status; returns `None` if the record is of another run, or holds what no actor of
+    /// this version writes (unknown state, times of years).
     pub fn read(&self, run: RunId) -> Option<ActorStatus> {
         let state = match self.state {
             1 => ActorState::Serving,
             2 => ActorState::Leaving,
             _ => return None,
         };
-        let times = Times::read_actor(&self.times)?;
+        let times = StageTimes::read_actor(&self.times)?;
         (self.run == run.0).then_some(ActorStatus {
             actor: ActorId(self.actor),
             incarnation: ActorIncarnation(self.incarnation),
@@ -123,15 +122,15 @@ mod tests {
         }
     }
 
-    fn times(nanos: u64) -> Times {
-        let mut times = Times::default();
+    fn times(nanos: u64) -> StageTimes {
+        let mut times = StageTimes::default();
         times.add(Stage::TakeSnapshot, 1, Duration::from_nanos(nanos));
         times.add(Stage::ActorIdle, nanos, Duration::from_nanos(2));
         times
     }
 
     #[test]
-    fn times_that_no_actor_comes_to_are_refused() {
+    fn impossible_times_are_refused() {
         let read = |times| {
             let status = ActorStatus {
                 actor: ActorId(1),

@@ -1,9 +1,8 @@
-//! The ticket: everything an episode is a function of.
+//! The ticket: the complete input of an episode.
 //!
-//! An episode is flown only against a ticket, and two actors that hold the same ticket fly the same
-//! episode, bit for bit. The learner sends tickets inside [`ControlRecord`]s, fixed-size messages
-//! that actors listen to; those of [segments](crate::segment) inside [`SegmentRecord`]s, which have
-//! room for more.
+//! An episode is flown only for a ticket, and two actors with the same ticket fly the same episode,
+//! bit for bit. The learner sends tickets inside [`ControlRecord`]s, messages of fixed size;
+//! tickets of [segments](crate::segment) inside [`SegmentRecord`]s, which have more room.
 
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
@@ -11,22 +10,22 @@ use serde::{Deserialize, Serialize};
 use crate::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion, RunId};
 use crate::segment::{Segment, SegmentRecord};
 
-/// What an episode is flown for, how, where and with which policy.
+/// Ticket of an episode: its course, policy, exploration and seed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ticket {
     /// The run it belongs to.
     pub run: RunId,
     /// Its number.
     pub episode: EpisodeId,
-    /// How often this episode had been issued before.
+    /// Number of earlier attempts at this episode.
     pub attempt: Attempt,
-    /// The snapshot to hold for all that the ticket is for.
+    /// The snapshot to fly the whole ticket with.
     pub policy_version: PolicyVersion,
-    /// Where it is flown.
+    /// Course.
     pub course: CourseChoice,
-    /// The level (1 is the first) whose start it takes off from.
+    /// The level whose start the episode begins at, from 1.
     pub start_level: u8,
-    /// How actions are chosen.
+    /// Choice of actions.
     pub exploration: Exploration,
     /// Seed of everything random in the episode.
     pub seed: u64,
@@ -35,15 +34,15 @@ pub struct Ticket {
 }
 
 impl Ticket {
-    /// Steps of the episode that were flown on other tickets before.
+    /// Returns the number of steps flown on earlier tickets of this episode.
     pub fn first_step(&self) -> u32 {
         self.segment
             .as_ref()
-            .map_or(0, |segment| segment.flown.len() as u32)
+            .map_or(0, |segment| segment.prior_actions.len() as u32)
     }
 }
 
-/// Where an episode is flown.
+/// Course of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum CourseChoice {
     /// The training course.
@@ -54,7 +53,7 @@ pub enum CourseChoice {
     Generated(u64),
 }
 
-/// How actions are chosen.
+/// Choice of actions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Exploration {
     /// Uniformly at random, before the first update.
@@ -65,16 +64,16 @@ pub enum Exploration {
     Mode,
 }
 
-/// What the learner tells an actor.
+/// Message from the learner to an actor.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Control {
-    /// Fly this.
+    /// Fly this ticket.
     Fly(Ticket),
     /// The learner is alive.
     Heartbeat,
     /// The run is over: stop flying and exit.
     Stop,
-    /// Nothing of what this actor flies arrives: join anew.
+    /// No record of this actor arrives: join again.
     Rejoin,
 }
 
@@ -101,10 +100,10 @@ pub struct ControlRecord {
 // leaves the process.
 const _: () = assert!(size_of::<ControlRecord>() == 6 * 8 + 3 * 4 + 4);
 
-const EVERYONE: u32 = u32::MAX;
+const ALL_ACTORS: u32 = u32::MAX;
 
 impl ControlRecord {
-    /// `ticket` for all of its episode, for one incarnation of one actor.
+    /// Builds the record of `ticket` for a whole episode, for one incarnation of one actor.
     pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: ActorIncarnation) -> Self {
         let (course_kind, course_index, course_seed) = match ticket.course {
             CourseChoice::Training => (0, 0, 0),
@@ -132,26 +131,26 @@ impl ControlRecord {
         }
     }
 
-    /// A heartbeat to all actors.
+    /// Builds a heartbeat to all actors.
     pub fn heartbeat(run: RunId) -> Self {
-        Self::to_everyone(run, 0)
+        Self::broadcast(run, 0)
     }
 
-    /// The end of the run, to all actors.
+    /// Builds the end of the run, to all actors.
     pub fn stop(run: RunId) -> Self {
-        Self::to_everyone(run, 2)
+        Self::broadcast(run, 2)
     }
 
-    /// The request to one incarnation of one actor to join anew.
+    /// Builds the request to one incarnation of one actor to join again.
     pub fn rejoin(run: RunId, actor: ActorId, incarnation: ActorIncarnation) -> Self {
         Self {
             to_actor: actor.0,
             to_incarnation: incarnation.0,
-            ..Self::to_everyone(run, 3)
+            ..Self::broadcast(run, 3)
         }
     }
 
-    fn to_everyone(run: RunId, kind: u8) -> Self {
+    fn broadcast(run: RunId, kind: u8) -> Self {
         Self {
             run: run.0,
             to_incarnation: 0,
@@ -159,7 +158,7 @@ impl ControlRecord {
             policy_version: 0,
             course_seed: 0,
             seed: 0,
-            to_actor: EVERYONE,
+            to_actor: ALL_ACTORS,
             attempt: 0,
             course_index: 0,
             kind,
@@ -169,16 +168,16 @@ impl ControlRecord {
         }
     }
 
-    /// Whether this incarnation of this actor is meant.
+    /// Returns `true` if the message is for this incarnation of this actor.
     pub fn is_for(&self, actor: ActorId, incarnation: ActorIncarnation) -> bool {
-        self.to_actor == EVERYONE
+        self.to_actor == ALL_ACTORS
             || (self.to_actor == actor.0 && self.to_incarnation == incarnation.0)
     }
 
-    /// What is said.
+    /// Reads the message.
     ///
     /// # Errors
-    /// [`ControlFault`] when the record holds what no learner of this version and run writes.
+    /// [`ControlFault`] if the record holds what no learner of this version and run writes.
     pub fn read(&self, run: RunId) -> Result<Control, ControlFault> {
         if self.run != run.0 {
             return Err(ControlFault::OtherRun(self.run));
@@ -236,17 +235,17 @@ impl ControlRecord {
     }
 }
 
-/// A message to actors, for the service that has room for it.
+/// A message to actors, by the service that carries it.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Message {
-    /// Everything but tickets of segments.
+pub enum ControlMessage {
+    /// Everything except tickets of segments.
     Control(ControlRecord),
     /// The ticket of a segment.
     Segment(Box<SegmentRecord>),
 }
 
-impl Message {
-    /// `ticket`, for one incarnation of one actor.
+impl ControlMessage {
+    /// Builds the message with `ticket`, for one incarnation of one actor.
     pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: ActorIncarnation) -> Self {
         match &ticket.segment {
             None => Self::Control(ControlRecord::fly(ticket, actor, incarnation)),
@@ -259,7 +258,7 @@ impl Message {
         }
     }
 
-    /// Whether this incarnation of this actor is meant.
+    /// Returns `true` if the message is for this incarnation of this actor.
     pub fn is_for(&self, actor: ActorId, incarnation: ActorIncarnation) -> bool {
         match self {
             Self::Control(record) => record.is_for(actor, incarnation),
@@ -267,10 +266,10 @@ impl Message {
         }
     }
 
-    /// What is said.
+    /// Reads the message.
     ///
     /// # Errors
-    /// [`ControlFault`] when the message holds what no learner of this version and run writes.
+    /// [`ControlFault`] if the message holds what no learner of this version and run writes.
     pub fn read(&self, run: RunId) -> Result<Control, ControlFault> {
         match self {
             Self::Control(record) => record.read(run),
@@ -279,13 +278,13 @@ impl Message {
     }
 }
 
-/// Why a control record is not believed.
+/// Reason why a control record is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum ControlFault {
-    /// It belongs to another run.
+    /// The record belongs to another run.
     #[error("control record of run {0:016x}")]
     OtherRun(u64),
-    /// A field has a value this version does not know.
+    /// A field has an unknown value.
     #[error("control record with {name} = {value}")]
     Field {
         /// The field.
@@ -293,7 +292,7 @@ pub enum ControlFault {
         /// Its value.
         value: u8,
     },
-    /// The ticket of a segment makes no sense.
+    /// The ticket of a segment is invalid.
     #[error("the ticket of a segment {0}")]
     Segment(&'static str),
 }

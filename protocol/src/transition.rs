@@ -1,10 +1,9 @@
 //! The transition record: one step of an episode, as it lies in shared memory.
 //!
-//! An episode of T steps is T+1 records, and so is a segment of one. Record t holds the observation
-//! at step t, the action chosen on it, and the reward and end flags that followed; the closing
-//! record holds the last observation only. The depth camera renders into
-//! [`TransitionRecord::depth`] of a loaned sample, and the learner reads it there: the image's
-//! bytes are written once.
+//! An episode or segment of T steps is T+1 records. Record t holds the observation at step t, the
+//! action chosen on it, and the reward and end flags that followed; the closing record holds only
+//! the last observation. The depth camera renders into [`TransitionRecord::depth`] of a loaned
+//! sample, and the learner reads it there: the image's bytes are written once.
 
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
@@ -13,12 +12,12 @@ use crate::ids::{ActorId, ActorIncarnation};
 use crate::ticket::Ticket;
 use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
 
-/// No number of a sound record is larger: rewards end at 4 · 10⁶ by their settings, corridors at 1
-/// km. The learner squares what it learns from, and single precision ends at 3 · 10³⁸.
-pub const LARGEST_NUMBER: f32 = 1e7;
+/// Largest magnitude in a valid record: the settings limit rewards to 4 · 10⁶ and corridors to 1
+/// km. The learner squares its inputs, and single precision ends at 3 · 10³⁸.
+pub const MAX_MAGNITUDE: f32 = 1e7;
 
 /// One step of an episode on the wire. Every bit pattern is a valid value of every field's type;
-/// [`TransitionRecord::check`] says whether it makes sense.
+/// [`TransitionRecord::check`] checks the meaning.
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
 pub struct TransitionRecord {
@@ -26,22 +25,22 @@ pub struct TransitionRecord {
     pub run: u64,
     /// The episode.
     pub episode: u64,
-    /// The snapshot that all of the ticket is flown with.
+    /// The snapshot that the whole ticket is flown with.
     pub policy_version: u64,
     /// The actor's incarnation.
     pub incarnation: u64,
     /// The actor.
     pub actor: u32,
-    /// The ticket's attempt: tells an episode flown again from its late twin.
+    /// The ticket's attempt. It distinguishes an episode flown again from a late copy.
     pub attempt: u32,
-    /// Position in the episode, from 0 without a gap, segments flown before included; the closing
-    /// record counts too.
+    /// Step within the episode, from 0 without a gap. Earlier segments and the closing record
+    /// count.
     pub step: u32,
     /// A [`RecordKind`].
     pub kind: u8,
-    /// The level the episode took off from.
+    /// The level whose start the episode begins at.
     pub start_level: u8,
-    /// Walls passed in the episode so far, this step's included.
+    /// Walls passed in the episode so far, this step included.
     pub walls_passed: u8,
     /// An [`Outcome`], in the closing record.
     pub outcome: u8,
@@ -51,7 +50,7 @@ pub struct TransitionRecord {
     pub orientation: [f32; 4],
     /// Velocity in the world in metres per second: forward, left, up.
     pub velocity_mps: [f32; 3],
-    /// The VAE's latent mean of `depth`; zero from `vae.latent` on.
+    /// The VAE's latent mean of `depth`; zero from index `vae.latent` on.
     pub latent: LatentCode,
     /// Lateral and vertical velocity command, each in [-1, 1].
     pub action: [f32; ACTION],
@@ -59,59 +58,59 @@ pub struct TransitionRecord {
     pub reward: f32,
     /// The paper's four terms: collision, level-up, destination, open view.
     pub reward_terms: [f32; 4],
-    /// 1 when a wall was crossed or the destination reached in this step.
+    /// 1 if a wall was crossed or the destination reached in this step.
     pub level_up: u8,
-    /// 1 when the episode ended in this step in a state without a future (collision, destination).
+    /// 1 if the episode ended in this step in a state without a future (collision, destination).
     pub terminated: u8,
-    /// 1 when the episode was cut off in this step by its step limit; its value still bootstraps.
+    /// 1 if the step limit ended the episode in this step; its value still bootstraps.
     pub truncated: u8,
-    /// Walls of the course, in the closing record: what `walls_passed` is measured against.
+    /// Walls of the course, in the closing record: the maximum of `walls_passed`.
     pub course_walls: u8,
-    /// In the closing record of an episode that collided: the wall that was hit, from 1 in course
-    /// order, or 0 for the corridor. 0 in all others.
+    /// The wall that was hit, from 1 in course order, in the closing record of an episode that
+    /// collided; 0 for the corridor and in all other records.
     pub hit_wall: u8,
     reserved: [u8; 7],
-    /// What the simulator knows of the observation's moment and the camera does not see; see
-    /// [`CriticInput::GroundTruth`](crate::config::CriticInput::GroundTruth).
+    /// The simulator's ground truth at the time of the observation, which the camera does not see;
+    /// see [`CriticInput::GroundTruth`](crate::config::CriticInput::GroundTruth).
     pub ground_truth: [f32; GROUND_TRUTH],
-    /// The depth image, 128×72, row by row from the top left; 255 is the camera's range or farther.
-    /// On a cache line of its own.
+    /// Depth image, 128×72, row by row from the top left; 255 is the camera's range or farther. It
+    /// starts on a cache line.
     pub depth: [u8; IMAGE_PIXELS],
 }
 
-// The header is seven cache lines, so that in samples aligned to one (see `services`) the image
-// starts on one; nothing is padding, so that the record is plain data.
+// The header is seven cache lines, so the image starts on a cache line in samples aligned to one
+// (see `services`). There is no padding, so the record is plain data.
 const _: () = assert!(std::mem::offset_of!(TransitionRecord, depth) == 448);
 const _: () = assert!(size_of::<TransitionRecord>() == 448 + IMAGE_PIXELS);
 const _: () = assert!(align_of::<TransitionRecord>() == 8);
 
-/// What a record is within its episode.
+/// Role of a record within its episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RecordKind {
-    /// An observation, the action on it and what followed.
+    /// An observation, the action on it and the consequences.
     Step,
-    /// The last observation; ends the episode.
+    /// The last observation of an episode.
     Closing,
-    /// The last observation of a segment whose episode goes on.
+    /// The last observation of a segment whose episode continues.
     SegmentEnd,
-    /// The episode broke off by a fault in the simulator; what was sent of it is void.
+    /// The simulator failed; the episode's earlier records are void.
     Failed,
 }
 
-/// How an episode ended.
+/// Outcome of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// Touched a wall or the corridor.
     Collided,
-    /// Touched the end wall: the course is passed.
+    /// Reached the end wall: the course is passed.
     ReachedEnd,
-    /// Reached the step limit in the air.
+    /// Reached the step limit while flying.
     TimedOut,
 }
 
 impl Outcome {
-    /// As on the wire.
+    /// Returns the code on the wire.
     pub fn code(self) -> u8 {
         match self {
             Self::Collided => 1,
@@ -120,14 +119,14 @@ impl Outcome {
         }
     }
 
-    /// From the wire; `None` for what is no outcome.
+    /// Reads a code from the wire; returns `None` if it is not an outcome.
     pub fn from_code(code: u8) -> Option<Self> {
         [Self::Collided, Self::ReachedEnd, Self::TimedOut]
             .into_iter()
             .find(|outcome| outcome.code() == code)
     }
 
-    /// As in `episodes.csv`.
+    /// Returns the name in `episodes.csv`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Collided => "collided",
@@ -138,7 +137,7 @@ impl Outcome {
 }
 
 impl RecordKind {
-    /// As on the wire.
+    /// Returns the code on the wire.
     pub fn code(self) -> u8 {
         match self {
             Self::Step => 1,
@@ -148,7 +147,7 @@ impl RecordKind {
         }
     }
 
-    /// From the wire; `None` for what is no kind.
+    /// Reads a code from the wire; returns `None` if it is not a kind.
     pub fn from_code(code: u8) -> Option<Self> {
         [Self::Step, Self::Closing, Self::Failed, Self::SegmentEnd]
             .into_iter()
@@ -157,8 +156,8 @@ impl RecordKind {
 }
 
 impl TransitionRecord {
-    /// Writes who flies what; everything but the image is reset. The image is left as it is, to be
-    /// rendered over.
+    /// Writes the header for `step` of `ticket` and clears everything else except the image, which
+    /// is rendered over.
     pub fn begin(
         &mut self,
         ticket: &Ticket,
@@ -178,8 +177,8 @@ impl TransitionRecord {
         self.start_level = ticket.start_level;
     }
 
-    /// The record's kind, if it makes sense as step `step` of `ticket` flown by `incarnation` of
-    /// `actor`.
+    /// Returns the record's kind if it is valid as step `step` of `ticket` flown by `incarnation`
+    /// of `actor`.
     ///
     /// # Errors
     /// [`RecordFault`] names the field; such a record is never learned from.
@@ -230,7 +229,7 @@ impl TransitionRecord {
         Ok(kind)
     }
 
-    /// Whether the latent code is not longer than `latent` numbers.
+    /// Checks that the latent code is not longer than `latent` numbers.
     ///
     /// # Errors
     /// [`RecordFault::Contradiction`]; such a record was made with another encoder.
@@ -244,9 +243,9 @@ impl TransitionRecord {
     }
 
     fn check_numbers(&self) -> Result<(), RecordFault> {
-        let usual = -LARGEST_NUMBER..=LARGEST_NUMBER;
-        // A NaN is in no range.
-        let finite = |name, values: &[f32]| match values.iter().find(|value| !usual.contains(value))
+        let range = -MAX_MAGNITUDE..=MAX_MAGNITUDE;
+        // NaN is outside every range.
+        let finite = |name, values: &[f32]| match values.iter().find(|value| !range.contains(value))
         {
             None => Ok(()),
             Some(value) if value.is_finite() => Err(RecordFault::TooLarge {
@@ -264,7 +263,7 @@ impl TransitionRecord {
         finite("reward", &[self.reward])?;
         finite("reward_terms", &self.reward_terms)?;
         let terms = self.reward_terms;
-        // Added up as the actor does, so that the sums are the same to the last bit.
+        // Summed in the actor's order, so that the sums are bit-equal.
         if self.reward != terms[0] + terms[1] + terms[2] + terms[3] {
             return Err(RecordFault::Contradiction {
                 what: "the reward is not the sum of its terms",
@@ -307,8 +306,8 @@ impl TransitionRecord {
         Err(RecordFault::Code { name, value })
     }
 
-    /// Whether `hit_wall` is none, or one that an episode which collided could reach: no farther
-    /// than the first that it has not passed.
+    /// Returns `true` if `hit_wall` is 0, or a wall that an episode which collided could reach: at
+    /// most the first one that it has not passed.
     fn may_have_hit_wall(&self) -> bool {
         let next = u32::from(self.start_level) + u32::from(self.walls_passed);
         let reachable = next.min(self.course_walls.into());
@@ -317,20 +316,20 @@ impl TransitionRecord {
     }
 }
 
-/// Why a record is not believed.
+/// Reason why a record is refused.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum RecordFault {
-    /// It belongs to something else, or has a gap before it.
-    #[error("{name} is {found} where {expected} is expected")]
+    /// The record belongs elsewhere, or records before it are missing.
+    #[error("{name} is {found}, expected {expected}")]
     Mismatch {
         /// The field.
         name: &'static str,
         /// Its value.
         found: u64,
-        /// The value it should have.
+        /// The expected value.
         expected: u64,
     },
-    /// A field has a value that no episode gives it.
+    /// A field has a value that no episode produces.
     #[error("{name} has the impossible value {value}")]
     Code {
         /// The field.
@@ -338,33 +337,33 @@ pub enum RecordFault {
         /// Its value.
         value: u8,
     },
-    /// A field holds an infinity or no number.
+    /// A field is infinite or NaN.
     #[error("{name} is not finite")]
     NotFinite {
         /// The field.
         name: &'static str,
     },
-    /// A field holds a number beyond anything that is simulated.
-    #[error("{name} holds {value}, beyond {LARGEST_NUMBER}")]
+    /// A field exceeds every simulated value.
+    #[error("{name} holds {value}, beyond {MAX_MAGNITUDE}")]
     TooLarge {
         /// The field.
         name: &'static str,
         /// The number.
         value: f32,
     },
-    /// The episode goes on and on.
+    /// The episode is too long.
     #[error("the episode has more than the {most} records of transport.max_records_per_episode")]
     TooLong {
         /// Records of the longest episode.
         most: usize,
     },
-    /// It contradicts itself or the records before it.
+    /// The record contradicts itself or earlier records.
     #[error("{what}")]
     Contradiction {
-        /// What cannot be.
+        /// The contradiction.
         what: &'static str,
     },
-    /// An action no policy of ours chooses.
+    /// An action that no policy of Skein chooses.
     #[error("action {action:?} is outside [-1, 1]")]
     ActionOutOfRange {
         /// The action.
@@ -375,7 +374,7 @@ pub enum RecordFault {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::LONGEST_LATENT;
+    use crate::MAX_LATENT;
     use crate::ids::{Attempt, EpisodeId, PolicyVersion, RunId};
     use crate::ticket::{CourseChoice, Exploration};
 
@@ -456,7 +455,7 @@ mod tests {
         let mut record = record();
         record.latent[..16].fill(0.5);
         assert_eq!(record.check_latent(16), Ok(()));
-        assert_eq!(record.check_latent(LONGEST_LATENT), Ok(()));
+        assert_eq!(record.check_latent(MAX_LATENT), Ok(()));
         for value in [1e-30, f32::NAN] {
             record.latent[15] = value;
             let refused = record.check_latent(15).unwrap_err().to_string();

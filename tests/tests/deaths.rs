@@ -123,7 +123,7 @@ fn survives_loss_of(remove: impl Fn(&RunningRun, &RunIdentity)) {
     assert!(disturbed.summary().resumes > 0, "{:?}", disturbed.summary());
     let terminal = &disturbed.output.stderr;
     assert!(
-        terminal.contains("was removed") && terminal.contains("leave what is called skein alone"),
+        terminal.contains("was removed") && terminal.contains("do not remove skein's files"),
         "{terminal}"
     );
 }

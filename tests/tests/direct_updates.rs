@@ -7,7 +7,7 @@
 )]
 
 use rustix::process::Signal;
-use skein_protocol::summary::Ending;
+use skein_protocol::summary::RunEnding;
 use skein_tests::{EndedRun, Role, RunRecipe};
 
 /// A run with an update after every step, and a checkpoint every five episodes.
@@ -92,7 +92,7 @@ fn a_stopped_run_completes_its_episode_and_loses_nothing() {
     run.until_ended();
     let summary: skein_protocol::summary::Summary =
         serde_json::from_slice(&std::fs::read(run.directory().summary_json()).unwrap()).unwrap();
-    assert_eq!(summary.ending, Ending::Interrupted);
+    assert_eq!(summary.ending, RunEnding::Interrupted);
     assert!(summary.episodes >= 25, "{summary:?}");
     run.resume(3);
     run.finish()

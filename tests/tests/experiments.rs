@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 use skein_chaos::compare;
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::summary::Ending;
+use skein_protocol::summary::RunEnding;
 use skein_run::RunDirectory;
 use skein_tests::{
     ProgramOutput, RunRecipe, episodes, leftovers, program, repository, run_program,
@@ -115,7 +115,7 @@ fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
 
 fn completed(run: &RunDirectory) -> bool {
     run.summary()
-        .is_some_and(|summary| summary.ending == Ending::Completed)
+        .is_some_and(|summary| summary.ending == RunEnding::Completed)
 }
 
 #[test]

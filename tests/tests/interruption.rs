@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::summary::Ending;
+use skein_protocol::summary::RunEnding;
 use skein_tests::{RunRecipe, RunningRun, leftovers, processes_of};
 
 /// Exit status that a shell reports for a program ended by Ctrl-C: 128 + SIGINT.
@@ -36,7 +36,7 @@ fn the_first_interruption_saves_everything_learned() {
     ended.assert_nothing_is_left();
 
     let summary = ended.summary();
-    assert_eq!(summary.ending, Ending::Interrupted);
+    assert_eq!(summary.ending, RunEnding::Interrupted);
     assert!(summary.episodes >= 20 && summary.updates > 0, "{summary:?}");
     let (latest, _) = Snapshot::load(&ended.directory.latest_snapshot()).unwrap();
     assert_eq!(latest.sha256(), summary.policy_sha256);

@@ -7,7 +7,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_learner::episode::{CommittedEpisode, StepObservation};
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
-use skein_protocol::{ACTION, IMAGE_PIXELS, LONGEST_LATENT};
+use skein_protocol::{ACTION, IMAGE_PIXELS, MAX_LATENT};
 use skein_simulator::course::{
     Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout,
 };
@@ -71,7 +71,7 @@ fn fly(side: f32) -> CommittedEpisode {
         depth.extend_from_slice(&image);
         let state = simulator.state();
         observations.push(StepObservation {
-            latent: [0.0; LONGEST_LATENT],
+            latent: [0.0; MAX_LATENT],
             velocity_mps: state.velocity_mps.into(),
             position_m: state.position_m.coords.into(),
             orientation: state.world_from_body.coords.into(),

@@ -114,7 +114,7 @@ fn the_native_policy_equals_the_learners() {
         let mut layout = Layout::default();
         let policy = Policy::describe(
             &mut layout,
-            config.view().len() as i64,
+            config.observation_layout().len() as i64,
             config.sac.hidden_width as i64,
         );
         let parameters = Parameters::initialise(layout, seed, Device::Cpu);
@@ -122,7 +122,7 @@ fn the_native_policy_equals_the_learners() {
             parameters.copy_range(0..into.len(), into)
         });
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
-        let observed: Vec<f32> = (0..config.view().len())
+        let observed: Vec<f32> = (0..config.observation_layout().len())
             .map(|_| rng.random_range(-3.0..3.0))
             .collect();
         let (mean, log_std) =
@@ -141,7 +141,7 @@ fn both_bound_an_extreme_standard_deviation_alike() {
     let mut layout = Layout::default();
     let policy = Policy::describe(
         &mut layout,
-        config.view().len() as i64,
+        config.observation_layout().len() as i64,
         config.sac.hidden_width as i64,
     );
     let mut parameters = Parameters::initialise(layout, 0, Device::Cpu);
@@ -158,7 +158,7 @@ fn both_bound_an_extreme_standard_deviation_alike() {
     let network = network(&config, &vae(&config, 0), |into| {
         parameters.copy_range(0..into.len(), into)
     });
-    let observed = vec![0.5; config.view().len()];
+    let observed = vec![0.5; config.observation_layout().len()];
     let (_, log_std) =
         policy.distribution(&parameters, &Tensor::from_slice(&observed).unsqueeze(0));
     let [_, native_log_std] = gaussian(&network, &observed);
@@ -169,7 +169,10 @@ fn both_bound_an_extreme_standard_deviation_alike() {
 fn a_published_policy_acts_as_in_the_learner() {
     for observation in OBSERVATIONS {
         let config = config(observation);
-        let (inputs, observed) = (Inputs::of(&config), vec![0.3; config.view().len()]);
+        let (inputs, observed) = (
+            Inputs::of(&config),
+            vec![0.3; config.observation_layout().len()],
+        );
         let flies_as = |sac: &dyn Algorithm, learner: &[f32]| {
             let network = network(&config, &vae(&config, 9), |into| sac.publish(into));
             let actor = network

@@ -20,7 +20,7 @@ use skein_learner::episodes::dispatcher::{BatchPlace, Dispatcher, EpisodeOrder};
 use skein_learner::episodes::receiver::EpisodeReceiver;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, Epoch, PolicyVersion};
-use skein_protocol::stages::Times;
+use skein_protocol::stages::StageTimes;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind};
@@ -159,7 +159,7 @@ fn status(actor: ActorId, incarnation: ActorIncarnation) -> ActorStatus {
         state: ActorState::Serving,
         newest_policy: None,
         episodes_flown: 0,
-        times: Times::default(),
+        times: StageTimes::default(),
     }
 }
 

@@ -12,8 +12,8 @@ use std::process::Command;
 
 use skein_protocol::config::Config;
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::stages::{Stage, Thread};
-use skein_protocol::summary::Ending;
+use skein_protocol::stages::{Stage, ThreadRole};
+use skein_protocol::summary::RunEnding;
 use skein_tests::{EndedRun, RunRecipe};
 
 #[test]
@@ -124,7 +124,7 @@ fn the_summary_agrees_with_the_episodes(run: &EndedRun) {
         "{commit}"
     );
     assert_eq!(summary.seed, 7);
-    assert_eq!(summary.ending, Ending::Completed);
+    assert_eq!(summary.ending, RunEnding::Completed);
     assert_eq!(summary.final_version.0, 4);
     assert_eq!(summary.episodes, episodes.len() as u64);
     assert_eq!(
@@ -180,7 +180,7 @@ fn the_stages_agree_with_the_counts(run: &EndedRun) {
     // One for the initial parameters.
     assert_eq!(count(Stage::Publish), summary.final_version.0 + 1);
     assert_eq!(count(Stage::Recode), 1);
-    let (training, receiving) = (secs(Thread::Training), secs(Thread::Receiving));
+    let (training, receiving) = (secs(ThreadRole::Training), secs(ThreadRole::Receiving));
     assert!(
         (summary.wall_secs - training).abs() < 0.1,
         "{training} s of {summary:?}"
@@ -189,7 +189,7 @@ fn the_stages_agree_with_the_counts(run: &EndedRun) {
         receiving > 0.5 * training && receiving <= summary.wall_secs,
         "{receiving} s of {summary:?}"
     );
-    let actors = secs(Thread::Actors);
+    let actors = secs(ThreadRole::Actors);
     assert!(
         actors > 0.5 * training && actors <= 2.0 * summary.wall_secs,
         "{actors} s of {summary:?}"

@@ -1,5 +1,5 @@
-//! What the benchmarks of whole actors share: a run of the default configuration whose learner is
-//! the benchmark itself.
+//! Shared parts of the actor benchmarks: a run of the default configuration whose learner is the
+//! benchmark itself.
 
 use std::path::Path;
 
@@ -12,25 +12,22 @@ use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 use skein_run::{LearnerLock, RunDirectory, RunIdentity};
 use skein_transport::LearnerPorts;
 
-/// As in `local.toml`.
+/// Observation of `local.toml`.
 pub(crate) const OBSERVATION: Observation = Observation::LatentVelocity;
 
-/// A run whose only learner is this process.
+/// Run whose only learner is this process.
 pub(crate) struct Learner {
     pub(crate) identity: RunIdentity,
     pub(crate) config: Config,
     pub(crate) ports: LearnerPorts,
     _lock: LearnerLock,
-    #[allow(
-        dead_code,
-        reason = "only the benchmark that starts a process says where"
-    )]
+    #[allow(dead_code, reason = "only the benchmark that starts a process uses it")]
     pub(crate) directory: tempfile::TempDir,
 }
 
 impl Learner {
     pub(crate) fn open() -> Self {
-        let directory = tempfile::tempdir().expect("there is room for a configuration");
+        let directory = tempfile::tempdir().expect("a temporary directory can be created");
         let run = RunDirectory::new(directory.path());
         let mut config = Config::default();
         config.learning.observation = OBSERVATION;
@@ -38,8 +35,8 @@ impl Learner {
         config.courses.training = courses.join("training.toml");
         config.courses.evaluation = vec![courses.join("training.toml")];
         run.create(&config).expect("the directory is new");
-        let (identity, config) = run.open().expect("it was just created");
-        let lock = LearnerLock::take(&run, &identity).expect("nobody else knows of it");
+        let (identity, config) = run.open().expect("the run was just created");
+        let lock = LearnerLock::take(&run, &identity).expect("no other process uses the run");
         let ports = LearnerPorts::open(&identity, lock.incarnation(), &config)
             .expect("services can be created");
         Self {
@@ -51,8 +48,8 @@ impl Learner {
         }
     }
 
-    /// Of random parameters, uniform in about PyTorch's default range: numbers of ordinary size run
-    /// through all layers.
+    /// Returns a snapshot with parameters uniform in about PyTorch's default range, so that all
+    /// layers compute with numbers of ordinary size.
     pub(crate) fn snapshot(&self) -> Snapshot {
         let layout = SnapshotLayout::of(&self.config);
         let mut rng = Pcg64Mcg::seed_from_u64(1);
@@ -70,7 +67,7 @@ impl Learner {
     }
 }
 
-/// A training episode with that snapshot.
+/// Returns a ticket of a training episode with that snapshot.
 pub(crate) fn ticket(run: RunId, episode: u64, level: u8) -> Ticket {
     Ticket {
         run,

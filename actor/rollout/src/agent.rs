@@ -1,8 +1,8 @@
-//! The agent: what it sees, and what it does about it.
+//! The agent: from camera image to action.
 
 use rand::{Rng, RngExt};
 use skein_protocol::ACTION;
-use skein_protocol::config::View;
+use skein_protocol::config::ObservationLayout;
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Exploration;
 use skein_protocol::transition::TransitionRecord;
@@ -10,30 +10,29 @@ use skein_simulator::simulator::Simulator;
 
 use skein_inference::{Network, Scratch};
 
-/// Working memory of one thread that looks and acts.
+/// Working memory of one thread that observes and acts.
 #[derive(Debug)]
 pub struct Agent {
-    view: View,
-    /// What was seen of each moment of the episode so far, `[steps, View::moment_len]`.
-    moments: Vec<f32>,
-    /// The policy's input, `[View::len]`.
+    layout: ObservationLayout,
+    /// Inputs of the episode's steps so far, `[steps, ObservationLayout::step_len]`.
+    step_inputs: Vec<f32>,
+    /// The policy's input, `[ObservationLayout::len]`.
     observed: Vec<f32>,
     scratch: Scratch,
 }
 
 impl Agent {
-    /// An agent whose policy sees `view`.
-    pub fn new(view: View) -> Self {
+    /// Creates an agent whose policy sees `layout`.
+    pub fn new(layout: ObservationLayout) -> Self {
         Self {
-            moments: Vec::new(),
-            observed: vec![0.0; view.len()],
-            view,
+            step_inputs: Vec::new(),
+            observed: vec![0.0; layout.len()],
+            layout,
             scratch: Scratch::default(),
         }
     }
 
-    /// Looks through the drone's camera: the image is rendered into `record`, wherever that lies,
-    /// and encoded from there. `lap` is called after each.
+    /// Renders the camera image into `record` and encodes it there. `lap` is called after each.
     pub fn observe(
         &mut self,
         simulator: &mut Simulator,
@@ -52,9 +51,9 @@ impl Agent {
         lap(Stage::Encoder);
     }
 
-    /// Chooses an action on the observation in `record`, each command in [-1, 1]. `noise` is drawn
-    /// from unless the policy's mode is asked for. Called for each step of an episode, in order;
-    /// the record of step 0 begins another one.
+    /// Chooses an action for the observation in `record`, each command in [-1, 1]. `noise` is used
+    /// unless the policy's mode is asked for. Call it for each step of an episode, in order; step 0
+    /// starts a new episode.
     pub fn act(
         &mut self,
         exploration: Exploration,
@@ -66,14 +65,14 @@ impl Agent {
         self.remember(record, previous_action);
         let mut distribution = || {
             let Self {
-                view,
-                moments,
+                layout,
+                step_inputs,
                 observed,
                 scratch,
             } = self;
-            let len = view.moment_len();
-            view.write(record.step as usize, observed, |step, into| {
-                into.copy_from_slice(&moments[step * len..][..len]);
+            let len = layout.step_len();
+            layout.write(record.step as usize, observed, |step, into| {
+                into.copy_from_slice(&step_inputs[step * len..][..len]);
             });
             network.distribution(observed, scratch)
         };
@@ -84,17 +83,16 @@ impl Agent {
         }
     }
 
-    /// Keeps what is seen of the moment in `record`, and forgets what was seen in an earlier
-    /// episode.
+    /// Stores the input of the step in `record`, and drops the inputs of earlier episodes.
     fn remember(&mut self, record: &TransitionRecord, previous_action: &[f32; ACTION]) {
-        let len = self.view.moment_len();
+        let len = self.layout.step_len();
         let first = record.step as usize * len;
-        self.moments.resize(first + len, 0.0);
-        self.view.write_moment(
+        self.step_inputs.resize(first + len, 0.0);
+        self.layout.write_step(
             &record.latent,
             &record.velocity_mps,
             previous_action,
-            &mut self.moments[first..],
+            &mut self.step_inputs[first..],
         );
     }
 }

@@ -1,4 +1,4 @@
-//! The courses of a run, and a simulator for each, built when a ticket first asks for it.
+//! The courses of a run, and a simulator for each, built when a ticket first names it.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -13,7 +13,7 @@ use skein_simulator::disturbances::DisturbanceSettingsError;
 use skein_simulator::simulator::{Simulator, SimulatorError, SimulatorSettings};
 use skein_simulator::suite::{EntryCourses, Suite, SuiteEntry};
 
-/// The courses a ticket may name, and how they are flown. Shared by the threads that fly them.
+/// Courses that a ticket may name, with simulator settings. Shared by all threads.
 #[derive(Debug)]
 pub struct Courses {
     settings: SimulatorSettings,
@@ -21,13 +21,13 @@ pub struct Courses {
     evaluation: Vec<EvaluationEntry>,
 }
 
-/// What a ticket of [`CourseChoice::Evaluation`] names: a course, or several that its episodes fly
-/// in turn.
+/// Evaluation entry, named by a ticket of [`CourseChoice::Evaluation`]: one course, or several that
+/// its episodes fly in turn.
 #[derive(Debug)]
 pub struct EvaluationEntry {
-    /// Courses, and what reports call them.
+    /// Courses, and their name in reports.
     pub entry: SuiteEntry,
-    /// How they are flown: the run's settings with the entry's disturbances.
+    /// Simulator settings: the run's, with the entry's disturbances.
     settings: SimulatorSettings,
 }
 
@@ -35,16 +35,15 @@ pub struct EvaluationEntry {
 pub struct Simulators {
     courses: Arc<Courses>,
     fixed: HashMap<CourseChoice, Simulator>,
-    /// Where every episode has a course of its own, only the last is kept: a ticket issued again
-    /// may come back to it.
-    passing: Option<(Passing, Simulator)>,
+    /// The last simulator of a course that one episode flies: a reissued ticket may need it again.
+    one_off: Option<(OneOffCourse, Simulator)>,
 }
 
-/// A course that is flown once or seldom: the choice, and its number within that.
-type Passing = (CourseChoice, u64);
+/// A course flown once or rarely: the choice, and its number within that choice.
+type OneOffCourse = (CourseChoice, u64);
 
 impl Courses {
-    /// The courses that a run's configuration names.
+    /// Loads the courses that a run's configuration names.
     ///
     /// # Errors
     /// [`CoursesError`] names the file or the key.
@@ -55,7 +54,7 @@ impl Courses {
         })
     }
 
-    /// The courses in the files `paths`, as evaluation courses flown as in the run, and no others.
+    /// Loads the files `paths` as the only evaluation courses, with the run's simulator settings.
     ///
     /// # Errors
     /// [`CoursesError`] names the file or the key.
@@ -84,7 +83,7 @@ impl Courses {
         })
     }
 
-    /// What `suite` names, with the run's drone and camera and the suite's disturbances.
+    /// Loads the entries of `suite`, with the run's drone and camera and the suite's disturbances.
     ///
     /// # Errors
     /// [`CoursesError`] names the key.
@@ -116,7 +115,7 @@ impl Courses {
         })
     }
 
-    /// The same with `episodes` evaluation episodes of each entry.
+    /// Sets the number of evaluation episodes of each entry.
     #[must_use]
     pub fn with_episodes(mut self, episodes: u64) -> Self {
         for evaluated in &mut self.evaluation {
@@ -125,31 +124,35 @@ impl Courses {
         self
     }
 
-    /// What evaluations fly, in order.
+    /// Returns the evaluation entries, in order.
     pub fn evaluation(&self) -> impl ExactSizeIterator<Item = &SuiteEntry> {
         self.evaluation.iter().map(|evaluated| &evaluated.entry)
     }
 
-    /// How training is flown, and what evaluations of files add nothing to.
+    /// Returns the run's simulator settings.
     pub fn settings(&self) -> &SimulatorSettings {
         &self.settings
     }
 
-    fn entry(&self, choice: CourseChoice, index: u32) -> Result<&EvaluationEntry, NoCourse> {
+    fn entry(
+        &self,
+        choice: CourseChoice,
+        index: u32,
+    ) -> Result<&EvaluationEntry, CourseChoiceError> {
         self.evaluation
             .get(index as usize)
-            .ok_or(NoCourse::NotLoaded { choice })
+            .ok_or(CourseChoiceError::NotLoaded { choice })
     }
 
-    /// A simulator of the course that `ticket` names.
-    fn build(&self, ticket: &Ticket) -> Result<Simulator, NoCourse> {
+    /// Builds a simulator of the course that `ticket` names.
+    fn build(&self, ticket: &Ticket) -> Result<Simulator, CourseChoiceError> {
         let choice = ticket.course;
         let (course, settings) = match choice {
             CourseChoice::Training => {
                 let course = self
                     .training
                     .clone()
-                    .ok_or(NoCourse::NotLoaded { choice })?;
+                    .ok_or(CourseChoiceError::NotLoaded { choice })?;
                 (course, &self.settings)
             }
             CourseChoice::Evaluation(index) => {
@@ -167,8 +170,8 @@ impl Courses {
         Ok(Simulator::new(course, settings)?)
     }
 
-    /// What tells the ticket's course from others that pass; `None` if it is flown again and again.
-    fn passing(&self, ticket: &Ticket) -> Result<Option<Passing>, NoCourse> {
+    /// Returns the key of a one-off course; `None` for a course that is flown again and again.
+    fn one_off(&self, ticket: &Ticket) -> Result<Option<OneOffCourse>, CourseChoiceError> {
         let choice = ticket.course;
         Ok(match choice {
             CourseChoice::Training => None,
@@ -181,8 +184,7 @@ impl Courses {
     }
 }
 
-/// The episode's number within its evaluation, from 0: the one that says which of several courses
-/// it flies.
+/// Returns the episode's number within its evaluation, from 0. It selects one of several courses.
 fn evaluation_episode(ticket: &Ticket) -> u64 {
     ticket
         .episode
@@ -191,36 +193,36 @@ fn evaluation_episode(ticket: &Ticket) -> u64 {
 }
 
 impl Simulators {
-    /// No simulator yet of any of `courses`.
+    /// Starts without simulators: each is built at its first use.
     pub fn new(courses: Arc<Courses>) -> Self {
         Self {
             courses,
             fixed: HashMap::new(),
-            passing: None,
+            one_off: None,
         }
     }
 
-    /// How courses are flown.
+    /// Returns the run's simulator settings.
     pub fn settings(&self) -> &SimulatorSettings {
         self.courses.settings()
     }
 
-    /// The simulator of the course a ticket names.
+    /// Returns the simulator of the course that a ticket names.
     ///
     /// # Errors
-    /// [`NoCourse`] says what is wrong with the choice.
-    pub fn of(&mut self, ticket: &Ticket) -> Result<&mut Simulator, NoCourse> {
+    /// [`CourseChoiceError`] says what is wrong with the choice.
+    pub fn of(&mut self, ticket: &Ticket) -> Result<&mut Simulator, CourseChoiceError> {
         let Self {
             courses,
             fixed,
-            passing,
+            one_off,
         } = self;
-        match courses.passing(ticket)? {
+        match courses.one_off(ticket)? {
             Some(wanted) => {
-                if passing.as_ref().is_none_or(|(built, _)| *built != wanted) {
-                    *passing = Some((wanted, courses.build(ticket)?));
+                if one_off.as_ref().is_none_or(|(built, _)| *built != wanted) {
+                    *one_off = Some((wanted, courses.build(ticket)?));
                 }
-                Ok(&mut passing.as_mut().expect("it was built in the lines above").1)
+                Ok(&mut one_off.as_mut().expect("it was built in the lines above").1)
             }
             None => Ok(match fixed.entry(ticket.course) {
                 Entry::Occupied(entry) => entry.into_mut(),
@@ -242,38 +244,38 @@ fn simulator_settings(config: &Config) -> Result<SimulatorSettings, CoursesError
         })
 }
 
-/// Why the courses of a run or an evaluation cannot be had.
+/// Reason why the courses of a run or an evaluation cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum CoursesError {
     /// A course file cannot be read or flown.
     #[error(transparent)]
     Course(#[from] CourseError),
-    /// The configuration's simulator section is wrong.
+    /// The configuration's simulator section is invalid.
     #[error("[simulator] {0}")]
     Settings(String),
-    /// The drone cannot be disturbed as an entry of a suite asks for.
+    /// The drone does not support the disturbances of an entry of a suite.
     #[error("entry \"{entry}\": {source}")]
     Disturbances {
         /// The entry.
         entry: String,
-        /// Why.
+        /// Cause.
         source: DisturbanceSettingsError,
     },
 }
 
-/// Why a ticket's course cannot be flown.
+/// Reason why a ticket's course cannot be flown.
 #[derive(Debug, thiserror::Error)]
-pub enum NoCourse {
-    /// There is none of this number.
+pub enum CourseChoiceError {
+    /// The course is not loaded.
     #[error("the ticket names {choice:?}, which this process has not loaded")]
     NotLoaded {
-        /// What the ticket names.
+        /// The ticket's choice.
         choice: CourseChoice,
     },
-    /// None can be generated.
+    /// The course cannot be generated.
     #[error(transparent)]
     Ranges(#[from] RangesError),
-    /// It cannot be simulated.
+    /// The course cannot be simulated.
     #[error(transparent)]
     Simulator(#[from] SimulatorError),
 }
@@ -286,7 +288,8 @@ mod tests {
     use super::*;
     use crate::testing::config;
 
-    /// The ticket of episode `episode` of an evaluation, or of a training episode on `course`.
+    /// Returns the ticket of episode `episode` of an evaluation, or of a training episode on
+    /// `course`.
     fn ticket(course: CourseChoice, episode: u64) -> Ticket {
         Ticket {
             run: RunId(0),
@@ -306,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named() {
+    fn errors_name_the_wrong_key_or_file() {
         let unknown = refused(&config("max_stepps = 3"));
         assert!(
             unknown.contains("[simulator]") && unknown.contains("max_stepps"),
@@ -318,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn evaluation_courses_go_by_their_files_names_in_order() {
+    fn evaluation_courses_are_named_after_their_files_in_order() {
         let courses = Courses::of_run(&config("")).unwrap();
         let names: Vec<_> = courses
             .evaluation()
@@ -347,13 +350,13 @@ mod tests {
         assert_eq!(of(CourseChoice::Training), training);
         assert_eq!(simulators.fixed.len(), 1);
         assert_eq!(
-            simulators.passing.unwrap().0,
+            simulators.one_off.unwrap().0,
             (CourseChoice::Generated(2), 0)
         );
     }
 
     #[test]
-    fn episodes_of_an_entry_fly_its_courses_in_turn_with_its_disturbances() {
+    fn episodes_of_an_entry_cycle_through_its_courses_with_its_disturbances() {
         let text = r#"
             name = "two orders and what is generated"
             episodes = 4

@@ -1,10 +1,10 @@
-//! The environment loop: one ticket in, one episode out, or one segment of an episode.
+//! The environment loop: flies the episode or segment of one ticket.
 //!
-//! [`EnvironmentLoop::fly`] is the whole of it, and the only one: training, evaluation during
-//! training and evaluation of a file differ in the ticket and in where the records go. An episode
-//! is a function of its ticket and of the snapshot the ticket names, so nothing is remembered from
-//! one episode to the next, and start, exploration noise and disturbances are drawn from generators
-//! of their own. What is remembered from one segment to the next saves time alone.
+//! [`EnvironmentLoop::fly`] is the only such loop: training, evaluation during training and
+//! evaluation of a file differ only in the ticket and in where the records go. An episode is a
+//! function of its ticket and of the snapshot that the ticket names. So no state passes from one
+//! episode to the next, and start, exploration noise and disturbances each have their own random
+//! generator. State kept between segments only saves time.
 
 use std::ops::DerefMut;
 
@@ -25,7 +25,7 @@ use skein_simulator::simulator::{
 };
 
 use crate::agent::Agent;
-use crate::courses::{NoCourse, Simulators};
+use crate::courses::{CourseChoiceError, Simulators};
 use skein_inference::Network;
 
 /// Flies tickets.
@@ -35,12 +35,12 @@ pub struct EnvironmentLoop {
     simulators: Simulators,
     reward: RewardSettings,
     agent: Agent,
-    /// What the last ticket left in the air, if it was for a segment.
-    under_way: Option<UnderWay>,
+    /// The episode that the last ticket's segment left unfinished.
+    paused: Option<PausedEpisode>,
 }
 
 impl EnvironmentLoop {
-    /// A environment_loop who signs records as `incarnation` of `actor`.
+    /// Creates a loop that marks records with `actor` and `incarnation`.
     pub fn new(
         actor: ActorId,
         incarnation: ActorIncarnation,
@@ -54,27 +54,27 @@ impl EnvironmentLoop {
             simulators,
             reward,
             agent,
-            under_way: None,
+            paused: None,
         }
     }
 
-    /// Signs records as `incarnation` from now on.
+    /// Marks records with `incarnation` from now on.
     pub fn begin_incarnation(&mut self, incarnation: ActorIncarnation) {
         self.incarnation = incarnation;
     }
 
-    /// Flies `ticket` with `network` to the end of its episode or its segment: each step a record
-    /// into `link`, and a closing one at last. `None` when the episode goes on after the segment.
+    /// Flies `ticket` with `network` to the end of its episode or segment. Sends a record per step
+    /// to `link`, then a closing one. Returns `None` if the episode continues after the segment.
     ///
     /// # Errors
-    /// [`EpisodeError`]; what was sent on this ticket is void then.
+    /// [`EpisodeError`]; then the records already sent are void.
     pub fn fly<L: RecordLink>(
         &mut self,
         ticket: &Ticket,
         network: &Network,
         link: &mut L,
     ) -> Result<Option<EpisodeScore>, EpisodeError<L::Error>> {
-        // Each segment draws from a generator of its own: who flies a later one need not know how
+        // Each segment has its own generator: an actor that flies a later one need not know how
         // often the earlier ones drew.
         let mut noise = generator(ticket, Purpose::ActionNoise, ticket.first_step());
         let begin = |link: &mut L, step| {
@@ -85,9 +85,9 @@ impl EnvironmentLoop {
 
         let mut record = begin(link, ticket.first_step())?;
         let (simulator, mut flown) =
-            match take_up(&mut self.simulators, self.under_way.take(), ticket) {
-                Ok(taken_up) => taken_up,
-                Err(fault) => return Err(give_up(fault, record, link)),
+            match position_at_start(&mut self.simulators, self.paused.take(), ticket) {
+                Ok(start) => start,
+                Err(fault) => return Err(send_failure(fault, record, link)),
             };
         link.lap(Stage::Reset);
         self.agent
@@ -109,12 +109,11 @@ impl EnvironmentLoop {
             link.lap(Stage::Policy);
             let report = match simulator.step(action) {
                 Ok(report) => report,
-                Err(error) => return Err(give_up(error.into(), record, link)),
+                Err(error) => return Err(send_failure(error.into(), record, link)),
             };
             link.lap(Stage::Physics);
 
-            // The reward looks at what the action led to, so the next image comes before this
-            // record is complete.
+            // The reward depends on the next image, so that comes before this record is complete.
             let mut next = begin(link, step)?;
             self.agent
                 .observe(simulator, network, &mut next, |stage| link.lap(stage));
@@ -140,7 +139,7 @@ impl EnvironmentLoop {
                 record.kind = RecordKind::SegmentEnd.code();
                 record.walls_passed = report.walls_passed;
                 link.send(record).map_err(EpisodeError::Link)?;
-                self.under_way = Some(UnderWay::after(ticket, flown));
+                self.paused = Some(PausedEpisode::after(ticket, flown));
                 return Ok(None);
             }
         }
@@ -150,53 +149,53 @@ impl EnvironmentLoop {
     }
 }
 
-/// Where an episode's records go: shared memory in a run, plain memory in a stand-alone evaluation.
+/// Destination of an episode's records: shared memory in a run, plain memory in a stand-alone
+/// evaluation.
 pub trait RecordLink {
-    /// A record being written.
+    /// Record being written.
     type Loan: DerefMut<Target = TransitionRecord>;
-    /// Why no record can be had or sent.
+    /// Error of loaning or sending.
     type Error: std::error::Error + 'static;
 
-    /// A record to write into; what it holds is arbitrary. Two are on loan at a time.
+    /// Loans a record to write into; its content is arbitrary. Two are on loan at a time.
     ///
     /// # Errors
-    /// When there is none.
+    /// If none is available.
     fn loan(&mut self) -> Result<Self::Loan, Self::Error>;
 
-    /// Hands a record over.
+    /// Sends a record.
     ///
     /// # Errors
-    /// When nobody can take it.
+    /// If it cannot be sent.
     fn send(&mut self, record: Self::Loan) -> Result<(), Self::Error>;
 
-    /// Asked before every step: whether to fly on.
+    /// Returns, before every step, whether to continue.
     ///
     /// # Errors
-    /// When that cannot be known.
+    /// If that cannot be determined.
     fn directive(&mut self) -> Result<Directive, Self::Error>;
 
-    /// Told at the end of each stage of a step, for whoever wants to know where the time goes; what
-    /// it does itself, a link books itself.
+    /// Called at the end of each stage of a step, for time measurement. A link measures its own
+    /// work itself.
     fn lap(&mut self, _stage: Stage) {}
 }
 
-/// Whether to fly on.
+/// Decision whether to continue an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Directive {
-    /// Fly on.
+    /// Continue.
     Continue,
-    /// Break the episode off: nobody wants it any more.
+    /// Stop the episode: it is no longer needed.
     Abandon,
 }
 
-/// Why an episode was not flown to its end.
+/// Reason why an episode was not flown to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum EpisodeError<E: std::error::Error + 'static> {
-    /// It was told to stop.
+    /// The link asked to stop.
     #[error("the episode was abandoned")]
     Abandoned,
-    /// The ticket or the physics is at fault; the link has been told by a record of kind
-    /// [`RecordKind::Failed`].
+    /// The ticket or the physics is at fault. A record of kind [`RecordKind::Failed`] was sent.
     #[error("the episode failed: {0}")]
     Fault(#[source] EpisodeFault),
     /// Records cannot be sent.
@@ -204,44 +203,42 @@ pub enum EpisodeError<E: std::error::Error + 'static> {
     Link(#[source] E),
 }
 
-/// What is wrong with an episode itself: whoever flies it again meets it again.
+/// Fault of an episode itself: it recurs for any actor that flies the ticket.
 #[derive(Debug, thiserror::Error)]
 pub enum EpisodeFault {
-    /// The ticket names a course that is not there.
+    /// The ticket names an unknown course.
     #[error(transparent)]
-    Course(#[from] NoCourse),
-    /// The ticket names a level that is not there.
+    Course(#[from] CourseChoiceError),
+    /// The ticket names an unknown level.
     #[error(transparent)]
     Level(#[from] NoSuchLevel),
-    /// The simulation broke down.
+    /// The simulation failed.
     #[error(transparent)]
     Simulation(#[from] SimulationError),
-    /// The actions before a segment do not lead to it.
-    #[error(
-        "the episode ends in step {step} of the {flown} that are said to have been flown before the segment"
-    )]
+    /// The earlier actions end the episode before the segment begins.
+    #[error("the episode ends in step {step}, within the {prior_actions} steps before the segment")]
     EndedBefore {
         /// The step, from 1.
         step: usize,
-        /// Actions flown before.
-        flown: usize,
+        /// Steps before the segment.
+        prior_actions: usize,
     },
 }
 
-/// An episode in the middle, in the simulator that has flown the last of it.
-struct UnderWay {
+/// Unfinished episode, whose latest segment is in the simulator.
+struct PausedEpisode {
     ticket: Ticket,
-    /// From reset on.
+    /// Actions from the reset on.
     flown: Vec<[f32; ACTION]>,
 }
 
-impl UnderWay {
+impl PausedEpisode {
     fn after(ticket: &Ticket, flown: Vec<[f32; ACTION]>) -> Self {
         let ticket = ticket.clone();
         Self { ticket, flown }
     }
 
-    /// Whether `segment` of the episode of `ticket` begins here, to the last bit.
+    /// Returns `true` if `segment` of the episode of `ticket` begins exactly here, bit for bit.
     fn is_before(&self, ticket: &Ticket, segment: &Segment) -> bool {
         let episode = |ticket: &Ticket| {
             (
@@ -255,34 +252,35 @@ impl UnderWay {
         let bits = |actions: &[[f32; ACTION]]| -> Vec<_> {
             actions.iter().flatten().map(|x| x.to_bits()).collect()
         };
-        episode(&self.ticket) == episode(ticket) && bits(&self.flown) == bits(&segment.flown)
+        episode(&self.ticket) == episode(ticket)
+            && bits(&self.flown) == bits(&segment.prior_actions)
     }
 }
 
-/// The simulator where `ticket` begins, and the actions that led there: at reset or, of a later
-/// segment, where the one before ended. If that was not flown here, or something else was since,
-/// the actions are repeated, which leads to the same place.
-fn take_up<'a>(
+/// Returns the simulator in the state in which `ticket` begins, and the actions that led there.
+/// That state is the reset or, for a later segment, the end of the previous one. If this loop does
+/// not hold that state, it repeats the actions, with the same result.
+fn position_at_start<'a>(
     simulators: &'a mut Simulators,
-    under_way: Option<UnderWay>,
+    paused: Option<PausedEpisode>,
     ticket: &Ticket,
 ) -> Result<(&'a mut Simulator, Vec<[f32; ACTION]>), EpisodeFault> {
     let Some(segment) = &ticket.segment else {
         return Ok((reset(simulators, ticket)?, Vec::new()));
     };
-    if let Some(under_way) = under_way.filter(|under_way| under_way.is_before(ticket, segment)) {
-        return Ok((simulators.of(ticket)?, under_way.flown));
+    if let Some(paused) = paused.filter(|paused| paused.is_before(ticket, segment)) {
+        return Ok((simulators.of(ticket)?, paused.flown));
     }
     let simulator = reset(simulators, ticket)?;
-    for (number, action) in (1..).zip(segment.flown.iter()) {
+    for (number, action) in (1..).zip(segment.prior_actions.iter()) {
         if simulator.step(*action)?.outcome.is_some() {
             return Err(EpisodeFault::EndedBefore {
                 step: number,
-                flown: segment.flown.len(),
+                prior_actions: segment.prior_actions.len(),
             });
         }
     }
-    Ok((simulator, segment.flown.to_vec()))
+    Ok((simulator, segment.prior_actions.to_vec()))
 }
 
 fn is_last_of_segment(ticket: &Ticket, step: u32) -> bool {
@@ -303,12 +301,12 @@ fn reset<'a>(
     Ok(simulator)
 }
 
-/// What draws for one purpose in the episode of `ticket`, from `step` on.
+/// Returns the random generator for one purpose in the episode of `ticket`, from `step` on.
 fn generator(ticket: &Ticket, purpose: Purpose, step: u32) -> Pcg64Mcg {
     Pcg64Mcg::seed_from_u64(derive(ticket.seed, purpose, step.into()))
 }
 
-/// Writes into the record of an observation what was done on it and what came of that.
+/// Writes an action and its consequences into the record of its observation.
 fn complete(
     record: &mut TransitionRecord,
     action: [f32; ACTION],
@@ -330,7 +328,7 @@ fn complete(
     record.truncated = u8::from(report.outcome == Some(EpisodeOutcome::TimedOut));
 }
 
-/// Makes a record with an observation the episode's last; returns what the episode came to.
+/// Makes a record with an observation the episode's closing one; returns the episode's score.
 fn close(
     record: &mut TransitionRecord,
     outcome: Outcome,
@@ -346,23 +344,23 @@ fn close(
     record.hit_wall = hit_wall.unwrap_or(0);
     EpisodeScore {
         walls_passed: report.walls_passed.into(),
-        // As in `episodes.csv`; of a segment, what was earned in it.
+        // As in `episodes.csv`. For a segment, its rewards only.
         episode_return: f64::from(episode_return as f32),
         outcome,
         hit_wall,
     }
 }
 
-/// The wall that was hit, from 1 in episode order.
+/// Returns the wall that was hit, from 1 in episode order.
 fn hit_wall(report: &StepReport) -> Option<u8> {
     match report.hit {
-        Some(Obstacle::Wall(place)) => Some(place),
+        Some(Obstacle::Wall(wall)) => Some(wall),
         Some(Obstacle::Corridor) | None => None,
     }
 }
 
-/// Sends `record` as the word that the episode has failed.
-fn give_up<L: RecordLink>(
+/// Sends `record` to report that the episode has failed.
+fn send_failure<L: RecordLink>(
     fault: EpisodeFault,
     mut record: L::Loan,
     link: &mut L,
@@ -374,7 +372,7 @@ fn give_up<L: RecordLink>(
     }
 }
 
-/// The simulator and the protocol know nothing of each other; here they meet.
+/// Converts between simulator and protocol, which do not depend on each other.
 fn outcome(ended: EpisodeOutcome) -> Outcome {
     match ended {
         EpisodeOutcome::Collided => Outcome::Collided,

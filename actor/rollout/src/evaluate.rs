@@ -1,6 +1,6 @@
-//! Evaluation from the command line: flies a trained snapshot, prints and writes how it fares.
+//! Evaluation from the command line: flies a trained snapshot, prints and stores the results.
 //!
-//! `skein-evaluate` and `skein evaluate` share what is here.
+//! `skein-evaluate` and `skein evaluate` share this module.
 
 use std::fs::{self, File, OpenOptions};
 use std::num::NonZeroUsize;
@@ -20,51 +20,51 @@ use skein_run::tables::evaluation_table;
 use skein_simulator::camera::InstructionSet;
 use skein_simulator::suite::{EntryCourses, MOST_EPISODES, Suite, SuiteEntry};
 
-/// Flies a trained snapshot through courses and prints how it fares.
+/// Flies a trained snapshot through courses and prints its results.
 ///
-/// Every episode takes off from the start of level 1 and follows the policy without noise. The
-/// episodes are the same each time, whatever the number of threads: their seeds derive from the
-/// seed of the run that trained the snapshot, whose configuration lies in the snapshot file.
+/// Every episode begins at the start of level 1 and follows the policy without noise. The episodes
+/// are the same each time, whatever the number of threads: their seeds derive from the seed of the
+/// run that trained the snapshot. The snapshot file holds that run's configuration.
 ///
-/// R is the average rate of walls passed, (t_1 + … + t_n) / (n · episodes), where t_i counts the
-/// episodes that passed wall i. Beside it stands what the other episodes failed by: which wall they
-/// hit, or before which one they hit the corridor or ran out of steps. Walls are counted in the
-/// order in which they are met.
+/// R is the mean rate of walls passed, (t_1 + … + t_n) / (n · episodes), where t_i counts the
+/// episodes that passed wall i. The table also shows how the other episodes failed: the wall they
+/// hit, or the wall before which they hit the corridor or ran out of steps. Walls are numbered in
+/// the order in which the drone meets them.
 #[derive(Debug, Parser)]
 #[command(name = "skein-evaluate", version, after_long_help = columns_help())]
 pub struct Arguments {
     #[command(flatten)]
     subject: Subject,
-    /// A course file to fly, once for each course. By default the evaluation courses of the run
-    /// that trained the snapshot.
+    /// A course file to fly; may be repeated. By default the evaluation courses of the run that
+    /// trained the snapshot.
     #[arg(long, value_name = "FILE")]
     course: Vec<PathBuf>,
-    /// A suite file to fly instead: courses, all orders of a course's walls, generated courses,
-    /// each with disturbances of its own; as configs/evaluations/generalist.toml.
+    /// A suite file to fly instead: courses, all orders of a course's walls, or generated courses,
+    /// each with its own disturbances. Example: configs/evaluations/generalist.toml.
     #[arg(long, value_name = "FILE", conflicts_with = "course")]
     suite: Option<PathBuf>,
-    /// Episodes per course, or of each entry of the suite. By default evaluation.episodes of that
-    /// run, or what the suite says.
+    /// Episodes per course or per entry of the suite. By default evaluation.episodes of that run,
+    /// or the suite's number.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=MOST_EPISODES))]
     episodes: Option<u64>,
     /// Also write the result to this file, as JSON.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Also write every step of every episode to this file, as .npz; takes 9.3 KiB of memory for
-    /// each step, about 1 MiB for each whole episode.
+    /// Also write every step of every episode to this file, as .npz. Needs 9.3 KiB of memory per
+    /// step, about 1 MiB per whole episode.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    // Not a doc comment: those cannot name the constant.
+    // Not a doc comment, which cannot contain the constant.
     #[arg(long, value_name = "N", help = threads_help())]
     threads: Option<NonZeroUsize>,
 }
 
-/// What is flown.
+/// Snapshot to fly.
 #[derive(Debug, Args)]
 #[group(required = true, multiple = false)]
 struct Subject {
-    /// Directory of a run: its best snapshot is flown, or the latest where none has been confirmed
-    /// as best.
+    /// Directory of a run: flies its best snapshot, or its latest if none has been confirmed as
+    /// best.
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
     /// A snapshot file (.safetensors).
@@ -107,7 +107,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "snapshot {} of {}: {}, {} threads",
         snapshot.version,
         path.display(),
-        what_is_flown(
+        describe_episodes(
             &courses,
             arguments.suite.as_ref().map_or("courses", |_| "entries")
         ),
@@ -125,8 +125,8 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
     println!("{}", evaluation_table(&evaluated.report));
     if let Some(file) = &arguments.json {
-        let json =
-            serde_json::to_string_pretty(&evaluated.report).context("the result is no JSON")?;
+        let json = serde_json::to_string_pretty(&evaluated.report)
+            .context("cannot write the result as JSON")?;
         fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))?;
     }
     if let Some(file) = &arguments.record {
@@ -139,8 +139,8 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Minutes of flying must not end in a file that cannot be written. Leaves nothing behind and an
-/// existing file as it is.
+/// Checks that `file` can be written, so that a long evaluation is not lost. Leaves no file behind
+/// and does not change an existing one.
 fn check_writable(file: &Path) -> anyhow::Result<()> {
     check_folder(file)?;
     let cannot_write = || format!("cannot write {}", file.display());
@@ -154,13 +154,14 @@ fn check_writable(file: &Path) -> anyhow::Result<()> {
             .with_context(cannot_write),
         Err(_) => File::create(file)
             .and_then(|_| fs::canonicalize(file))
-            // The link that names it, if there is one, stays.
+            // If a link names it, the link stays.
             .and_then(fs::remove_file)
             .with_context(cannot_write),
     }
 }
 
-/// The system's word for a missing folder is the one for a missing file.
+/// Checks that the folder of `file` exists: the system reports a missing folder like a missing
+/// file.
 fn check_folder(file: &Path) -> anyhow::Result<()> {
     let folder = match file.parent() {
         Some(folder) if folder != Path::new("") => folder,
@@ -168,7 +169,7 @@ fn check_folder(file: &Path) -> anyhow::Result<()> {
     };
     if !folder.is_dir() {
         bail!(
-            "cannot write {}: there is no folder {}; create it, or name another",
+            "cannot write {}: folder {} does not exist; create it, or name another",
             file.display(),
             folder.display()
         );
@@ -184,8 +185,8 @@ fn snapshot_path(subject: &Subject) -> anyhow::Result<PathBuf> {
             .context("neither --run nor --snapshot is given");
     };
     let directory = RunDirectory::new(run);
-    // Of a run that has an identity, it can be told whether its courses are those that it was
-    // trained and evaluated on.
+    // For a run with an identity, this checks that its courses are those it was trained and
+    // evaluated on.
     if directory.identity().is_file() {
         directory.open()?;
     }
@@ -193,13 +194,14 @@ fn snapshot_path(subject: &Subject) -> anyhow::Result<PathBuf> {
     let found = candidates.iter().find(|path| path.is_file()).cloned();
     found.with_context(|| {
         format!(
-            "{} holds neither snapshots/best.safetensors nor snapshots/latest.safetensors: is it the directory of a run, and has its first epoch ended?",
+            "{} holds neither snapshots/best.safetensors nor snapshots/latest.safetensors: is it \
+            the directory of a run whose first epoch has ended?",
             run.display()
         )
     })
 }
 
-/// What the arguments ask to be flown.
+/// Loads the courses that the arguments name.
 fn courses(arguments: &Arguments, config: &Config, snapshot: &Path) -> anyhow::Result<Courses> {
     let courses = match (&arguments.suite, arguments.course.as_slice()) {
         (Some(file), _) => Courses::of_suite(config, Suite::load(file)?)
@@ -213,8 +215,8 @@ fn courses(arguments: &Arguments, config: &Config, snapshot: &Path) -> anyhow::R
     })
 }
 
-/// How many episodes of what, in words; `entries` is what there is a number of episodes for.
-fn what_is_flown(courses: &Courses, entries: &str) -> String {
+/// Describes the episodes; `entries` is the word for what has a number of episodes.
+fn describe_episodes(courses: &Courses, entries: &str) -> String {
     let episodes: Vec<u64> = courses.evaluation().map(|entry| entry.episodes).collect();
     match episodes.as_slice() {
         [first, others @ ..] if others.iter().all(|episodes| episodes == first) => {
@@ -228,8 +230,8 @@ fn what_is_flown(courses: &Courses, entries: &str) -> String {
     }
 }
 
-/// A line for each entry that generates shapes which the snapshot was trained on: what it measures
-/// is not what an agent makes of new shapes.
+/// Returns a note for each entry with generated shapes that the snapshot was trained on: its result
+/// does not measure performance on new shapes.
 fn shapes_trained_on(config: &Config, courses: &Courses) -> Vec<String> {
     let trained = &courses.settings().generator.shapes;
     let known = |entry: &SuiteEntry| match &entry.courses {
@@ -253,18 +255,19 @@ fn shapes_trained_on(config: &Config, courses: &Courses) -> Vec<String> {
         .collect()
 }
 
-/// The evaluation courses of the run that trained the snapshot: in the run's directory, wherever
-/// that has moved.
+/// Returns the evaluation courses of the run that trained the snapshot, from the run's directory,
+/// which may have moved.
 fn evaluation_courses(config: &Config, snapshot: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let snapshot =
         std::path::absolute(snapshot).with_context(|| format!("{}", snapshot.display()))?;
-    // DIR/snapshots/best.safetensors, beside DIR/courses/.
+    // The snapshot is DIR/snapshots/best.safetensors; courses lie in DIR/courses/.
     let folder = RunDirectory::new(snapshot.ancestors().nth(2).unwrap_or(Path::new("/"))).courses();
     let find = |path: &PathBuf| {
         let file = folder.join(path.file_name().unwrap_or_default());
         file.is_file().then(|| file.clone()).with_context(|| {
             format!(
-                "{}, which the snapshot's run was evaluated on, is not there; name the course files to fly with --course",
+                "{}, an evaluation course of the snapshot's run, does not exist; name course \
+                files with --course",
                 file.display()
             )
         })
@@ -274,11 +277,12 @@ fn evaluation_courses(config: &Config, snapshot: &Path) -> anyhow::Result<Vec<Pa
 
 fn threads_help() -> String {
     format!(
-        "Most threads to fly on, at most {MAX_THREADS} and one an episode. By default one a core"
+        "Most threads to fly on; at most {MAX_THREADS}, and one per episode. By default one per \
+        core"
     )
 }
 
-/// The arrays of a recording, for the long help.
+/// Returns the description of a recording's arrays, for the long help.
 fn columns_help() -> String {
     let rows = COLUMNS.iter().map(|column| {
         let shape: Vec<_> = std::iter::once("n".to_owned())
@@ -293,7 +297,8 @@ fn columns_help() -> String {
         )
     });
     format!(
-        "Arrays in the file of --record, read by numpy.load(FILE); a row for each observation, episodes and courses in order:\n{}  {:<13} {:<4} {:<14} {}",
+        "Arrays in the file of --record, read by numpy.load(FILE); one row per observation, \
+        episodes and courses in order:\n{}  {:<13} {:<4} {:<14} {}",
         rows.collect::<String>(),
         "course_names",
         "<U",

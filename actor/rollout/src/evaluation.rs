@@ -1,9 +1,9 @@
-//! Evaluation without a learner: how a snapshot flies, entry by entry: a course, or a suite's
-//! several.
+//! Evaluation of a snapshot without a learner, entry by entry: single courses, or the entries of a
+//! suite.
 //!
-//! The episodes are those of the environment loop, with tickets written here: mode action, start of
-//! level 1, seeds from the run's. They are spread over all cores; which thread flies which changes
-//! nothing.
+//! It flies episodes with the environment loop, on tickets of its own: mode actions, start of level
+//! 1, seeds derived from the run's. Episodes are spread over all cores; the result does not depend
+//! on the threads.
 
 use std::convert::Infallible;
 use std::io;
@@ -25,55 +25,55 @@ use crate::courses::{Courses, Simulators};
 use crate::environment_loop::{Directive, EnvironmentLoop, EpisodeError, EpisodeFault, RecordLink};
 use skein_inference::Network;
 
-/// Most threads of an evaluation: more cores than any machine we know of has, few enough for every
+/// Most threads of an evaluation: more than the cores of any known machine, few enough for every
 /// system's limits.
 pub const MAX_THREADS: usize = 512;
 
-/// What is to be flown.
+/// An evaluation to fly.
 #[derive(Debug)]
 pub struct Evaluation<'a> {
     /// The policy.
     pub snapshot: &'a Snapshot,
     /// The configuration it was trained with.
     pub config: &'a Config,
-    /// Each of its evaluation entries is flown, as often as it says.
+    /// Courses; each evaluation entry is flown as often as it says.
     pub courses: Arc<Courses>,
-    /// Most threads to fly on; without influence on the result. See [`Evaluation::threads`].
+    /// Most threads to fly on. The result does not depend on it. See [`Evaluation::threads`].
     pub threads: NonZeroUsize,
-    /// What to keep of the episodes.
+    /// Data to keep of the episodes.
     pub keep: Keep,
 }
 
-/// What to keep of the episodes.
+/// Data to keep of the episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Keep {
-    /// Their scores.
+    /// Scores only.
     Scores,
-    /// Every record, 9.3 KiB for each step.
+    /// Every record, 9.3 KiB per step.
     Records,
 }
 
-/// How it went.
+/// Result of an evaluation.
 #[derive(Debug)]
-pub struct Evaluated {
-    /// Entry by entry.
+pub struct EvaluationResult {
+    /// Report, entry by entry.
     pub report: EvaluationReport,
-    /// Entry by entry, episode by episode.
+    /// Episodes, entry by entry.
     pub episodes: Vec<Vec<EvaluatedEpisode>>,
 }
 
 /// One episode of an evaluation.
 #[derive(Debug, Clone)]
 pub struct EvaluatedEpisode {
-    /// What it came to.
+    /// Score.
     pub score: EpisodeScore,
     /// Walls of the course.
     pub walls: usize,
-    /// Its steps and its closing record, if they were to be kept.
+    /// Its steps and its closing record, if they are kept.
     pub records: Vec<Box<TransitionRecord>>,
 }
 
-/// Why an evaluation came to nothing.
+/// Reason why an evaluation failed.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
     /// An episode cannot be flown.
@@ -83,24 +83,24 @@ pub enum EvaluationError {
         course: String,
         /// The episode's number in that entry, from 0.
         episode: u64,
-        /// What went wrong.
+        /// Cause.
         #[source]
         fault: EpisodeFault,
     },
-    /// The system has no room for so many threads.
+    /// The system cannot start so many threads.
     #[error("cannot start thread {thread} of {threads}: {source}; ask for fewer")]
     Thread {
         /// The thread's number, from 1.
         thread: usize,
-        /// How many were wanted.
+        /// Number of threads wanted.
         threads: usize,
-        /// Why.
+        /// Cause.
         source: io::Error,
     },
 }
 
 impl Evaluation<'_> {
-    /// Threads that are flown on: not more than there are episodes, nor than [`MAX_THREADS`].
+    /// Returns the number of threads: at most one per episode and [`MAX_THREADS`].
     pub fn threads(&self) -> usize {
         let episodes = usize::try_from(self.total()).unwrap_or(usize::MAX);
         self.threads.get().min(episodes).min(MAX_THREADS)
@@ -110,8 +110,8 @@ impl Evaluation<'_> {
     ///
     /// # Errors
     /// [`EvaluationError`] names the first episode, in entry and episode order, that cannot be
-    /// flown, or the thread that cannot be had.
-    pub fn run(&self) -> Result<Evaluated, EvaluationError> {
+    /// flown, or the thread that cannot be started.
+    pub fn run(&self) -> Result<EvaluationResult, EvaluationError> {
         let mut episodes = self.fly_all()?.into_iter();
         let mut courses = Vec::new();
         let mut by_course = Vec::new();
@@ -137,13 +137,13 @@ impl Evaluation<'_> {
             policy_sha256: self.snapshot.sha256(),
             courses,
         };
-        Ok(Evaluated {
+        Ok(EvaluationResult {
             report,
             episodes: by_course,
         })
     }
 
-    /// Every episode's end, in entry and episode order.
+    /// Flies all episodes; returns them in entry and episode order.
     fn fly_all(&self) -> Result<Vec<Result<EvaluatedEpisode, EvaluationError>>, EvaluationError> {
         let network = Network::new(self.snapshot, &SnapshotLayout::of(self.config));
         let next = AtomicU64::new(0);
@@ -154,7 +154,7 @@ impl Evaluation<'_> {
                     .name(format!("evaluation-{thread}"))
                     .spawn_scoped(scope, || self.fly_next_until_done(&network, &next))
                     .map_err(|source| {
-                        // Those that have started find nothing left to fly.
+                        // Running threads find no episode left.
                         next.store(self.total(), Ordering::Relaxed);
                         EvaluationError::Thread {
                             thread,
@@ -177,13 +177,13 @@ impl Evaluation<'_> {
         Ok(flown.into_iter().map(|(_, episode)| episode).collect())
     }
 
-    /// Episodes of all entries together.
+    /// Returns the number of episodes of all entries.
     fn total(&self) -> u64 {
         self.courses.evaluation().map(|entry| entry.episodes).sum()
     }
 
-    /// Entry and episode of the episode `index` of all, from 0.
-    fn place(&self, mut index: u64) -> Option<(u32, u64)> {
+    /// Returns entry and episode of the episode `index` of all, from 0.
+    fn entry_and_episode(&self, mut index: u64) -> Option<(u32, u64)> {
         for (entry, number) in self.courses.evaluation().zip(0..) {
             if index < entry.episodes {
                 return Some((number, index));
@@ -193,21 +193,21 @@ impl Evaluation<'_> {
         None
     }
 
-    /// One thread's share: whatever episode is next. The number counts episodes through all
-    /// entries.
+    /// Work of one thread: flies the next episode until none is left. `next` counts episodes
+    /// through all entries.
     fn fly_next_until_done(
         &self,
         network: &Network,
         next: &AtomicU64,
     ) -> Vec<(u64, Result<EvaluatedEpisode, EvaluationError>)> {
         let simulators = Simulators::new(Arc::clone(&self.courses));
-        let agent = Agent::new(self.config.view());
+        let agent = Agent::new(self.config.observation_layout());
         let mut environment_loop =
             EnvironmentLoop::new(ActorId(0), ActorIncarnation(0), simulators, agent);
         let mut flown = Vec::new();
         loop {
             let index = next.fetch_add(1, Ordering::Relaxed);
-            let Some((entry, episode)) = self.place(index) else {
+            let Some((entry, episode)) = self.entry_and_episode(index) else {
                 return flown;
             };
             flown.push((
@@ -235,7 +235,7 @@ impl Evaluation<'_> {
             seed: derive(self.config.run.seed, Purpose::EvaluationEpisode, episode),
             segment: None,
         };
-        let mut memory = Memory {
+        let mut memory = MemoryLink {
             keep: self.keep,
             walls: 0,
             spare: Vec::new(),
@@ -257,22 +257,22 @@ impl Evaluation<'_> {
                 })
             }
             Err(EpisodeError::Link(never)) => match never {},
-            Ok(None) => unreachable!("its ticket is for a whole episode"),
-            Err(EpisodeError::Abandoned) => unreachable!("nobody tells an evaluation to stop"),
+            Ok(None) => unreachable!("the ticket is for a whole episode"),
+            Err(EpisodeError::Abandoned) => unreachable!("an evaluation is never abandoned"),
         }
     }
 }
 
-/// Records in plain memory.
-struct Memory {
+/// Link that keeps records in plain memory.
+struct MemoryLink {
     keep: Keep,
-    /// Of the course, as the closing record tells.
+    /// Walls of the course, from the closing record.
     walls: usize,
     spare: Vec<Box<TransitionRecord>>,
     sent: Vec<Box<TransitionRecord>>,
 }
 
-impl RecordLink for Memory {
+impl RecordLink for MemoryLink {
     type Loan = Box<TransitionRecord>;
     type Error = Infallible;
 
@@ -302,7 +302,7 @@ mod tests {
     use super::*;
     use crate::testing::{config, random_snapshot};
 
-    /// What `look` sees of an evaluation on two courses.
+    /// Calls `look` with an evaluation on two courses.
     fn look_at<T>(
         episodes: u64,
         threads: usize,
@@ -324,7 +324,7 @@ mod tests {
         })
     }
 
-    fn evaluated(threads: usize, keep: Keep) -> Evaluated {
+    fn evaluated(threads: usize, keep: Keep) -> EvaluationResult {
         look_at(5, threads, keep, |evaluation| evaluation.run().unwrap())
     }
 
@@ -343,7 +343,7 @@ mod tests {
     #[test]
     fn the_number_of_threads_changes_nothing() {
         let one = evaluated(1, Keep::Records);
-        let bytes = |evaluated: &Evaluated| {
+        let bytes = |evaluated: &EvaluationResult| {
             let records = evaluated
                 .episodes
                 .iter()
@@ -390,7 +390,7 @@ mod tests {
             .collect();
         assert!(
             starts.windows(2).all(|pair| pair[0] != pair[1]),
-            "a hundred episodes are a hundred different ones"
+            "all episodes differ"
         );
     }
 }

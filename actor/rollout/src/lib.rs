@@ -2,8 +2,8 @@
 //!
 //! Begin with [`environment_loop`]: an episode from its ticket to its closing record. It hands each
 //! record to a [`RecordLink`](environment_loop::RecordLink): shared memory in an actor, plain
-//! memory in an [`evaluation`]. There is no libtorch here: inference is native
-//! ([`skein_inference`]), so what stands on this builds in minutes and starts at once.
+//! memory in an [`evaluation`]. Inference is native ([`skein_inference`]) and needs no libtorch, so
+//! programs on this crate build in minutes and start at once.
 
 pub mod agent;
 pub mod courses;

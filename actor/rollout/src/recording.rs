@@ -1,8 +1,8 @@
-//! Recordings of evaluation episodes: a `.npz` file, which NumPy alone reads (`numpy.load(FILE)`).
+//! Recordings of evaluation episodes: a `.npz` file for NumPy (`numpy.load(FILE)`).
 //!
-//! One row for every observation: the steps of an episode in order, its closing observation last;
+//! One row per observation: the steps of an episode in order, then its closing observation;
 //! episodes in order, courses in order. [`COLUMNS`] lists the arrays. The format is a zip file with
-//! one `.npy` file an array; rows are written as they lie in memory, so nothing is held twice.
+//! one `.npy` file per array; rows are written directly from the records.
 
 use std::fmt;
 use std::fs::{self, File};
@@ -15,53 +15,53 @@ use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
 
 use crate::evaluation::EvaluatedEpisode;
-use Axis::{Latent, Of};
+use AxisLength::{Fixed, Latent};
 
-// The arrays' types below say little-endian, and rows are copied from memory.
+// The arrays' types say little-endian, and rows are copied from memory.
 const _: () = assert!(cfg!(target_endian = "little"));
 
-/// An array of a recording.
+/// Array of a recording.
 pub struct Column {
     /// Its name.
     pub name: &'static str,
-    /// NumPy's name for its type.
+    /// Type, in NumPy's notation.
     pub kind: &'static str,
-    /// Its shape after the first axis, which counts rows.
-    pub shape: &'static [Axis],
-    /// What it holds.
+    /// Shape after the first axis, which counts rows.
+    pub shape: &'static [AxisLength],
+    /// Meaning.
     pub meaning: &'static str,
-    write: fn(&Row<'_>, &mut Vec<u8>),
+    write: fn(&RecordingRow<'_>, &mut Vec<u8>),
 }
 
-/// An axis of an array.
+/// Length of an axis of an array.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Axis {
-    /// So long.
-    Of(usize),
-    /// As long as the run's latent code.
+pub enum AxisLength {
+    /// A fixed length.
+    Fixed(usize),
+    /// The length of the run's latent code.
     Latent,
 }
 
-impl Axis {
+impl AxisLength {
     fn len(self, latent: usize) -> usize {
         match self {
-            Of(len) => len,
+            Fixed(len) => len,
             Latent => latent,
         }
     }
 }
 
-impl fmt::Display for Axis {
+impl fmt::Display for AxisLength {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Of(len) => len.fmt(f),
+            Fixed(len) => len.fmt(f),
             Latent => f.write_str("latent"),
         }
     }
 }
 
 /// One observation of a recording.
-struct Row<'a> {
+struct RecordingRow<'a> {
     course: i32,
     episode: i32,
     /// Length of the latent code.
@@ -69,7 +69,7 @@ struct Row<'a> {
     record: &'a TransitionRecord,
 }
 
-/// Every array with a row for each observation. `course_names` comes besides them.
+/// All arrays with one row per observation. `course_names` is written in addition.
 pub const COLUMNS: [Column; 15] = [
     Column::new(
         "course",
@@ -96,7 +96,7 @@ pub const COLUMNS: [Column; 15] = [
         "closing",
         "|u1",
         &[],
-        "1 in the last row of an episode, on which no action follows",
+        "1 in the last row of an episode, which has no action",
         |row, out| {
             out.push(u8::from(row.record.kind == RecordKind::Closing.code()));
         },
@@ -104,7 +104,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "position_m",
         "<f4",
-        &[Of(3)],
+        &[Fixed(3)],
         "along the corridor, left, up; metres, world frame",
         |row, out| {
             put(out, &row.record.position_m);
@@ -113,7 +113,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "orientation",
         "<f4",
-        &[Of(4)],
+        &[Fixed(4)],
         "world from body, unit quaternion (i, j, k, w)",
         |row, out| {
             put(out, &row.record.orientation);
@@ -122,7 +122,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "velocity_mps",
         "<f4",
-        &[Of(3)],
+        &[Fixed(3)],
         "forward, left, up; metres per second, world frame",
         |row, out| {
             put(out, &row.record.velocity_mps);
@@ -131,7 +131,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "depth",
         "|u1",
-        &[Of(IMAGE_HEIGHT), Of(IMAGE_WIDTH)],
+        &[Fixed(IMAGE_HEIGHT), Fixed(IMAGE_WIDTH)],
         "depth image, top row first; 255 is farthest",
         |row, out| {
             out.extend_from_slice(&row.record.depth);
@@ -147,7 +147,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "action",
         "<f4",
-        &[Of(ACTION)],
+        &[Fixed(ACTION)],
         "commanded velocity left, up, in [-1, 1]; 0 in closing rows",
         |row, out| {
             put(out, &row.record.action);
@@ -156,7 +156,7 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "reward_terms",
         "<f4",
-        &[Of(4)],
+        &[Fixed(4)],
         "collision, level-up, destination, action; for the action above",
         |row, out| {
             put(out, &row.record.reward_terms);
@@ -169,7 +169,7 @@ pub const COLUMNS: [Column; 15] = [
         "walls_passed",
         "|u1",
         &[],
-        "in this episode, after the step",
+        "walls passed in this episode, this step included",
         |row, out| {
             out.push(row.record.walls_passed);
         },
@@ -198,9 +198,9 @@ impl Column {
     const fn new(
         name: &'static str,
         kind: &'static str,
-        shape: &'static [Axis],
+        shape: &'static [AxisLength],
         meaning: &'static str,
-        write: fn(&Row<'_>, &mut Vec<u8>),
+        write: fn(&RecordingRow<'_>, &mut Vec<u8>),
     ) -> Self {
         Self {
             name,
@@ -212,19 +212,19 @@ impl Column {
     }
 }
 
-/// Why a recording was not written.
+/// Reason why a recording was not written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write the recording {}: {source}", path.display())]
 pub struct RecordingError {
     /// The file.
     pub path: PathBuf,
-    /// Why.
+    /// Cause.
     #[source]
     pub source: io::Error,
 }
 
-/// Writes the records of `episodes`, course by course, to `path`; in place at once, or not at all.
-/// Their codes have `latent` numbers.
+/// Writes the records of `episodes`, course by course, to `path` atomically. `latent` is the length
+/// of their codes.
 ///
 /// # Errors
 /// [`RecordingError`] names the file.
@@ -234,35 +234,34 @@ pub fn write_recording(
     latent: usize,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> Result<(), RecordingError> {
-    let aside = aside(path);
-    write_npz(&aside, courses, latent, episodes)
-        .and_then(|()| fs::rename(&aside, path))
+    let temporary = temporary_path(path);
+    write_npz(&temporary, courses, latent, episodes)
+        .and_then(|()| fs::rename(&temporary, path))
         .map_err(|source| {
-            // Half a recording is of no use; where there is none to remove, nothing remains either.
-            let _ = fs::remove_file(&aside);
+            // A partial recording is useless. If there is none, removing it does nothing.
+            let _ = fs::remove_file(&temporary);
             failed(path, source)
         })
 }
 
-/// Checks, before anything is flown, that [`write_recording`] can write to `path`. Leaves nothing
-/// behind and an existing file as it is.
+/// Checks before any episode that [`write_recording`] can write to `path`. Leaves no file behind
+/// and does not change an existing one.
 ///
 /// # Errors
 /// [`RecordingError`] names the file.
 pub fn check_recordable(path: &Path) -> Result<(), RecordingError> {
     if fs::metadata(path).is_ok_and(|there| !there.is_file()) {
-        let source =
-            io::Error::other("it is there and no regular file, so no recording can replace it");
+        let source = io::Error::other("it is not a regular file, so a recording cannot replace it");
         return Err(failed(path, source));
     }
-    let aside = aside(path);
-    File::create(&aside)
-        .and_then(|_| fs::remove_file(&aside))
+    let temporary = temporary_path(path);
+    File::create(&temporary)
+        .and_then(|_| fs::remove_file(&temporary))
         .map_err(|source| failed(path, source))
 }
 
-/// Where a recording lies until it is whole.
-fn aside(path: &Path) -> PathBuf {
+/// Returns the temporary path of a recording.
+fn temporary_path(path: &Path) -> PathBuf {
     path.with_extension("npz.tmp")
 }
 
@@ -279,7 +278,7 @@ fn write_npz(
     latent: usize,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> io::Result<()> {
-    let rows: Vec<Row<'_>> = (0i32..)
+    let rows: Vec<RecordingRow<'_>> = (0i32..)
         .zip(episodes)
         .flat_map(|(course, episodes)| rows_of(course, latent, episodes))
         .collect();
@@ -326,9 +325,9 @@ fn rows_of(
     course: i32,
     latent: usize,
     episodes: &[EvaluatedEpisode],
-) -> impl Iterator<Item = Row<'_>> {
+) -> impl Iterator<Item = RecordingRow<'_>> {
     (0i32..).zip(episodes).flat_map(move |(episode, flown)| {
-        flown.records.iter().map(move |record| Row {
+        flown.records.iter().map(move |record| RecordingRow {
             course,
             episode,
             latent,
@@ -381,7 +380,7 @@ mod tests {
         let record = |number: u8| {
             let mut record = Box::new(TransitionRecord::zeroed());
             record.depth.fill(number);
-            record.latent = std::array::from_fn(|place| f32::from(number) + place as f32);
+            record.latent = std::array::from_fn(|index| f32::from(number) + index as f32);
             record.position_m = [f32::from(number), 0.5, -1.0];
             record
         };
@@ -398,7 +397,7 @@ mod tests {
         }
     }
 
-    /// Header and data of an array.
+    /// Returns header and data of an array.
     fn array(file: &Path, name: &str) -> (String, Vec<u8>) {
         let mut zip = zip::ZipArchive::new(File::open(file).unwrap()).unwrap();
         let mut bytes = Vec::new();
@@ -415,7 +414,7 @@ mod tests {
         )
     }
 
-    /// The values of an array's data.
+    /// Returns the values of an array's data.
     fn values<T: bytemuck::AnyBitPattern>(bytes: &[u8]) -> Vec<T> {
         bytes
             .chunks_exact(size_of::<T>())
@@ -497,7 +496,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_replaced_is_refused_before_and_no_attempt_leaves_anything() {
+    fn an_unwritable_recording_is_refused_early_and_leaves_no_file() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         let names = || {

@@ -1,4 +1,4 @@
-//! What several tests need: a policy of random parameters, and a configuration with the shipped
+//! Shared helpers of tests: a policy with random parameters, and a configuration with the shipped
 //! courses.
 
 use std::path::Path;
@@ -9,7 +9,8 @@ use skein_protocol::config::Config;
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 
-/// Parameters uniform in about PyTorch's default range, so that values neither vanish nor explode.
+/// Returns a snapshot with parameters uniform in about PyTorch's default range, so that values
+/// neither vanish nor explode.
 pub(crate) fn random_snapshot(layout: &SnapshotLayout, seed: u64) -> Snapshot {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let mut values = vec![0.0; layout.values()];
@@ -25,8 +26,8 @@ pub(crate) fn random_snapshot(layout: &SnapshotLayout, seed: u64) -> Snapshot {
     }
 }
 
-/// The default configuration with a small policy, the shipped courses, and `simulator` as its
-/// simulator section.
+/// Returns the default configuration with a small policy, the shipped courses, and `simulator` as
+/// its simulator section.
 pub(crate) fn config(simulator: &str) -> Config {
     let mut config = Config {
         simulator: toml::from_str(simulator).unwrap(),

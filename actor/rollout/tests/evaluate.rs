@@ -1,4 +1,4 @@
-//! `skein-evaluate` as its user meets it.
+//! Tests of `skein-evaluate` as a user runs it.
 
 #![allow(
     clippy::unwrap_used,
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use skein_protocol::config::Config;
-use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, Failures};
+use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, WallFailures};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 
@@ -19,8 +19,8 @@ fn shipped(course: &str) -> PathBuf {
         .join(course)
 }
 
-/// A run's folder with a snapshot of an untrained policy; its evaluation courses lie beside it, as
-/// in a run that was moved.
+/// Returns a run's folder with a snapshot of an untrained policy. Its evaluation courses lie beside
+/// it, as in a run that was moved.
 fn run_folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     for name in ["snapshots", "courses"] {
@@ -70,7 +70,7 @@ fn error_of(folder: &Path, arguments: &[&str]) -> String {
 }
 
 #[test]
-fn a_run_is_evaluated_on_its_own_courses_alike_on_any_number_of_threads() {
+fn a_run_is_evaluated_on_its_own_courses_with_the_same_result_on_any_number_of_threads() {
     let folder = run_folder();
     for threads in ["1", "3"] {
         let json = format!("{threads}.json");
@@ -132,7 +132,7 @@ fn a_snapshot_file_alone_is_flown_and_recorded() {
 }
 
 #[test]
-fn a_suite_is_flown_entry_by_entry_alike_on_any_number_of_threads() {
+fn a_suite_has_the_same_result_on_any_number_of_threads() {
     let folder = run_folder();
     let text = r#"
         name = "three ways"
@@ -190,13 +190,14 @@ fn a_suite_is_flown_entry_by_entry_alike_on_any_number_of_threads() {
         [("as it is", 3), ("in any order", 5), ("new courses", 3)]
     );
     for entry in &report.courses {
-        let failed =
-            |failures: &Failures| failures.hit_wall + failures.hit_corridor + failures.timed_out;
+        let failed = |failures: &WallFailures| {
+            failures.hit_wall + failures.hit_corridor + failures.timed_out
+        };
         let failures: u64 = entry.failures.iter().map(failed).sum();
         assert_eq!(failures + entry.reached_end, entry.episodes, "{entry:?}");
         assert_eq!(entry.failures.len(), 6);
     }
-    // The first entry is the course as a file, flown undisturbed.
+    // The first entry is the course file, flown without disturbances.
     let output = evaluate(
         folder.path(),
         &[
@@ -259,7 +260,7 @@ fn files_that_cannot_be_written_are_refused_before_anything_is_flown() {
 }
 
 #[test]
-fn an_evaluation_that_fails_leaves_no_file_and_changes_none() {
+fn a_failed_evaluation_creates_and_changes_no_file() {
     let folder = run_folder();
     let at = folder.path();
     std::fs::write(at.join("earlier.json"), "earlier").unwrap();

@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use skein_protocol::config::Config;
-use skein_protocol::summary::Ending;
+use skein_protocol::summary::RunEnding;
 use skein_run::RunDirectory;
 use skein_run::failure::with_causes;
 
@@ -234,7 +234,7 @@ impl PlannedRun {
             ));
         }
         match self.directory.summary() {
-            Some(summary) if summary.ending == Ending::Completed => {
+            Some(summary) if summary.ending == RunEnding::Completed => {
                 let is_flown = self
                     .suite_json
                     .as_ref()
@@ -253,7 +253,7 @@ impl PlannedRun {
             }
             _ => {}
         }
-        match self.directory.is_under_way() {
+        match self.directory.is_running() {
             Ok(false) => Ok(RunState::Begun),
             Ok(true) => Ok(RunState::UnderWay),
             Err(error) => Err(format!("  {root}: {}", with_causes(&error))),

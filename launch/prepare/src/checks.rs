@@ -4,7 +4,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use skein_protocol::config::{Config, ConfirmOn, culprit};
+use skein_protocol::config::{Config, ConfirmOn, failing_override};
 use skein_simulator::course::Course;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 
@@ -112,7 +112,7 @@ pub(super) fn blame(
             .and_then(|config| check(config_file, &config, actors));
         checked.err().map(|error| error.to_string())
     };
-    match culprit(overrides, message_for) {
+    match failing_override(overrides, message_for) {
         Some(text) => PrepareError::Overridden {
             text: text.clone(),
             source: Box::new(error),

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::statvfs;
 use skein_protocol::config::{Config, CriticInput, EncoderTraining};
 use skein_protocol::snapshot::SnapshotLayout;
-use skein_protocol::{ACTION, IMAGE_PIXELS, TRUE_STATE};
+use skein_protocol::{ACTION, IMAGE_PIXELS, PRIVILEGED_STATE};
 use skein_transport::shared_memory_needed;
 
 /// Folder of iceoryx2's segments.
@@ -140,15 +140,16 @@ pub fn scarce_disk(config: &Config, directory: &Path) -> Option<String> {
 /// Returns the bytes of a checkpoint whose replay buffer is full, with its depth images.
 fn checkpoint_bytes(config: &Config) -> u64 {
     let learning = &config.learning;
-    let records = (config.transport.max_records_per_episode * learning.times_stored()) as u64;
+    let records =
+        (config.transport.max_records_per_episode * learning.copies_per_transition()) as u64;
     let rows = (config.replay.capacity as u64).min(config.run.episodes.saturating_mul(records));
     let message = match learning.critic_input {
         CriticInput::Observation => 0,
-        CriticInput::GroundTruth => TRUE_STATE,
+        CriticInput::GroundTruth => PRIVILEGED_STATE,
     };
-    let row = 4 * (2 * (config.view().len() + message) + ACTION + 2) as u64;
+    let row = 4 * (2 * (config.observation_layout().len() + message) + ACTION + 2) as u64;
     let steps = match learning.encoder {
-        EncoderTraining::Vae => config.vae.train_steps * learning.times_stored(),
+        EncoderTraining::Vae => config.vae.train_steps * learning.copies_per_transition(),
         EncoderTraining::EndToEnd => config.replay.capacity,
     };
     let images = 2 * steps as u64 + learning.episodes_per_epoch * records;

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use plotters::prelude::*;
 use serde::Deserialize;
-use skein_protocol::transition::{LARGEST_NUMBER, Outcome};
+use skein_protocol::transition::{MAX_MAGNITUDE, Outcome};
 use skein_simulator::course::{Course, Wall};
 
 use super::ReportError;
@@ -67,7 +67,7 @@ pub(super) fn read_trajectories(path: &Path) -> Result<TrajectoriesByCourse, Rep
         let at_m = [row.x_m, row.y_m, row.z_m];
         if !at_m
             .iter()
-            .all(|metres| (-LARGEST_NUMBER..=LARGEST_NUMBER).contains(metres))
+            .all(|metres| (-MAX_MAGNITUDE..=MAX_MAGNITUDE).contains(metres))
         {
             let line = rows.reader().position().line() - 1;
             return Err(malformed(format!(

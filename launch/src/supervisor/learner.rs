@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use skein_protocol::progress::Progress;
-use skein_run::failure::EXIT_START_AGAIN;
+use skein_protocol::progress::ProgressReport;
+use skein_run::failure::EXIT_RESTART;
 use tokio::io::{AsyncBufReadExt, BufReader, Lines};
 use tokio::process::ChildStdout;
 use tokio::sync::{mpsc, watch};
@@ -123,7 +123,7 @@ impl<'a> LearnerProcess<'a> {
     }
 
     /// Records a report.
-    pub(super) fn reported(&mut self, progress: &Progress) -> News {
+    pub(super) fn reported(&mut self, progress: &ProgressReport) -> News {
         let (heard, done) = (Instant::now(), WorkDone::of(progress));
         self.deaths.reached(done);
         match std::mem::replace(&mut self.state, LearnerState::Dead) {
@@ -258,7 +258,7 @@ impl<'a> LearnerProcess<'a> {
 
     /// Returns the reason given by a learner that asks for a restart.
     fn reason_given(&self, exit: &Exit) -> String {
-        (*exit == Exit::Status(EXIT_START_AGAIN.into()))
+        (*exit == Exit::Status(EXIT_RESTART.into()))
             .then(|| last_words(&self.plan.run.learner_log(), &self.plan.programs.learner))
             .flatten()
             .map_or(String::new(), |words| format!(" (\"{words}\")"))

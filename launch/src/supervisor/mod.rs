@@ -32,7 +32,7 @@ use std::time::Duration;
 
 use skein_protocol::config::Config;
 use skein_protocol::ids::ActorId;
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
 use skein_run::RunDirectory;
 
 use process::Exit;
@@ -47,7 +47,7 @@ const EVENTS: usize = 64;
 /// Programs of a run.
 #[derive(Debug, Clone)]
 pub struct Programs {
-    /// Takes `--run DIR`; writes [`Progress`] as JSON lines on its standard output.
+    /// Takes `--run DIR`; writes [`ProgressReport`] as JSON lines on its standard output.
     pub learner: PathBuf,
     /// Takes `--run DIR --id K`.
     pub actor: PathBuf,
@@ -153,7 +153,7 @@ pub struct Restarts {
 /// Observer of a supervised run.
 pub trait Watcher {
     /// Handles a report of the learner.
-    fn progress(&mut self, progress: &Progress, restarts: Restarts);
+    fn progress(&mut self, progress: &ProgressReport, restarts: Restarts);
     /// Handles a warning for the user.
     fn warn(&mut self, text: &str);
 }

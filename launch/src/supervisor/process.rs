@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
 use rustix::process::{Pid, Signal, kill_process};
-use skein_run::failure::{EXIT_LEARNER_GONE, EXIT_START_AGAIN};
+use skein_run::failure::{EXIT_LEARNER_GONE, EXIT_RESTART};
 use tokio::process::{Child, Command};
 use tokio::sync::watch;
 
@@ -72,7 +72,7 @@ impl Exit {
     /// An error that the program reported itself would only repeat.
     pub(super) fn may_recover(&self) -> bool {
         match *self {
-            Self::Status(status) => status == PANICKED || status == i32::from(EXIT_START_AGAIN),
+            Self::Status(status) => status == PANICKED || status == i32::from(EXIT_RESTART),
             Self::Signal(_) | Self::Unknown(_) => true,
         }
     }

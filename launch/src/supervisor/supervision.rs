@@ -3,7 +3,7 @@
 use std::ops::ControlFlow::{self, Break, Continue};
 use std::time::Duration;
 
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
 use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep_until};
 
@@ -108,7 +108,7 @@ impl<W: Watcher> Supervision<'_, W> {
         Continue(())
     }
 
-    fn reported(&mut self, progress: &Progress) {
+    fn reported(&mut self, progress: &ProgressReport) {
         let restarts = Restarts {
             learner: self.learner.restarts(),
             actors: self.crew.restarts(),

@@ -1,6 +1,6 @@
 //! Work done by a run, as shown by the learner's reports.
 
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
 
 /// Work done by a run. More work compares greater: first by episodes, then by the updates made from
 /// them.
@@ -13,7 +13,7 @@ pub(super) struct WorkDone {
 }
 
 impl WorkDone {
-    pub(super) fn of(progress: &Progress) -> Self {
+    pub(super) fn of(progress: &ProgressReport) -> Self {
         Self {
             episodes: progress.episodes,
             vae_updates: progress.vae_updates,

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, ActorIncarnation, PolicyVersion};
-use skein_protocol::stages::Times;
+use skein_protocol::stages::StageTimes;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind};
@@ -138,7 +138,7 @@ impl SyntheticActor {
             // As if a snapshot had arrived.
             newest_policy: Some(PolicyVersion(0)),
             episodes_flown: 0,
-            times: Times::default(),
+            times: StageTimes::default(),
         };
         self.ports
             .send_status(StatusRecord::new(self.ports.run(), &status))

@@ -11,7 +11,7 @@ use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
 use skein_run::durable;
-use skein_run::fault::{FaultPoint, pass};
+use skein_run::fault::{FaultPoint, die_if_armed};
 
 use super::manifest::Manifest;
 use super::{CheckpointError, CheckpointState, TrainingProgress};
@@ -56,9 +56,9 @@ pub(super) fn write(
         .map(|tensor| (tensor.name.clone(), BorrowedTensor::of(tensor)))
         .collect();
     write_tensors(&directory.join(TENSORS), tensors)?;
-    pass(FaultPoint::CheckpointTensors);
+    die_if_armed(FaultPoint::CheckpointTensors);
     write_tensors(&directory.join(REPLAY), replay_tensors(&state.replay))?;
-    pass(FaultPoint::CheckpointReplay);
+    die_if_armed(FaultPoint::CheckpointReplay);
     let snapshots = state
         .snapshots
         .iter()
@@ -84,7 +84,7 @@ pub(super) fn write(
         .expect("progress consists of numbers, texts and lists of them");
     write_bytes(&directory.join(PROGRESS), &bytes)?;
     write_bytes(&directory.join(CONFIG), config.as_bytes())?;
-    pass(FaultPoint::CheckpointProgress);
+    die_if_armed(FaultPoint::CheckpointProgress);
     Ok(())
 }
 

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use skein_protocol::config::Config;
 use skein_run::durable;
-use skein_run::fault::{FaultPoint, pass};
+use skein_run::fault::{FaultPoint, die_if_armed};
 use tracing::warn;
 
 use super::manifest::{self, Manifest};
@@ -77,12 +77,12 @@ impl CheckpointStore {
             remove(&aside)?;
             return Err(error);
         }
-        pass(FaultPoint::CheckpointSynced);
+        die_if_armed(FaultPoint::CheckpointSynced);
         let place = checkpoint_directory(&self.directory, episodes);
         self.make_way(&place)?;
         fs::rename(&aside, &place).map_err(CheckpointError::io("rename into place", &aside))?;
         sync(&self.directory)?;
-        pass(FaultPoint::CheckpointRenamed);
+        die_if_armed(FaultPoint::CheckpointRenamed);
         self.remove_others(episodes)?;
         Ok(place)
     }
@@ -94,10 +94,10 @@ impl CheckpointStore {
         relied_on: &[PathBuf],
     ) -> Result<(), CheckpointError> {
         durable::create_private_directory(aside).map_err(CheckpointError::io("create", aside))?;
-        pass(FaultPoint::CheckpointCreated);
+        die_if_armed(FaultPoint::CheckpointCreated);
         files::write(aside, state, &self.config.portable())?;
         self.seal(aside, state.progress.episodes)?;
-        pass(FaultPoint::CheckpointManifest);
+        die_if_armed(FaultPoint::CheckpointManifest);
         for name in files::NAMES.iter().chain([&manifest::NAME]) {
             sync(&aside.join(name))?;
         }
@@ -305,7 +305,7 @@ impl CheckpointStore {
         let aside = self.directory.join(".removing");
         remove(&aside)?;
         fs::rename(place, &aside).map_err(CheckpointError::io("rename", place))?;
-        pass(FaultPoint::CheckpointRetired);
+        die_if_armed(FaultPoint::CheckpointRetired);
         remove(&aside)
     }
 }

@@ -330,7 +330,7 @@ fn nothing_of(order: &EpisodeOrder, actor: ActorId) -> CommittedEpisode {
     let flown: &[[f32; ACTION]] = ticket
         .segment
         .as_ref()
-        .map_or(&[], |segment| &segment.flown);
+        .map_or(&[], |segment| &segment.prior_actions);
     CommittedEpisode {
         episode: ticket.episode,
         epoch: order.epoch,

@@ -134,7 +134,7 @@ fn an_episode_that_never_ends_is_refused_at_its_limit() {
 fn segment(begins: Option<SegmentEnd>) -> Assembly {
     let segment = Segment {
         steps: 2,
-        flown: vec![[0.25, -0.5]].into(),
+        prior_actions: vec![[0.25, -0.5]].into(),
     };
     let ticket = Ticket {
         segment: Some(segment),
@@ -237,7 +237,7 @@ fn a_segment_that_is_too_short_or_too_long_or_of_a_whole_episode_is_refused() {
 #[test]
 fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passed() {
     let seen = StepObservation {
-        latent: [9.0; skein_protocol::LONGEST_LATENT],
+        latent: [9.0; skein_protocol::MAX_LATENT],
         velocity_mps: [1.0, 0.5, 0.0],
         position_m: [3.0, 0.0, 2.0],
         orientation: [0.0, 0.0, 0.0, 1.0],

@@ -14,9 +14,9 @@ use std::time::{Duration, Instant};
 
 use skein_protocol::config::TransportSection;
 use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, RunId};
-use skein_protocol::stages::Times;
+use skein_protocol::stages::StageTimes;
 use skein_protocol::status::{ActorState, ActorStatus};
-use skein_protocol::ticket::{ControlRecord, Message, Ticket};
+use skein_protocol::ticket::{ControlMessage, ControlRecord, Ticket};
 use skein_protocol::transition::{RecordFault, TransitionRecord};
 
 use super::assembly::{Assembled, Assembly, SegmentEnd};
@@ -44,9 +44,9 @@ pub struct Dispatcher {
     failures: EpisodeFailures,
     faults: Faults,
     /// Time by stage of actors that are gone.
-    times_of_departed: Times,
+    times_of_departed: StageTimes,
     /// Messages to actors other than tickets.
-    control_messages: Vec<Message>,
+    control_messages: Vec<ControlMessage>,
     /// `true` if a message was sent to an actor that may be waiting to be woken.
     is_wake_due: bool,
     /// End of the last segment, if its episode continues.
@@ -63,15 +63,15 @@ struct AttachedActor {
     spoiled: u32,
     /// Its time by stage when first heard. An actor taken for dead by mistake is thus not counted
     /// twice.
-    first_times: Times,
-    times: Times,
+    first_times: StageTimes,
+    times: StageTimes,
     /// `true` if it may be waiting for a ticket: no record for a ticket issued after its last
     /// heartbeat has arrived.
     may_wait: bool,
 }
 
 impl AttachedActor {
-    fn times_since_first_heard(&self) -> Times {
+    fn times_since_first_heard(&self) -> StageTimes {
         self.times.since(&self.first_times)
     }
 
@@ -106,7 +106,7 @@ impl Dispatcher {
             actors: BTreeMap::new(),
             failures: EpisodeFailures::default(),
             faults: Faults::default(),
-            times_of_departed: Times::default(),
+            times_of_departed: StageTimes::default(),
             control_messages: Vec::new(),
             is_wake_due: false,
             segment_end: None,
@@ -124,7 +124,7 @@ impl Dispatcher {
     }
 
     /// Time by stage of all actors, as last reported.
-    pub fn actor_times(&self) -> Times {
+    pub fn actor_times(&self) -> StageTimes {
         let living = self
             .actors
             .values()
@@ -379,7 +379,7 @@ impl Dispatcher {
                 // direction. A new connection is not.
                 if issued.assembly.is_empty() {
                     let rejoin = ControlRecord::rejoin(self.run, id, actor.incarnation);
-                    self.control_messages.push(Message::Control(rejoin));
+                    self.control_messages.push(ControlMessage::Control(rejoin));
                 }
                 self.spoil_first(id, Reissue::Late);
                 self.restart_clock(id, now);
@@ -391,7 +391,7 @@ impl Dispatcher {
     /// Issues tickets while there are orders, and actors with credit. Every actor gets its first
     /// ticket before any gets a second. An actor that spoils every episode gets none while there
     /// are others. Returns the messages to send.
-    pub fn issue(&mut self, now: Instant) -> Vec<Message> {
+    pub fn issue(&mut self, now: Instant) -> Vec<ControlMessage> {
         let mut messages = std::mem::take(&mut self.control_messages);
         self.is_wake_due |= !messages.is_empty();
         let credit = self.limits.tickets_per_actor;
@@ -407,7 +407,7 @@ impl Dispatcher {
             let Some(order) = self.waiting.pop_front() else {
                 break;
             };
-            messages.push(Message::fly(&order.ticket, id, actor.incarnation));
+            messages.push(ControlMessage::fly(&order.ticket, id, actor.incarnation));
             let begins = self.segment_end.filter(|end| end.is_before(&order));
             let longest = self.limits.max_records_per_episode;
             let assembly =

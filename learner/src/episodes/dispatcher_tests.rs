@@ -66,7 +66,7 @@ fn status(actor: u32, incarnation: ActorIncarnation) -> ActorStatus {
         state: ActorState::Serving,
         newest_policy: None,
         episodes_flown: 0,
-        times: Times::default(),
+        times: StageTimes::default(),
     }
 }
 
@@ -91,7 +91,7 @@ fn flown(
 
 /// Tickets issued to `actor`.
 pub(super) fn tickets_for(
-    messages: &[Message],
+    messages: &[ControlMessage],
     actor: u32,
     incarnation: ActorIncarnation,
 ) -> Vec<Ticket> {

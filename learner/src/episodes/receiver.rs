@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use skein_protocol::config::Config;
 use skein_protocol::ids::Epoch;
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::stages::Times;
+use skein_protocol::stages::StageTimes;
 use skein_protocol::ticket::Ticket;
 use skein_run::failure::with_causes;
 use skein_run::{LearnerIncarnation, RunIdentity};
@@ -51,7 +51,7 @@ pub struct Shared {
     /// Attached actors, in ascending order.
     live_actors: RwLock<Vec<u32>>,
     faults: RwLock<Faults>,
-    times: RwLock<Times>,
+    times: RwLock<StageTimes>,
     situation: RwLock<Option<(Instant, Situation)>>,
     /// Reason why the receiving thread ended early.
     failure: RwLock<Option<ReceiverError>>,
@@ -234,7 +234,7 @@ impl Shared {
 
     /// Time by stage of the receiving thread and all actors since the learner's start, as last
     /// reported by each.
-    pub fn times(&self) -> Times {
+    pub fn times(&self) -> StageTimes {
         *self.times.read().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -279,7 +279,7 @@ impl Shared {
         *self.faults.write().unwrap_or_else(PoisonError::into_inner) = dispatcher.faults();
     }
 
-    pub(super) fn update_times(&self, times: Times) {
+    pub(super) fn update_times(&self, times: StageTimes) {
         *self.times.write().unwrap_or_else(PoisonError::into_inner) = times;
     }
 

@@ -14,7 +14,7 @@ fn segment(flown: usize) -> EpisodeOrder {
     let mut order = order(0);
     order.ticket.segment = Some(Segment {
         steps: 1,
-        flown: vec![[0.0, 0.0]; flown].into(),
+        prior_actions: vec![[0.0, 0.0]; flown].into(),
     });
     order.place.batch = flown as u64;
     order

@@ -16,9 +16,9 @@ use skein_protocol::config::Config;
 use skein_protocol::ids::RunId;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::{LapTimer, Stage};
-use skein_protocol::ticket::{ControlRecord, Message};
+use skein_protocol::ticket::{ControlMessage, ControlRecord};
 use skein_run::RunIdentity;
-use skein_run::fault::{FaultPoint, pass};
+use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_transport::{LearnerPorts, ServiceError};
 
 use super::dispatcher::{BatchPlace, Dispatcher, EpisodeOrder, HopelessEpisode};
@@ -58,7 +58,7 @@ struct Delivery {
 
 enum Outgoing {
     Snapshot(Snapshot),
-    Message(Message),
+    Message(ControlMessage),
 }
 
 /// Request of the training thread, besides its commands.
@@ -237,7 +237,7 @@ impl Server {
         delivery.early.insert(place.index, episode);
         while let Some(episode) = delivery.early.remove(&delivery.next) {
             delivery.next += 1;
-            pass(FaultPoint::LearnerEpisodeCommitted);
+            die_if_armed(FaultPoint::LearnerEpisodeCommitted);
             // A training thread that no longer waits has been stopped.
             let _ = delivery.to.send(episode);
         }

@@ -24,7 +24,7 @@ mod tests;
 use std::sync::Arc;
 
 use rand::{Rng, RngExt};
-use skein_protocol::config::{Config, EncoderTraining, ReplaySection, View};
+use skein_protocol::config::{Config, EncoderTraining, ObservationLayout, ReplaySection};
 use skein_protocol::ids::EpisodeId;
 use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode};
 
@@ -40,7 +40,7 @@ use success::success_steps;
 #[derive(Debug)]
 pub struct Replay {
     section: ReplaySection,
-    view: View,
+    view: ObservationLayout,
     success: Ring,
     regular: Ring,
     /// Depth images: kept until the VAE is frozen, or for the whole run where the policy learns
@@ -67,7 +67,7 @@ pub struct Minibatch {
     pub rewards: Vec<f32>,
     /// Observations after the action, `[batch, observation]`.
     pub next_observations: Vec<f32>,
-    /// Critic inputs before the action, `[batch, TRUE_STATE]`; empty if the critic sees the
+    /// Critic inputs before the action, `[batch, PRIVILEGED_STATE]`; empty if the critic sees the
     /// observation.
     pub true_states: Vec<f32>,
     /// Critic inputs after the action, likewise.
@@ -127,7 +127,7 @@ pub enum InsertError {
 impl Replay {
     /// Creates an empty buffer for the run that `config` describes.
     pub fn new(config: &Config) -> Self {
-        let view = config.view();
+        let view = config.observation_layout();
         let layout = RowLayout::of(config);
         let (success, regular) = capacities(&config.replay);
         Self {
@@ -389,12 +389,12 @@ fn image_limit(config: &Config) -> usize {
         EncoderTraining::Vae => config.vae.train_steps,
         EncoderTraining::EndToEnd => config.replay.capacity,
     };
-    2 * steps * config.learning.times_stored() + epoch_images(config)
+    2 * steps * config.learning.copies_per_transition() + epoch_images(config)
 }
 
 /// Largest number of images in an epoch's episodes.
 fn epoch_images(config: &Config) -> usize {
     config.learning.episodes_per_epoch as usize
         * config.transport.max_records_per_episode
-        * config.learning.times_stored()
+        * config.learning.copies_per_transition()
 }

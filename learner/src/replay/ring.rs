@@ -4,8 +4,8 @@
 //! in memory. Cache misses limit the reading of random rows: a row costs one run of neighbouring
 //! cache lines, where one table per quantity would cost one miss each.
 
-use skein_protocol::config::{Config, CriticInput, View};
-use skein_protocol::{ACTION, LatentCode, TRUE_STATE};
+use skein_protocol::config::{Config, CriticInput, ObservationLayout};
+use skein_protocol::{ACTION, LatentCode, PRIVILEGED_STATE};
 
 /// Layout of a row: observation, next observation, true state, next true state, action, reward,
 /// terminated, all `f32`.
@@ -44,10 +44,10 @@ impl RowLayout {
     /// Returns the layout for the run that `config` describes.
     pub(super) fn of(config: &Config) -> Self {
         Self {
-            observation: config.view().len(),
+            observation: config.observation_layout().len(),
             true_state: match config.learning.critic_input {
                 CriticInput::Observation => 0,
-                CriticInput::GroundTruth => TRUE_STATE,
+                CriticInput::GroundTruth => PRIVILEGED_STATE,
             },
         }
     }
@@ -215,7 +215,7 @@ impl Ring {
     /// `first_of_episode` returns the number of the first image of an image's episode.
     pub(super) fn replace_latents(
         &mut self,
-        view: &View,
+        view: &ObservationLayout,
         latents: &[LatentCode],
         first_of_episode: impl Fn(u32) -> u32,
     ) {
@@ -228,8 +228,8 @@ impl Ring {
             let first = first_of_episode(image);
             let (episode, step) = (&latents[first as usize..], (image - first) as usize);
             for (step, observation) in [(step, row.observation), (step + 1, row.next_observation)] {
-                let moments = observation.chunks_exact_mut(view.moment_len());
-                for (moment, seen) in view.moments(step).zip(moments) {
+                let moments = observation.chunks_exact_mut(view.step_len());
+                for (moment, seen) in view.seen_steps(step).zip(moments) {
                     view.write_code(&episode[moment], seen);
                 }
             }

@@ -1,7 +1,7 @@
 //! The whole update on both engines: exactness, determinism, and that it learns.
 
 use skein_kernels::{Isa, Team};
-use skein_protocol::config::{Engine, Observation, SacSection, View};
+use skein_protocol::config::{Engine, Observation, ObservationLayout, SacSection};
 use skein_protocol::snapshot::SnapshotLayout;
 use tch::{Device, Tensor, no_grad_guard};
 
@@ -183,7 +183,10 @@ fn a_truncated_episode_still_bootstraps() {
 fn the_published_part_is_the_snapshots_policy() {
     for engine in ENGINES {
         let mut sac = sac(engine, &small(), 1);
-        let layout = SnapshotLayout::new(&View::present(Observation::Latent, OBSERVATION), 32);
+        let layout = SnapshotLayout::new(
+            &ObservationLayout::present(Observation::Latent, OBSERVATION),
+            32,
+        );
         assert_eq!(layout.policy().len(), sac.policy_layout().len());
         let policys = layout
             .tensors()

@@ -4,11 +4,11 @@
 use std::ops::Range;
 
 use skein_protocol::ids::{Epoch, PolicyVersion};
-use skein_protocol::progress::Phase;
+use skein_protocol::progress::LearnerPhase;
 use skein_protocol::stages::Stage;
 use skein_protocol::summary::Trained;
 use skein_protocol::ticket::Ticket;
-use skein_run::fault::{FaultPoint, pass};
+use skein_run::fault::{FaultPoint, die_if_armed};
 
 use super::{Training, TrainingError};
 use crate::best::{is_better, is_candidate};
@@ -33,7 +33,7 @@ impl Training<'_> {
         let (run, number) = (self.identity.run, self.progress.evaluations);
         let tickets = curriculum::confirmation(self.config, run, number, version);
         let flown = self.evaluate(tickets, KeptData::Latents)?;
-        pass(FaultPoint::LearnerCandidateFlown);
+        die_if_armed(FaultPoint::LearnerCandidateFlown);
         self.note_trained(&flown);
         let passed: f64 = flown
             .iter()
@@ -71,7 +71,7 @@ impl Training<'_> {
         if is_better(&candidate, best) {
             self.progress.best = Some(candidate);
             self.save_snapshot(version, &self.directory.best_snapshot())?;
-            pass(FaultPoint::LearnerBestSaved);
+            die_if_armed(FaultPoint::LearnerBestSaved);
         }
         Ok(())
     }
@@ -141,7 +141,7 @@ impl Training<'_> {
         self.timer.lap(Stage::OtherTraining, 0);
         let total = tickets.len() as u64;
         self.reporter.update(|progress| {
-            progress.phase = Phase::Evaluating;
+            progress.phase = LearnerPhase::Evaluating;
             progress.evaluation_episodes = (0, total);
         });
         let mut batch = self
@@ -182,7 +182,7 @@ impl Training<'_> {
             KeptData::Latents,
         )?;
         let pictured = self.evaluate_on(version, 0..1, 1, KeptData::Depth)?;
-        pass(FaultPoint::LearnerEvaluated);
+        die_if_armed(FaultPoint::LearnerEvaluated);
         Ok(self.disk.with_room(self.directory.root(), || {
             evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;
             evaluation::write_reconstructions(self.directory, &mut self.trainer, &pictured)

@@ -9,11 +9,11 @@ use std::{fs, io};
 
 use skein_protocol::config::Config;
 use skein_protocol::ids::PolicyVersion;
-use skein_protocol::progress::{self, Phase};
+use skein_protocol::progress::{self, LearnerPhase};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
-use skein_protocol::summary::{Ending, Summary};
-use skein_run::fault::{FaultPoint, pass};
+use skein_protocol::summary::{RunEnding, Summary};
+use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity, save_snapshot};
 
 use super::{EpochCurves, StopMonitor, Training, TrainingError};
@@ -241,7 +241,7 @@ impl<'a> Training<'a> {
     /// Saves everything; returns the progress.
     pub(super) fn save(&mut self) -> Result<TrainingProgress, TrainingError> {
         self.reporter
-            .update(|progress| progress.phase = Phase::Finishing);
+            .update(|progress| progress.phase = LearnerPhase::Finishing);
         self.metrics.flush()?;
         self.checkpoint()?;
         self.timer.lap(Stage::OtherTraining, 0);
@@ -257,7 +257,7 @@ impl<'a> Training<'a> {
             "stopped, and the end of the epoch takes too long: back to the newest checkpoint"
         );
         self.reporter
-            .update(|progress| progress.phase = Phase::Finishing);
+            .update(|progress| progress.phase = LearnerPhase::Finishing);
         // Flush before the files are cut, so that nothing follows later.
         self.metrics.flush()?;
         self.metrics = resume_metrics(self.directory, &self.saved, &self.disk)?;
@@ -271,7 +271,7 @@ impl<'a> Training<'a> {
     /// needs its actors.
     pub(super) fn conclude(
         self,
-        end: Result<(Ending, TrainingProgress), TrainingError>,
+        end: Result<(RunEnding, TrainingProgress), TrainingError>,
     ) -> Result<Summary, TrainingError> {
         // The times of a thread are gone once it has ended.
         let thread_cpu_secs = threads::cpu_secs();
@@ -301,7 +301,7 @@ fn save_summary(
     disk: &Disk,
     summary: &Summary,
 ) -> Result<(), TrainingError> {
-    pass(FaultPoint::LearnerBeforeSummary);
+    die_if_armed(FaultPoint::LearnerBeforeSummary);
     let path = directory.summary_json();
     disk.with_room(&path, || directory.save_summary(summary))
         .map_err(file_error(&path))
@@ -386,9 +386,9 @@ fn restore(
 }
 
 /// First report of this incarnation.
-fn first_report(config: &Config, saved: &TrainingProgress) -> progress::Progress {
+fn first_report(config: &Config, saved: &TrainingProgress) -> progress::ProgressReport {
     let windows = &saved.metrics.windows;
-    progress::Progress {
+    progress::ProgressReport {
         episodes: saved.episodes,
         steps: saved.environment_steps,
         updates: saved.policy_updates,
@@ -396,14 +396,14 @@ fn first_report(config: &Config, saved: &TrainingProgress) -> progress::Progress
         walls_passed: windows.walls_passed.mean(),
         mean_return: windows.total_reward.mean(),
         elapsed_secs: saved.spent.wall_secs,
-        ..progress::Progress::start(config.run.episodes)
+        ..progress::ProgressReport::start(config.run.episodes)
     }
 }
 
 fn summary(
     identity: &RunIdentity,
     config: &Config,
-    ending: Ending,
+    ending: RunEnding,
     progress: &TrainingProgress,
     resumes: u64,
 ) -> Summary {

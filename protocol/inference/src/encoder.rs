@@ -11,7 +11,7 @@ use skein_kernels::{Finish, Isa, Matrix, Panels, Rows, Start, Team, Windows, pro
 use skein_protocol::snapshot::{
     ENCODER_CHANNELS as CHANNELS, ENCODER_FEATURES as FEATURES, ENCODER_KERNEL as KERNEL,
 };
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LONGEST_LATENT, LatentCode};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LatentCode, MAX_LATENT};
 
 use crate::linear::Linear;
 
@@ -77,7 +77,7 @@ impl Encoder {
             convolution.apply(input, output);
             std::mem::swap(input, output);
         }
-        let mut latent = [0.0; LONGEST_LATENT];
+        let mut latent = [0.0; MAX_LATENT];
         self.mean
             .apply(input, Finish::Plain, &mut latent[..self.mean.outputs()]);
         latent
@@ -90,7 +90,7 @@ impl Encoder {
     pub fn encode_all(&self, team: &mut Team, images: &[u8]) -> Vec<LatentCode> {
         let (images, rest) = images.as_chunks::<IMAGE_PIXELS>();
         assert!(rest.is_empty(), "{} pixels are no whole image", rest.len());
-        let mut latents = vec![[0.0; LONGEST_LATENT]; images.len()];
+        let mut latents = vec![[0.0; MAX_LATENT]; images.len()];
         team.split_rows(&mut latents, 1, 1, |first, latents| {
             let mut scratch = EncoderScratch::default();
             for (latent, image) in latents.iter_mut().zip(&images[first..]) {
@@ -157,11 +157,12 @@ mod tests {
     use super::*;
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64Mcg;
-    use skein_protocol::config::{Observation, View};
+    use skein_protocol::config::{Observation, ObservationLayout};
     use skein_protocol::snapshot::SnapshotLayout;
 
     fn parameters(latent: usize, seed: u64) -> (SnapshotLayout, Vec<f32>) {
-        let layout = SnapshotLayout::new(&View::present(Observation::Latent, latent), 1);
+        let layout =
+            SnapshotLayout::new(&ObservationLayout::present(Observation::Latent, latent), 1);
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let mut values = vec![0.0; layout.values()];
         for tensor in layout.tensors() {

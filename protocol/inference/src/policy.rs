@@ -62,7 +62,7 @@ impl Policy {
         Self { layers, head }
     }
 
-    /// Returns the distribution of the action for an observation, `[View::len]`.
+    /// Returns the distribution of the action for an observation, `[ObservationLayout::len]`.
     ///
     /// # Panics
     /// If `observation` does not have the length that the policy was trained on.

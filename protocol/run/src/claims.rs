@@ -1,7 +1,7 @@
-//! Which actor has which number: held by locks that end with the process that holds them.
+//! Actor numbers, claimed by locks that end with their process.
 //!
-//! A lock is never in the way of the dead: the kernel frees it however its process ended. Files
-//! that are locked stay; only the lock counts.
+//! A dead process blocks no number: the kernel releases its lock. Locked files stay; only the lock
+//! counts.
 
 use std::fs::{File, OpenOptions};
 use std::path::PathBuf;
@@ -12,7 +12,8 @@ use rustix::io::Errno;
 use crate::{RunDirectory, RunError};
 use skein_protocol::ids::ActorId;
 
-/// An actor's number, which nobody else has while this is alive: a lock on the actor's log.
+/// Claim to an actor's number, held as a lock on the actor's log. No other process has the number
+/// while this value exists.
 #[derive(Debug)]
 pub struct ActorClaim {
     id: ActorId,
@@ -20,15 +21,15 @@ pub struct ActorClaim {
 }
 
 impl ActorClaim {
-    /// The number.
+    /// Returns the number.
     pub fn id(&self) -> ActorId {
         self.id
     }
 }
 
 impl RunDirectory {
-    /// Claims the lowest number that no actor of this run has at present. Logs are appended to, so
-    /// that a number whose actor is gone can be used again.
+    /// Claims the lowest number that no actor of this run uses. Logs are appended to, so a number
+    /// can be reused after its actor has ended.
     ///
     /// # Errors
     /// [`RunError::Io`] names the log that cannot be written.
@@ -40,11 +41,11 @@ impl RunDirectory {
                 return Ok(ActorClaim { id, _lock: lock });
             }
         }
-        unreachable!("the numbers of four thousand million actors are taken")
+        unreachable!("all 2^32 actor numbers are taken")
     }
 }
 
-/// `file`, locked; `None` when somebody else has locked it.
+/// Returns `file` locked, or `None` if another process has locked it.
 fn locked(path: PathBuf, file: std::io::Result<File>) -> Result<Option<File>, RunError> {
     let outcome =
         file.and_then(

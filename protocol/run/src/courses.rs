@@ -1,4 +1,4 @@
-//! The copies of the course files: a run flies through those it was started with, or not at all.
+//! Checksums of the copied course files: a run flies exactly the courses it was started with.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -10,7 +10,7 @@ use xxhash_rust::xxh3::xxh3_64;
 use super::RunError;
 use skein_protocol::config::Config;
 
-/// Checksum of each file in `folder`, by its name; of a folder that does not exist, none.
+/// Returns the checksum of each file in `folder` by its name; none if the folder does not exist.
 pub(super) fn checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {
     let entries = match fs::read_dir(folder) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(BTreeMap::new()),
@@ -19,7 +19,7 @@ pub(super) fn checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {
     let mut checksums = BTreeMap::new();
     for entry in entries {
         let entry = entry?;
-        // A name that is not UTF-8 cannot stand in the configuration: no course of the run.
+        // The configuration holds only UTF-8 names, so this is not a course of the run.
         if let Ok(name) = entry.file_name().into_string() {
             checksums.insert(name, checksum(&entry.path())?);
         }
@@ -27,8 +27,7 @@ pub(super) fn checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {
     Ok(checksums)
 }
 
-/// Checks that the files in `folder` are those of `checksums`, and that the run flies through no
-/// others.
+/// Checks that the files in `folder` match `checksums`, and that the run uses no others.
 pub(super) fn verify(
     folder: &Path,
     checksums: &BTreeMap<String, String>,
@@ -38,12 +37,12 @@ pub(super) fn verify(
         let name = path.file_name().and_then(|name| name.to_str());
         let is_known =
             path.parent() == Some(folder) && name.is_some_and(|name| checksums.contains_key(name));
-        // A run that was created without copies vouches for none.
+        // A run created without copies has no checksums.
         if !checksums.is_empty() && !is_known {
             return Err(RunError::CourseChanged {
                 path: path.clone(),
                 problem: format!(
-                    "is none of the courses in {} that the run was started with",
+                    "is not one of the courses in {} that the run was started with",
                     folder.display()
                 ),
             });
@@ -52,12 +51,13 @@ pub(super) fn verify(
     for (name, expected) in checksums {
         let path = folder.join(name);
         let problem = if Path::new(name).file_name() != Some(name.as_ref()) {
-            Some("is no name of a course file".to_owned())
+            Some("is not a file name".to_owned())
         } else {
             match checksum(&path) {
                 Ok(found) => (found != *expected).then(|| {
                     format!(
-                        "was changed since the run was started: its checksum is {found} where {expected} is expected"
+                        "has changed since the run was started: its checksum is {found}, not \
+                        {expected}"
                     )
                 }),
                 Err(error) => Some(format!("cannot be read: {error}")),
@@ -70,7 +70,7 @@ pub(super) fn verify(
     Ok(())
 }
 
-/// xxh3, hexadecimal: JSON's numbers do not hold 64 bits everywhere.
+/// Returns the xxh3 in hexadecimal, because JSON numbers do not hold 64 bits everywhere.
 fn checksum(path: &Path) -> io::Result<String> {
     fs::read(path).map(|content| format!("{:016x}", xxh3_64(&content)))
 }

@@ -1,4 +1,4 @@
-//! The run's directory: where everything in it lies, and how it is created and opened.
+//! The run's directory: its paths, creation and opening.
 
 use std::fs;
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
@@ -24,12 +24,12 @@ macro_rules! paths {
 }
 
 impl RunDirectory {
-    /// The run in `root`.
+    /// Names the run in `root`.
     pub fn new(root: impl Into<PathBuf>) -> Self {
         Self { root: root.into() }
     }
 
-    /// The directory itself.
+    /// Returns the directory itself.
     pub fn root(&self) -> &Path {
         &self.root
     }
@@ -41,11 +41,13 @@ impl RunDirectory {
         identity => "run.json",
         /// Copies of the course files, so that the directory is complete.
         courses => "courses",
-        /// One log file a process.
+        /// Log files, one per process.
         logs => "logs",
-        /// Locked by the learner while it lives, see [`LearnerLock`](crate::LearnerLock).
+        /// Lock file that the learner holds while it is alive, see
+        /// [`LearnerLock`](crate::LearnerLock).
         learner_lock => "learner.lock",
-        /// One row per start of the learner: incarnation,unix_secs,episodes it went on from.
+        /// One row per learner start: incarnation,unix_secs,episodes; `episodes` counts the
+        /// committed ones it resumed from.
         incarnations_csv => "incarnations.csv",
         /// One row per committed training episode.
         episodes_csv => "episodes.csv",
@@ -57,11 +59,11 @@ impl RunDirectory {
         best_snapshot => "snapshots/best.safetensors",
         /// The newest snapshot.
         latest_snapshot => "snapshots/latest.safetensors",
-        /// Everything needed to go on.
+        /// Checkpoints, from which the learner resumes.
         checkpoints => "checkpoints",
         /// [`EvaluationReport`](skein_protocol::evaluation::EvaluationReport) of the best snapshot.
         evaluation_json => "evaluation.json",
-        /// Where the evaluation episodes flew: course,episode,step,x_m,y_m,z_m,outcome.
+        /// Trajectories of the evaluation episodes: course,episode,step,x_m,y_m,z_m,outcome.
         evaluation_trajectories_csv => "evaluation_trajectories.csv",
         /// Depth images and their reconstructions: `depth` and `reconstruction`, u8 `[n, 72, 128]`.
         reconstructions => "reconstructions.safetensors",
@@ -71,24 +73,24 @@ impl RunDirectory {
         plots => "plots",
     }
 
-    /// The learner's log file.
+    /// Returns the learner's log file.
     pub fn learner_log(&self) -> PathBuf {
         self.logs().join("learner.log")
     }
 
-    /// An actor's log file.
+    /// Returns an actor's log file.
     pub fn actor_log(&self, actor: ActorId) -> PathBuf {
         self.logs().join(format!("actor-{actor}.log"))
     }
 
-    /// How the best snapshot flies the suite called `suite`, as `skein-evaluate` tells it; an
-    /// experiment has it written.
+    /// Returns the file with the results of the best snapshot on the suite called `suite`, as
+    /// `skein-evaluate` writes it. Only experiments write it.
     pub fn suite_json(&self, suite: &str) -> PathBuf {
         self.root.join("suites").join(format!("{suite}.json"))
     }
 
-    /// Episodes committed in the newest of the run's checkpoints, by their names; whether one is
-    /// sound, only reading it can tell.
+    /// Returns the committed episodes of the run's newest checkpoint, by the checkpoints' names.
+    /// The checkpoint may still turn out damaged when it is read.
     pub fn newest_checkpoint(&self) -> Option<u64> {
         let episodes = |entry: fs::DirEntry| {
             entry
@@ -104,8 +106,9 @@ impl RunDirectory {
             .max()
     }
 
-    /// Creates the directory with its folders, for this user alone, and writes the resolved
-    /// configuration and a new identity, which vouches for the course files that are in it already.
+    /// Creates the directory with its folders, accessible to this user only. Writes the resolved
+    /// configuration and a new identity, which holds the checksums of the course files already
+    /// there.
     ///
     /// # Errors
     /// [`RunError`] names the path.
@@ -115,7 +118,7 @@ impl RunDirectory {
             .recursive(true)
             .mode(0o700)
             .create(&self.root)
-            // One that was there before may be open to others.
+            // An existing directory may be open to others.
             .and_then(|()| fs::set_permissions(&self.root, fs::Permissions::from_mode(0o700)))
             .map_err(io(self.root.clone()))?;
         self.make_folders()?;
@@ -125,8 +128,8 @@ impl RunDirectory {
             env!("CARGO_PKG_VERSION"),
             config.to_toml()
         );
-        // A power cut shortly after must not leave checkpoints of a run that nobody knows any more:
-        // all of it is brought to disk.
+        // Synced to disk: after a power cut there must be no checkpoints of a run without an
+        // identity.
         durable::replace(&self.config(), text.as_bytes()).map_err(io(self.config()))?;
         let resolved = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
         let courses = courses::checksums(&self.courses()).map_err(io(self.courses()))?;
@@ -142,8 +145,8 @@ impl RunDirectory {
         Ok(identity)
     }
 
-    /// Makes the folders that are not there: copies of a run may lack those that were empty. That
-    /// of the checkpoints is none of them, because a run without any is begun anew.
+    /// Creates missing folders: a copy of a run may lack those that were empty. The checkpoint
+    /// folder is not created, because a run without it starts from the beginning.
     ///
     /// # Errors
     /// [`RunError`] names the path.
@@ -162,11 +165,11 @@ impl RunDirectory {
         Ok(())
     }
 
-    /// Reads identity and configuration of an existing run; its course files are those it was
-    /// started with.
+    /// Reads identity and configuration of an existing run, and checks that its course files are
+    /// those it was started with.
     ///
     /// # Errors
-    /// [`RunError`] names the file and what is wrong with it.
+    /// [`RunError`] names the file and the problem.
     pub fn open(&self) -> Result<(RunIdentity, Config), RunError> {
         let path = self.identity();
         let text = fs::read_to_string(&path).map_err(|source| RunError::Io {
@@ -177,7 +180,7 @@ impl RunDirectory {
             path: path.clone(),
             source,
         };
-        // First of all: another version's identity may have other parts.
+        // The version comes first: another version's identity may have other fields.
         let Versioned { protocol_version } =
             serde_json::from_str(&text).map_err(not_an_identity)?;
         if protocol_version != PROTOCOL_VERSION {
@@ -199,15 +202,15 @@ impl RunDirectory {
     }
 }
 
-/// What identities of all versions have.
+/// The field that identities of all versions have.
 #[derive(Deserialize)]
 struct Versioned {
     protocol_version: u32,
 }
 
 impl RunDirectory {
-    /// In which keys `config` differs from the configuration of the run, if a checkpoint still
-    /// tells it.
+    /// Returns the keys in which `config` differs from the run's configuration, if a checkpoint
+    /// still holds a copy.
     fn differences(&self, identity: &RunIdentity, config: &Config) -> String {
         let known = self.newest_checkpoint().and_then(|episodes| {
             let copy = self
@@ -231,19 +234,17 @@ impl RunDirectory {
     }
 }
 
-/// What to do about it, if that can be told.
+/// Returns the remedy, if there is one.
 fn remedy(error: &std::io::Error) -> &'static str {
     match error.kind() {
         std::io::ErrorKind::NotFound => "; is this the directory of a run?",
-        std::io::ErrorKind::PermissionDenied => {
-            "; it belongs to another user, or may not be written"
-        }
-        std::io::ErrorKind::ReadOnlyFilesystem => "; copy the run to a disk that can be written",
+        std::io::ErrorKind::PermissionDenied => "; it belongs to another user or is read-only",
+        std::io::ErrorKind::ReadOnlyFilesystem => "; copy the run to a writable disk",
         _ => "",
     }
 }
 
-/// Why a run's directory cannot be used.
+/// Reason why a run's directory cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// A file or folder cannot be read or written.
@@ -251,7 +252,7 @@ pub enum RunError {
     Io {
         /// The path.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         #[source]
         source: std::io::Error,
     },
@@ -260,12 +261,13 @@ pub enum RunError {
     Identity {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         #[source]
         source: serde_json::Error,
     },
     /// The run was started by a program of another version.
-    #[error("{}: the run speaks protocol version {found}, this program {PROTOCOL_VERSION}; use the program that started it", path.display())]
+    #[error("{}: the run uses protocol version {found}, this program {PROTOCOL_VERSION}; use the \
+        program version that started the run", path.display())]
     OtherVersion {
         /// The identity file.
         path: PathBuf,
@@ -273,19 +275,21 @@ pub enum RunError {
         found: u32,
     },
     /// The configuration is not the one the run was started with.
-    #[error("{} was changed since the run was started (\"there\" is as it was started, \"here\" as it is now): {differences}; change it back, or start a new run for another configuration", path.display())]
+    #[error("{} has changed since the run was started (\"there\": at the start, \"here\": now): \
+        {differences}; restore it, or start a new run", path.display())]
     ConfigChanged {
         /// The configuration file.
         path: PathBuf,
-        /// Each key with both values; if no checkpoint tells them, both digests.
+        /// The differing keys with both values; without a checkpoint, both digests.
         differences: String,
     },
     /// A course file is not the one the run was started with.
-    #[error("{} {problem}, and episodes through another course would be learned from as if it were the same; put the file back as it was, or start a new run", path.display())]
+    #[error("{} {problem}: the run would mix episodes of different courses; restore the file, or \
+        start a new run", path.display())]
     CourseChanged {
         /// The course file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The problem.
         problem: String,
     },
     /// The configuration cannot be used.
@@ -308,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn another_versions_run_is_told_as_such_whatever_its_identity_holds() {
+    fn a_run_of_another_version_is_refused_as_such_whatever_its_identity_holds() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         run.create(&Config::default()).unwrap();
@@ -318,14 +322,14 @@ mod tests {
         )
         .unwrap();
         let error = run.open().unwrap_err().to_string();
-        assert!(error.contains("speaks protocol version 1"), "{error}");
+        assert!(error.contains("uses protocol version 1"), "{error}");
         fs::write(run.identity(), "").unwrap();
         let error = run.open().unwrap_err().to_string();
         assert!(error.contains("is not the identity of a run"), "{error}");
     }
 
     #[test]
-    fn a_changed_configuration_is_noticed() {
+    fn a_changed_configuration_is_refused() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         run.create(&Config::default()).unwrap();
@@ -339,7 +343,7 @@ mod tests {
             other => panic!("{other:?}"),
         };
         assert!(refusal().contains("its digest is"), "{}", refusal());
-        // What a checkpoint says of the run's configuration tells the key.
+        // With the checkpoint's copy, the message names the key.
         let checkpoint = run.checkpoints().join("episode-20");
         fs::create_dir(&checkpoint).unwrap();
         fs::write(checkpoint.join("config.toml"), before.portable()).unwrap();
@@ -351,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn a_changed_damaged_or_missing_course_is_noticed_and_named() {
+    fn a_changed_damaged_or_missing_course_is_refused_by_name() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         fs::create_dir(run.courses()).unwrap();
@@ -374,7 +378,7 @@ mod tests {
             );
         };
         fs::write(&training, "walls = 4").unwrap();
-        refused(&training, "was changed");
+        refused(&training, "has changed");
         fs::write(&training, "walls = 5").unwrap();
         run.open().unwrap();
         fs::remove_file(&gates).unwrap();
@@ -382,13 +386,13 @@ mod tests {
         fs::write(&gates, "walls = 2").unwrap();
         run.open().unwrap();
 
-        // The configuration's digest is the same wherever the run's directory lies: a course of the
-        // same name elsewhere is another one all the same.
+        // The digest ignores folders, but a course of the same name elsewhere is still another
+        // course.
         let elsewhere = directory.path().join("training.toml");
         fs::copy(&training, &elsewhere).unwrap();
         config.courses.training.clone_from(&elsewhere);
         fs::write(run.config(), config.to_toml()).unwrap();
-        refused(&elsewhere, "is none of the courses");
+        refused(&elsewhere, "is not one of the courses");
     }
 
     #[test]
@@ -406,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_directory_is_for_its_owner_alone() {
+    fn only_the_owner_can_access_a_run_directory() {
         let parent = tempfile::tempdir().unwrap();
         let (new, open) = (parent.path().join("new"), parent.path().join("open"));
         fs::create_dir(&open).unwrap();

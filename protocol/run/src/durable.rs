@@ -1,44 +1,44 @@
-//! Files that hold what they held before or all of what is new, whatever happens while they are
-//! written, a power cut included.
+//! Durable files: after any interruption, a power cut included, they hold either the old content or
+//! all of the new.
 
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
-/// Puts `bytes` in the place of whatever is at `path`, at once: they are written beside it, brought
-/// to disk, and renamed. Only the user can read them.
+/// Replaces the content of `path` by `bytes` atomically: they are written beside it, synced to
+/// disk, and renamed. Only the user can read the file.
 ///
 /// # Errors
-/// Of the file system; what was at `path` is still there then.
+/// Errors of the file system; then `path` still has its old content.
 pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let aside = aside(path);
-    let written = create_private(&aside)
+    let temporary_path = temporary_path(path);
+    let written = create_private(&temporary_path)
         .and_then(|mut file| {
             file.write_all(bytes)?;
             file.sync_all()
         })
-        .and_then(|()| fs::rename(&aside, path));
+        .and_then(|()| fs::rename(&temporary_path, path));
     if let Err(error) = written {
-        // What is half written takes room, which may be just what is missing. If it cannot be
-        // removed, the first error is the one to tell.
-        let _ = fs::remove_file(&aside);
+        // A half-written file takes space, which may be just what is missing. If it cannot be
+        // removed, the first error matters more.
+        let _ = fs::remove_file(&temporary_path);
         return Err(error);
     }
     sync(path.parent().unwrap_or(Path::new(".")))
 }
 
-/// The name under which the file at `path` is written.
-fn aside(path: &Path) -> PathBuf {
+/// Returns the name under which the file at `path` is written.
+fn temporary_path(path: &Path) -> PathBuf {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(".tmp");
     path.with_file_name(name)
 }
 
-/// Creates the file at `path`, emptying one that is there, so that only the user can read it.
+/// Creates the file at `path`, or empties an existing one, readable for the user only.
 ///
 /// # Errors
-/// Of the file system.
+/// Errors of the file system.
 pub fn create_private(path: &Path) -> io::Result<File> {
     OpenOptions::new()
         .write(true)
@@ -48,21 +48,20 @@ pub fn create_private(path: &Path) -> io::Result<File> {
         .open(path)
 }
 
-/// Creates the directory at `path` with those above it, if they are not there, so that only the
-/// user can look into it.
+/// Creates the directory at `path` and missing parents, accessible for the user only.
 ///
 /// # Errors
-/// Of the file system.
+/// Errors of the file system.
 pub fn create_private_directory(path: &Path) -> io::Result<()> {
     DirBuilder::new().recursive(true).mode(0o700).create(path)
 }
 
-/// Brings a file, or the names in a directory, to disk.
+/// Syncs a file, or the names in a directory, to disk.
 ///
 /// # Errors
-/// Of the file system.
+/// Errors of the file system.
 pub fn sync(path: &Path) -> io::Result<()> {
-    // Of a bare file name, the directory above is the empty path.
+    // The parent of a bare file name is the empty path.
     let path = if path.as_os_str().is_empty() {
         Path::new(".")
     } else {
@@ -93,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_replaced_remains_and_nothing_is_left_beside_it() {
+    fn a_failed_replacement_keeps_the_old_content_and_leaves_no_file() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("folder");
         fs::create_dir(&path).unwrap();

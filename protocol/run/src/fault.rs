@@ -1,10 +1,10 @@
-//! Points at which a process can be made to die, to show that it does not matter.
+//! Fault points: places in the code at which a process can be made to die, to test that a death
+//! changes no result.
 //!
-//! A point is armed from outside and while the run is under way: the environment variable
-//! [`FAULTS`] names a directory, and whoever passes a point of which there is a file there removes
-//! the file and kills itself with SIGKILL. So a point that was armed once kills once, whichever
-//! process comes by, and the process that is started in its place gets past. Without the variable,
-//! passing a point costs a comparison.
+//! A point is armed from outside, while the run is in progress. The environment variable [`FAULTS`]
+//! names a directory; a process that reaches a point whose file exists there removes the file and
+//! kills itself with SIGKILL. So an armed point kills exactly one process, and its successor
+//! passes. Without the variable, a point costs one comparison.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -17,15 +17,15 @@ pub const FAULTS: &str = "SKEIN_FAULTS";
 
 macro_rules! points {
     ($($(#[$doc:meta])* $point:ident => $name:literal),* $(,)?) => {
-        /// A moment at which a process may die.
+        /// A place in the code at which a process may die.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         pub enum FaultPoint { $($(#[$doc])* $point),* }
 
         impl FaultPoint {
-            /// All of them.
+            /// All points.
             pub const ALL: &[Self] = &[$(Self::$point),*];
 
-            /// The name of the file that arms it.
+            /// Name of the file that arms the point.
             pub const fn name(self) -> &'static str {
                 match self { $(Self::$point => $name),* }
             }
@@ -34,7 +34,7 @@ macro_rules! points {
 }
 
 points! {
-    /// An actor has joined and not yet said so.
+    /// An actor has joined and has not yet reported it.
     ActorJoined => "actor.joined",
     /// An actor has rendered a record and not yet sent it.
     ActorBeforeSend => "actor.before-send",
@@ -42,26 +42,26 @@ points! {
     ActorMidEpisode => "actor.mid-episode",
     /// An actor has sent the last record of an episode and not yet woken the learner.
     ActorAfterLastRecord => "actor.after-last-record",
-    /// The learner has opened its services, and nobody could join yet.
+    /// The learner has opened its services; no actor could join yet.
     LearnerStarted => "learner.started",
     /// The learner's receiving thread has committed an episode that the training thread has not
     /// seen.
     LearnerEpisodeCommitted => "learner.episode-committed",
-    /// All episodes of an epoch are there, none is learned from.
+    /// All episodes of an epoch are committed; no update has begun.
     LearnerEpochCollected => "learner.epoch-collected",
     /// An update of an epoch is done.
     LearnerMidUpdates => "learner.mid-updates",
-    /// All updates of an epoch are done, nothing is published.
+    /// All updates of an epoch are done; nothing is published.
     LearnerUpdated => "learner.updated",
-    /// A snapshot lies in shared memory and is not yet sent.
+    /// A snapshot lies in shared memory and is not sent yet.
     LearnerPublishing => "learner.publishing",
     /// A snapshot is sent.
     LearnerPublished => "learner.published",
-    /// A candidate for the best snapshot was evaluated and not yet judged.
+    /// The confirmation episodes of a candidate are flown and not yet judged.
     LearnerCandidateFlown => "learner.candidate-flown",
-    /// A new best snapshot is on disk, and no checkpoint knows of it.
+    /// A new best snapshot is on disk; no checkpoint refers to it.
     LearnerBestSaved => "learner.best-saved",
-    /// A checkpoint's directory is there, empty.
+    /// A checkpoint's directory exists and is empty.
     CheckpointCreated => "checkpoint.created",
     /// A checkpoint's tensors are written.
     CheckpointTensors => "checkpoint.tensors",
@@ -69,13 +69,13 @@ points! {
     CheckpointReplay => "checkpoint.replay",
     /// A checkpoint's counters are written.
     CheckpointProgress => "checkpoint.progress",
-    /// A checkpoint's manifest is written, nothing is brought to disk yet.
+    /// A checkpoint's manifest is written; nothing is synced to disk yet.
     CheckpointManifest => "checkpoint.manifest",
-    /// A checkpoint is on disk under the name it is written under.
+    /// A checkpoint is on disk under its temporary name.
     CheckpointSynced => "checkpoint.synced",
-    /// A checkpoint is in its place, those that it makes superfluous are still there.
+    /// A checkpoint has its final name; superseded ones still exist.
     CheckpointRenamed => "checkpoint.renamed",
-    /// A superfluous checkpoint has lost its name and not yet its files.
+    /// A superseded checkpoint has been renamed; its files still exist.
     CheckpointRetired => "checkpoint.retired",
     /// The final evaluation is flown and not yet written.
     LearnerEvaluated => "learner.evaluated",
@@ -83,21 +83,20 @@ points! {
     LearnerBeforeSummary => "learner.before-summary",
 }
 
-/// Passes `point`: dies here if it is armed.
-pub fn pass(point: FaultPoint) {
+/// Kills this process if `point` is armed.
+pub fn die_if_armed(point: FaultPoint) {
     static DIRECTORY: OnceLock<Option<PathBuf>> = OnceLock::new();
     let directory = DIRECTORY.get_or_init(|| std::env::var_os(FAULTS).map(PathBuf::from));
     if let Some(directory) = directory
         && disarm(directory, point)
     {
-        // An error is for whoever may not kill itself, which cannot be; going on then is as good as
-        // anything.
+        // A process may always kill itself, so there is no error to handle.
         let _ = kill_process(getpid(), Signal::KILL);
     }
 }
 
-/// Takes the armed point out of `directory`; whether it was there. Of several processes that come
-/// by at a time, one gets it.
+/// Removes the armed point from `directory`; returns `true` if it existed. Of several processes
+/// that reach it at once, one succeeds.
 fn disarm(directory: &Path, point: FaultPoint) -> bool {
     fs::remove_file(directory.join(point.name())).is_ok()
 }

@@ -1,10 +1,9 @@
-//! Who a run is, and which incarnation of its learner is the present one.
+//! The identity of a run, and the announcement of its learner's current incarnation.
 //!
-//! Each start of the learner, the first or one after a death, is an incarnation with a transport of
-//! its own: fresh services in a folder and under a prefix that no incarnation before it had. So
-//! nothing that a killed process left half done is ever met again. The learner announces its
-//! incarnation by a small file once its services are open; actors look there, and again whenever
-//! they have lost it.
+//! Each start of the learner is a new incarnation with its own transport: new services in a new
+//! folder and under a new prefix. So no process ever meets what a killed one left half done. The
+//! learner announces its incarnation in a small file once its services are open. Actors read the
+//! file when they start, and again whenever they have lost the learner.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -16,31 +15,30 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
-use super::place::{PlaceError, is_locked};
+use super::private_files::{PathError, is_locked};
 use skein_protocol::PROTOCOL_VERSION;
 use skein_protocol::config::Config;
 use skein_protocol::ids::RunId;
 use skein_protocol::record_layout;
 use skein_protocol::snapshot::SnapshotLayout;
 
-/// Who a run is: what its processes need to find each other, and nobody else.
+/// Identity of a run, by which its processes find each other.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunIdentity {
-    /// [`PROTOCOL_VERSION`] of the program that started it.
+    /// [`PROTOCOL_VERSION`] of the program that started the run.
     pub protocol_version: u32,
     /// The run.
     pub run: RunId,
     /// [`Config::digest`].
     pub config_digest: u64,
-    /// Checksum (xxh3, hexadecimal) of each file in [`courses`](super::RunDirectory::courses) as
-    /// the run was started with it, by its name.
+    /// Checksum (xxh3, hexadecimal) of each file in [`courses`](super::RunDirectory::courses) at
+    /// the start of the run, by file name.
     pub courses: BTreeMap<String, String>,
 }
 
-/// One start of a learner: its number among those of its run since the first of the processes that
-/// live now was started. A small number, because it stands twice in the path of a listener's
-/// socket.
+/// Number of a learner start, counted since the first of the run's living processes started. It is
+/// small because the path of a listener's socket contains it twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct LearnerIncarnation(u32);
@@ -52,14 +50,14 @@ impl fmt::Display for LearnerIncarnation {
 }
 
 impl LearnerIncarnation {
-    /// The incarnation after `previous`.
+    /// Returns the incarnation after `previous`.
     pub(super) fn after(previous: Option<Self>) -> Self {
         Self(previous.map_or(1, |incarnation| incarnation.0.saturating_add(1)))
     }
 
-    /// From the name of its folder; `None` for what is none.
+    /// Parses the name of an incarnation's folder; returns `None` for any other name.
     pub(super) fn parse(name: &str) -> Option<Self> {
-        /// No run dies as often; and a listener's socket has room for so many digits.
+        /// No run restarts as often, and a listener's socket has room for so many digits.
         const MOST: u32 = 9_999_999;
         let incarnation = name
             .parse()
@@ -83,38 +81,38 @@ impl RunIdentity {
         }
     }
 
-    /// Where the run's transport lies; the folder is there while a process of the run incarnations.
-    /// Short, because a listener's socket below it may have no more than 108 characters.
+    /// Returns the folder of the run's transport. It exists while a process of the run is alive.
+    /// The path is short, because a listener's socket below it may have at most 108 characters.
     pub fn transport_folder(&self) -> PathBuf {
         super::sweep::MACHINE.transport_folder(self.run)
     }
 
-    /// First characters of every shared-memory segment of this run.
+    /// Returns the first characters of the names of this run's shared-memory segments.
     pub fn shared_memory_prefix(&self) -> String {
         super::sweep::shared_memory_prefix(self.run)
     }
 
-    /// Where iceoryx2 keeps the services of an incarnation.
+    /// Returns the folder in which iceoryx2 keeps the services of an incarnation.
     pub fn incarnation_folder(&self, incarnation: LearnerIncarnation) -> PathBuf {
         self.transport_folder().join(incarnation.to_string())
     }
 
-    /// First characters of every shared-memory segment of an incarnation.
+    /// Returns the first characters of the names of an incarnation's shared-memory segments.
     pub fn incarnation_prefix(&self, incarnation: LearnerIncarnation) -> String {
         format!("{}{incarnation}_", self.shared_memory_prefix())
     }
 
-    /// Takes everybody else's rights to the segments of `incarnation` away: iceoryx2 gives one of
-    /// them, a counter, to all users of the machine.
+    /// Restricts the segments of `incarnation` to their owner: iceoryx2 makes one of them, a
+    /// counter, accessible to all users of the machine.
     ///
     /// # Errors
-    /// When the segments cannot be looked at or changed.
-    pub fn close_to_others(&self, incarnation: LearnerIncarnation) -> io::Result<()> {
+    /// If the segments cannot be listed or changed.
+    pub fn restrict_to_owner(&self, incarnation: LearnerIncarnation) -> io::Result<()> {
         self.shared_memory(incarnation)
             .try_for_each(|segment| fs::set_permissions(segment, fs::Permissions::from_mode(0o600)))
     }
 
-    /// The shared-memory segments of `incarnation`.
+    /// Returns the shared-memory segments of `incarnation`.
     pub fn shared_memory(&self, incarnation: LearnerIncarnation) -> impl Iterator<Item = PathBuf> {
         super::sweep::MACHINE.segments(&self.incarnation_prefix(incarnation))
     }
@@ -131,36 +129,35 @@ impl RunIdentity {
         super::sweep::supervisor_lock(&self.transport_folder())
     }
 
-    /// What the living learner of this run has announced; `None` when there is none, or it has not
-    /// opened its services yet. Looking leaves no trace.
+    /// Returns the announcement of this run's living learner; `None` if there is none, or it has
+    /// not opened its services yet. The call leaves no trace.
     ///
     /// # Errors
-    /// [`PlaceError`] when the run belongs to another user, or its folder cannot be read.
-    pub fn present_incarnation(&self) -> Result<Option<Announcement>, PlaceError> {
+    /// [`PathError`] if the run belongs to another user, or its folder cannot be read.
+    pub fn current_incarnation(&self) -> Result<Option<Announcement>, PathError> {
         if !is_locked(&self.learner_lock())? {
             return Ok(None);
         }
         Announcement::read(&self.announcement_file())
     }
 
-    /// Whether a learner of this run lives on this machine, its services open or not. Looking
-    /// leaves no trace.
+    /// Returns `true` if a learner of this run is alive on this machine, its services open or not.
+    /// The call leaves no trace.
     ///
     /// # Errors
-    /// [`PlaceError`] when the run belongs to another user, or its folder cannot be read.
-    pub fn is_learner_alive(&self) -> Result<bool, PlaceError> {
+    /// [`PathError`] if the run belongs to another user, or its folder cannot be read.
+    pub fn is_learner_alive(&self) -> Result<bool, PathError> {
         is_locked(&self.learner_lock())
     }
 }
 
-/// What a learner says of its present incarnation: everything in which a process that joins it must
-/// not differ.
+/// Announcement of a learner's incarnation: everything in which a joining process must match it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Announcement {
     /// The incarnation.
     pub incarnation: LearnerIncarnation,
-    /// The learner's process.
+    /// Process id of the learner.
     pub pid: u32,
     protocol_version: u32,
     run: RunId,
@@ -169,22 +166,23 @@ pub struct Announcement {
     record_layout: String,
 }
 
-/// In what a process and the learner it would join differ.
+/// The first difference between a process and the learner it tries to join.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "the learner and this process differ in {what}: the learner's is {expected}, this process's {found}; start it from the same build and run directory"
+    "the learner and this process differ in {what}: the learner's is {expected}, this process's \
+    {found}; start it from the same build and run directory"
 )]
-pub struct Difference {
-    /// In what.
+pub struct JoinMismatch {
+    /// Name of the differing value.
     pub what: &'static str,
-    /// The learner's.
+    /// The learner's value.
     pub expected: String,
-    /// This process's.
+    /// This process's value.
     pub found: String,
 }
 
 impl Announcement {
-    /// What the learner of `incarnation` says of itself.
+    /// Returns the announcement of the learner of `incarnation`.
     pub fn new(identity: &RunIdentity, incarnation: LearnerIncarnation, config: &Config) -> Self {
         Self {
             incarnation,
@@ -197,18 +195,18 @@ impl Announcement {
         }
     }
 
-    /// Whether a process of `identity` and `config` may join.
+    /// Checks that a process of `identity` and `config` may join.
     ///
     /// # Errors
-    /// [`Difference`] says what differs.
-    pub fn check(&self, identity: &RunIdentity, config: &Config) -> Result<(), Difference> {
-        let mine = Self::new(identity, self.incarnation, config);
+    /// [`JoinMismatch`] names the difference.
+    pub fn check(&self, identity: &RunIdentity, config: &Config) -> Result<(), JoinMismatch> {
+        let own = Self::new(identity, self.incarnation, config);
         let digest = |digest: u64| format!("{digest:016x}");
         let same = |what, expected: String, found: String| {
             if expected == found {
                 Ok(())
             } else {
-                Err(Difference {
+                Err(JoinMismatch {
                     what,
                     expected,
                     found,
@@ -218,33 +216,33 @@ impl Announcement {
         same(
             "protocol version",
             self.protocol_version.to_string(),
-            mine.protocol_version.to_string(),
+            own.protocol_version.to_string(),
         )?;
-        same("run", digest(self.run.0), digest(mine.run.0))?;
+        same("run", digest(self.run.0), digest(own.run.0))?;
         same(
             "configuration",
             digest(self.config_digest),
-            digest(mine.config_digest),
+            digest(own.config_digest),
         )?;
         same(
             "snapshot layout",
             digest(self.snapshot_layout),
-            digest(mine.snapshot_layout),
+            digest(own.snapshot_layout),
         )?;
         same(
             "record layout",
             self.record_layout.clone(),
-            mine.record_layout,
+            own.record_layout,
         )
     }
 
-    pub(super) fn read(path: &Path) -> Result<Option<Self>, PlaceError> {
+    pub(super) fn read(path: &Path) -> Result<Option<Self>, PathError> {
         match fs::read(path) {
             Ok(bytes) => serde_json::from_slice(&bytes)
                 .map(Some)
-                .map_err(|source| PlaceError::at(path)(source.into())),
+                .map_err(|source| PathError::at(path)(source.into())),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(error) => Err(PlaceError::at(path)(error)),
+            Err(error) => Err(PathError::at(path)(error)),
         }
     }
 }
@@ -289,13 +287,16 @@ mod tests {
     }
 
     #[test]
-    fn whoever_differs_is_told_in_what() {
+    fn a_process_that_does_not_match_is_refused_with_what_differs() {
         let config = Config::default();
         let identity = RunIdentity::new(&config, BTreeMap::new());
-        let told = Announcement::new(&identity, LearnerIncarnation::after(None), &config);
-        assert_eq!(told.check(&identity, &config), Ok(()));
+        let announcement = Announcement::new(&identity, LearnerIncarnation::after(None), &config);
+        assert_eq!(announcement.check(&identity, &config), Ok(()));
         let refusal = |identity: &RunIdentity, config: &Config| {
-            told.check(identity, config).unwrap_err().to_string()
+            announcement
+                .check(identity, config)
+                .unwrap_err()
+                .to_string()
         };
         let other = |change: fn(&mut RunIdentity)| {
             let mut other = identity.clone();
@@ -313,7 +314,7 @@ mod tests {
         assert!(refusal(&identity, &wide).contains("differ in snapshot layout"));
         let longer = Announcement {
             record_layout: "transition 1".to_owned(),
-            ..told
+            ..announcement
         };
         let refusal = longer.check(&identity, &config).unwrap_err().to_string();
         assert!(

@@ -1,14 +1,14 @@
 //! A run on this machine: its directory, its identity, and the processes that belong to it.
 //!
 //! Begin with [`RunDirectory`]. Its identity ([`RunIdentity`]) names the folder of its transport,
-//! where the learner announces its present incarnation; locks keep a second learner or supervisor
-//! away, and what dead processes left is swept. The rest is what all of our programs do alike:
-//! files written whole ([`durable`]), logs ([`logging`]), the allocator ([`allocation`]), errors on
-//! one line ([`failure`]), points at which tests kill a process ([`fault`]), tables for the
-//! terminal ([`tables`]).
+//! where the learner announces its current incarnation. Locks keep out a second learner or
+//! supervisor, and leftovers of dead processes are swept. Other modules hold what all of Skein's
+//! programs share: atomically written files ([`durable`]), logs ([`logging`]), allocator settings
+//! ([`allocation`]), errors on one line ([`failure`]), points at which tests kill a process
+//! ([`fault`]), tables for the terminal ([`tables`]).
 //!
-//! Identity and announcement are here and not in the protocol: they name this machine's folders and
-//! locks, and only processes of this machine read them.
+//! Identity and announcement are here and not in the protocol, because they name this machine's
+//! folders and locks, and only processes of this machine read them.
 
 pub mod allocation;
 mod claims;
@@ -22,17 +22,17 @@ mod lock;
 pub mod log_tail;
 pub mod logging;
 pub mod orphans;
-mod place;
 mod presence;
+mod private_files;
 mod results;
 mod sweep;
 pub mod tables;
 
 pub use claims::ActorClaim;
 pub use directory::{RunDirectory, RunError};
-pub use identity::{Announcement, Difference, LearnerIncarnation, RunIdentity};
+pub use identity::{Announcement, JoinMismatch, LearnerIncarnation, RunIdentity};
 pub use lock::{LearnerLock, LockError, SupervisorLock};
-pub use place::PlaceError;
 pub use presence::Presence;
+pub use private_files::PathError;
 pub use results::save_snapshot;
-pub use sweep::{Swept, sweep_leftovers};
+pub use sweep::{SweepResult, sweep_leftovers};

@@ -1,55 +1,59 @@
-//! The locks of a run: exactly one learner, with a transport of its own for each of its
-//! incarnations, and exactly one supervisor.
+//! Locks of a run: exactly one learner, with a new transport for each of its incarnations, and
+//! exactly one supervisor.
 //!
-//! A lock is taken by two locks, one on the run's directory and one in the transport's folder: a
-//! copy of the directory is the same run.
+//! Each consists of two file locks, one on the run's directory and one in the transport's folder,
+//! because a copy of the directory is the same run.
 
 use std::fs::{self, File, TryLockError};
 use std::path::PathBuf;
 
 use super::RunDirectory;
 use super::identity::{Announcement, LearnerIncarnation, RunIdentity};
-use super::place::{HeldLock, Locked, PlaceError, is_locked, lock, make_folder};
 use super::presence::Presence;
+use super::private_files::{FileLock, LockAttempt, PathError, is_locked, lock, make_folder};
 use super::sweep::MACHINE;
 
-/// The learner's lock of a run, taken. To be held as long as the learner lives, and longer than its
+/// The learner's lock of a run. The learner holds it as long as it is alive, and longer than its
 /// ports.
 #[derive(Debug)]
 pub struct LearnerLock {
     incarnation: LearnerIncarnation,
     announcement: PathBuf,
-    // In this order: locks are let go before the presence, which may remove their files.
-    _in_transport: HeldLock,
-    _in_directory: HeldLock,
+    // Field order matters: locks are released before the presence, which may remove their files.
+    _in_transport: FileLock,
+    _in_directory: FileLock,
     _presence: Presence,
 }
 
-/// The supervisor's lock of a run, taken. To be held as long as the run is supervised.
+/// The supervisor's lock of a run, held as long as the run is supervised.
 #[derive(Debug)]
 pub struct SupervisorLock {
-    // Locks are let go before the presence, which may remove their files.
-    _in_transport: HeldLock,
+    // Field order matters: locks are released before the presence, which may remove their files.
+    _in_transport: FileLock,
     _directory: File,
     _presence: Presence,
 }
 
-/// Why there is no lock for this process.
+/// Reason why a lock cannot be taken.
 #[derive(Debug, thiserror::Error)]
 pub enum LockError {
-    /// Another process of this run has it.
-    #[error("another {who} of this run lives{}: it holds {}", pid.map_or(String::new(), |pid| format!(" (process {pid})")), lock.display())]
+    /// Another process of this run holds it.
+    #[error(
+        "another {who} of this run is alive{}: it holds {}",
+        pid.map_or(String::new(), |pid| format!(" (process {pid})")),
+        lock.display()
+    )]
     Taken {
-        /// What it is.
+        /// Role of the process.
         who: &'static str,
-        /// The lock it holds.
+        /// The lock that it holds.
         lock: PathBuf,
-        /// Its process, if it could be read.
+        /// Process id, if it could be read.
         pid: Option<u32>,
     },
     /// The transport's folder cannot be used.
     #[error(transparent)]
-    Place(#[from] PlaceError),
+    Path(#[from] PathError),
 }
 
 impl LearnerLock {
@@ -57,26 +61,26 @@ impl LearnerLock {
     /// incarnation.
     ///
     /// # Errors
-    /// [`LockError::Taken`] when another learner of this run incarnations.
+    /// [`LockError::Taken`] if another learner of this run is alive.
     pub fn take(directory: &RunDirectory, identity: &RunIdentity) -> Result<Self, LockError> {
         let in_directory = take_lock("learner", directory.learner_lock())?;
         let presence = Presence::enter(identity)?;
         let in_transport = take_lock("learner", identity.learner_lock())?;
 
-        // The last incarnation's number stands in both files: the transport's folder may have been
-        // removed from under its processes, and of a directory there may be copies.
+        // Both files hold the last incarnation's number: the transport's folder may have been
+        // removed while in use, and the directory may have been copied.
         let incarnation = LearnerIncarnation::after(
             last_incarnation(&in_transport)?.max(last_incarnation(&in_directory)?),
         );
-        let words = format!("{} {incarnation}", std::process::id());
-        in_transport.write(&words)?;
-        in_directory.write(&words)?;
+        let content = format!("{} {incarnation}", std::process::id());
+        in_transport.write(&content)?;
+        in_directory.write(&content)?;
 
         let announcement = identity.announcement_file();
         remove_announcement(&announcement)?;
         MACHINE.remove_incarnations(identity.run);
         let folder = identity.incarnation_folder(incarnation);
-        make_folder(&folder).map_err(PlaceError::at(&folder))?;
+        make_folder(&folder).map_err(PathError::at(&folder))?;
         Ok(Self {
             incarnation,
             announcement,
@@ -86,7 +90,7 @@ impl LearnerLock {
         })
     }
 
-    /// This learner's incarnation.
+    /// Returns this learner's incarnation.
     pub fn incarnation(&self) -> LearnerIncarnation {
         self.incarnation
     }
@@ -94,7 +98,7 @@ impl LearnerLock {
 
 impl Drop for LearnerLock {
     fn drop(&mut self) {
-        // Actors look at the lock too, so a file that stays behind misleads nobody.
+        // Actors check the lock too, so a leftover file does no harm.
         let _ = fs::remove_file(&self.announcement);
     }
 }
@@ -103,10 +107,10 @@ impl SupervisorLock {
     /// Takes the lock.
     ///
     /// # Errors
-    /// [`LockError::Taken`] when another process supervises this run.
+    /// [`LockError::Taken`] if another process supervises this run.
     pub fn take(directory: &RunDirectory, identity: &RunIdentity) -> Result<Self, LockError> {
         let root = directory.root();
-        let locked = File::open(root).map_err(PlaceError::at(root))?;
+        let locked = File::open(root).map_err(PathError::at(root))?;
         match locked.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
@@ -116,7 +120,7 @@ impl SupervisorLock {
                     pid: None,
                 });
             }
-            Err(TryLockError::Error(error)) => return Err(PlaceError::at(root)(error).into()),
+            Err(TryLockError::Error(error)) => return Err(PathError::at(root)(error).into()),
         }
         let presence = Presence::enter(identity)?;
         let in_transport = take_lock("supervisor", identity.supervisor_lock())?;
@@ -130,38 +134,39 @@ impl SupervisorLock {
 }
 
 impl RunDirectory {
-    /// Whether a process supervises the run in this very directory, or is its learner.
+    /// Returns `true` if a process supervises the run in this directory, or is its learner. Copies
+    /// of the directory are not checked.
     ///
     /// # Errors
-    /// [`PlaceError`] when it cannot be looked at.
-    pub fn is_under_way(&self) -> Result<bool, PlaceError> {
+    /// [`PathError`] if the locks cannot be read.
+    pub fn is_running(&self) -> Result<bool, PathError> {
         Ok(is_locked(self.root())? || is_locked(&self.learner_lock())?)
     }
 }
 
 impl RunIdentity {
-    /// Tells actors that the services of `announcement`'s incarnation are open. For the learner
-    /// that holds the lock.
+    /// Announces to actors that the services of `announcement`'s incarnation are open. Only the
+    /// learner that holds the lock calls this.
     ///
     /// # Errors
-    /// [`PlaceError`] when the file cannot be written.
-    pub fn announce(&self, announcement: &Announcement) -> Result<(), PlaceError> {
+    /// [`PathError`] if the file cannot be written.
+    pub fn announce(&self, announcement: &Announcement) -> Result<(), PathError> {
         let path = self.announcement_file();
         let aside = path.with_extension("new");
         let json = serde_json::to_vec(announcement).expect("an announcement is plain data");
         fs::write(&aside, json)
             .and_then(|()| fs::rename(&aside, &path))
-            .map_err(PlaceError::at(&path))
+            .map_err(PathError::at(&path))
     }
 }
 
-fn take_lock(who: &'static str, path: PathBuf) -> Result<HeldLock, LockError> {
+fn take_lock(who: &'static str, path: PathBuf) -> Result<FileLock, LockError> {
     match lock(&path)? {
-        Locked::Mine(lock) => Ok(lock),
-        Locked::Taken { words } => Err(LockError::Taken {
+        LockAttempt::Acquired(lock) => Ok(lock),
+        LockAttempt::HeldByOther { content } => Err(LockError::Taken {
             who,
             lock: path,
-            pid: words
+            pid: content
                 .split_whitespace()
                 .next()
                 .and_then(|pid| pid.parse().ok()),
@@ -169,19 +174,19 @@ fn take_lock(who: &'static str, path: PathBuf) -> Result<HeldLock, LockError> {
     }
 }
 
-/// The incarnation that whoever held `lock` last wrote into it.
-fn last_incarnation(lock: &HeldLock) -> Result<Option<LearnerIncarnation>, PlaceError> {
+/// Returns the incarnation that the last holder of `lock` wrote into it.
+fn last_incarnation(lock: &FileLock) -> Result<Option<LearnerIncarnation>, PathError> {
     Ok(lock
-        .words()?
+        .content()?
         .split_whitespace()
         .nth(1)
         .and_then(LearnerIncarnation::parse))
 }
 
-fn remove_announcement(path: &std::path::Path) -> Result<(), PlaceError> {
+fn remove_announcement(path: &std::path::Path) -> Result<(), PathError> {
     match fs::remove_file(path) {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            Err(PlaceError::at(path)(error))
+            Err(PathError::at(path)(error))
         }
         _ => Ok(()),
     }
@@ -200,12 +205,12 @@ mod tests {
         let _supervisor = Presence::enter(&identity).unwrap();
         let lock = LearnerLock::take(&run, &identity).unwrap();
         let refusal = LearnerLock::take(&run, &identity).unwrap_err().to_string();
-        let told = format!(
-            "another learner of this run lives (process {}): it holds {}",
+        let expected = format!(
+            "another learner of this run is alive (process {}): it holds {}",
             std::process::id(),
             run.learner_lock().display()
         );
-        assert_eq!(refusal, told);
+        assert_eq!(refusal, expected);
 
         let copied = tempfile::tempdir().unwrap();
         fs::copy(run.identity(), copied.path().join("run.json")).unwrap();
@@ -213,7 +218,7 @@ mod tests {
             .unwrap_err()
             .to_string();
         assert!(
-            refusal.contains("another learner of this run lives"),
+            refusal.contains("another learner of this run is alive"),
             "{refusal}"
         );
         assert!(
@@ -227,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_has_one_supervisor_at_a_time_whichever_copy_of_its_directory_it_is_given() {
+    fn a_run_and_the_copies_of_its_directory_have_one_supervisor_at_a_time() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         let identity = run.create(&Config::default()).unwrap();
@@ -235,9 +240,9 @@ mod tests {
         fs::copy(run.identity(), copied.path().join("run.json")).unwrap();
         let copy = RunDirectory::new(copied.path());
 
-        assert!(!run.is_under_way().unwrap());
+        assert!(!run.is_running().unwrap());
         let lock = SupervisorLock::take(&run, &identity).unwrap();
-        assert!(run.is_under_way().unwrap() && !copy.is_under_way().unwrap());
+        assert!(run.is_running().unwrap() && !copy.is_running().unwrap());
         for (other, lock) in [
             (&run, run.root().to_owned()),
             (&copy, identity.supervisor_lock()),
@@ -246,7 +251,7 @@ mod tests {
                 .unwrap_err()
                 .to_string();
             assert!(
-                refusal.starts_with("another supervisor of this run lives"),
+                refusal.starts_with("another supervisor of this run is alive"),
                 "{refusal}"
             );
             assert!(refusal.contains(&lock.display().to_string()), "{refusal}");
@@ -258,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn an_incarnation_whose_folder_was_removed_is_not_lived_again() {
+    fn the_number_of_an_incarnation_is_not_reused_after_its_folder_was_removed() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         let identity = run.create(&Config::default()).unwrap();
@@ -270,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_incarnation_removes_what_the_dead_ones_left_and_meets_nothing_of_it() {
+    fn a_new_incarnation_removes_what_dead_ones_left() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         let identity = run.create(&Config::default()).unwrap();
@@ -284,7 +289,7 @@ mod tests {
             .announce(&Announcement::new(&identity, dead, &Config::default()))
             .unwrap();
         assert_eq!(
-            identity.present_incarnation().unwrap().unwrap().incarnation,
+            identity.current_incarnation().unwrap().unwrap().incarnation,
             dead
         );
         drop(lock);
@@ -294,7 +299,7 @@ mod tests {
         assert!(!segment.exists() && !identity.incarnation_folder(dead).exists());
         assert!(identity.incarnation_folder(lock.incarnation()).exists());
         assert_eq!(
-            identity.present_incarnation().unwrap(),
+            identity.current_incarnation().unwrap(),
             None,
             "its services are not open"
         );

@@ -1,4 +1,4 @@
-//! Last lines of a log file, quoted in errors.
+//! The last lines of a log file, for error messages.
 
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -6,7 +6,7 @@ use std::path::Path;
 
 /// Number of lines quoted.
 const LINES: usize = 12;
-/// Number of bytes read from the end of a log.
+/// Bytes read from the end of a log.
 const MAX_BYTES: u64 = 16 * 1024;
 
 /// Returns the last lines of the log at `path`, indented, or a remark if there are none.
@@ -27,9 +27,9 @@ pub fn log_tail(path: &Path) -> String {
         .join("\n")
 }
 
-/// Returns the reason that `program` printed last before it ended, without its name. Programs of
-/// Skein write `name: reason` on standard error, which goes to their log. `None` if the log holds
-/// no such line.
+/// Returns the last error message of `program` without its name: Skein's programs write `name:
+/// reason` on standard error, which goes to their log. Returns `None` if the log holds no such
+/// message.
 pub fn last_words(path: &Path, program: &Path) -> Option<String> {
     let start = format!("{}: ", program.file_name()?.to_str()?);
     let text = read_end(path).ok()?;
@@ -66,7 +66,7 @@ mod tests {
     }
 
     #[test]
-    fn last_words_are_the_last_reason_that_the_program_printed() {
+    fn the_last_error_message_is_the_programs_own_and_its_newest() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("learner.log");
         let program = Path::new("/bin/skein-learner");

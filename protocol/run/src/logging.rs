@@ -1,4 +1,4 @@
-//! One tracing subscriber, set up in one place; one log file a process.
+//! Logging: one tracing subscriber and one log file per process.
 
 use std::fs::OpenOptions;
 use std::path::Path;
@@ -10,18 +10,19 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, fmt};
 
-/// How log lines are written.
+/// Format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum LogFormat {
-    /// For people.
+    /// Text for people.
     #[default]
     Text,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Json,
 }
 
 impl LogFormat {
-    /// JSON when the environment variable `SKEIN_LOG_FORMAT` is `json`.
+    /// Returns [`LogFormat::Json`] if the environment variable `SKEIN_LOG_FORMAT` is `json`, else
+    /// text.
     pub fn from_environment() -> Self {
         match std::env::var("SKEIN_LOG_FORMAT") {
             Ok(format) if format == "json" => Self::Json,
@@ -30,14 +31,13 @@ impl LogFormat {
     }
 }
 
-/// Sends this process's log to `path`, appending; `RUST_LOG` says what is logged, `info` by
-/// default.
+/// Appends this process's log to `path`. `RUST_LOG` filters it, `info` by default.
 ///
 /// # Errors
-/// When the file cannot be opened.
+/// If the file cannot be opened.
 ///
 /// # Panics
-/// When called twice.
+/// If called twice.
 pub fn log_to_file(path: &Path, format: LogFormat) -> std::io::Result<()> {
     let file = Mutex::new(OpenOptions::new().create(true).append(true).open(path)?);
     let wanted = std::env::var("RUST_LOG").ok();
@@ -54,7 +54,7 @@ pub fn log_to_file(path: &Path, format: LogFormat) -> std::io::Result<()> {
     if let Some(fault) = fault {
         tracing::warn!("{fault}");
     }
-    // A panic is a defect; it must not only scroll away on a terminal.
+    // A panic is a defect and must appear in the log, not only on the terminal.
     let default_hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
         tracing::error!(%panic, "panic");
@@ -63,7 +63,8 @@ pub fn log_to_file(path: &Path, format: LogFormat) -> std::io::Result<()> {
     Ok(())
 }
 
-/// What `RUST_LOG` asks for, `info` if it is not set. If it cannot be read, `info` and the fault.
+/// Returns the filter in `RUST_LOG`, `info` if it is not set. If it is malformed, returns `info`
+/// and a warning.
 fn filter(wanted: Option<&str>) -> (Targets, Option<String>) {
     let default = Targets::new().with_default(LevelFilter::INFO);
     match wanted.map(str::parse) {
@@ -87,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_logged_follows_rust_log_and_a_malformed_value_is_named() {
+    fn rust_log_filters_the_log_and_a_malformed_value_is_named() {
         let (by_default, fault) = filter(None);
         assert_eq!(fault, None);
         assert!(by_default.would_enable("skein_actor", &Level::INFO));

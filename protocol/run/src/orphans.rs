@@ -1,4 +1,4 @@
-//! Ends child processes whose parent has ended.
+//! Child processes that end with their parent.
 
 use std::io;
 use std::os::unix::process::CommandExt;
@@ -7,7 +7,7 @@ use std::process::Command;
 use rustix::process::{Signal, getppid, set_parent_process_death_signal};
 
 /// Makes the kernel send `signal` to the process that `command` starts when the *thread* that
-/// started it ends, for whatever reason. If that thread has ended already, the process does not
+/// started it ends, however that happens. If the parent has already died, the process does not
 /// start.
 pub fn signal_when_orphaned(command: &mut Command, signal: Signal) {
     let parent = rustix::process::getpid();
@@ -16,7 +16,7 @@ pub fn signal_when_orphaned(command: &mut Command, signal: Signal) {
     unsafe {
         command.pre_exec(move || {
             set_parent_process_death_signal(Some(signal))?;
-            // The parent may have ended before prctl took effect; then no signal would arrive.
+            // The parent may have died in between, and no signal would come.
             if getppid() == Some(parent) {
                 Ok(())
             } else {

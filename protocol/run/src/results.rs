@@ -1,4 +1,4 @@
-//! Snapshots and the summary as files of a run: written whole or not at all.
+//! Snapshots and the summary as files of a run, written atomically.
 
 use std::io;
 use std::path::Path;
@@ -26,7 +26,7 @@ pub fn save_snapshot(
 }
 
 impl RunDirectory {
-    /// The run's summary; `None` if there is none that can be read.
+    /// Returns the run's summary; `None` if there is none, or it cannot be read.
     pub fn summary(&self) -> Option<Summary> {
         Summary::load(&self.summary_json())
     }
@@ -34,7 +34,7 @@ impl RunDirectory {
     /// Writes the run's summary.
     ///
     /// # Errors
-    /// The file system's.
+    /// Errors of the file system.
     pub fn save_summary(&self, summary: &Summary) -> io::Result<()> {
         durable::replace(&self.summary_json(), summary.to_json().as_bytes())
     }

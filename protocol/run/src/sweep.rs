@@ -1,9 +1,9 @@
-//! Removes what runs leave on the machine when their processes are killed: segments in shared
-//! memory, folders of the transport.
+//! Removes what killed processes leave on the machine: segments in shared memory, folders of the
+//! transport.
 //!
-//! A run is judged by the lock on its transport folder, see [`Presence`](super::Presence): it is
-//! removed only by who holds that lock alone. Only names of ours are touched, and only what belongs
-//! to this user; links are never followed.
+//! A run is removed only by a process that holds the lock on its transport folder exclusively, see
+//! [`Presence`](super::Presence). Only Skein's names are touched, and only what belongs to this
+//! user; links are never followed.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -13,19 +13,19 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use super::identity::LearnerIncarnation;
-use super::place::{is_still_at, make_folder, open_folder, open_private, run_of, user};
+use super::private_files::{is_still_at, make_folder, open_folder, open_private, run_of, user};
 use skein_protocol::ids::RunId;
 
-/// Where the transport of runs lies.
+/// Directories that hold the transport of runs.
 #[derive(Debug)]
 pub(super) struct Machine {
-    /// Where each run has a folder.
+    /// Parent of each run's folder.
     folders: &'static str,
-    /// Where shared-memory segments lie.
+    /// Directory of the shared-memory segments.
     segments: &'static str,
 }
 
-/// This machine. iceoryx2's shared memory has no other place on Linux.
+/// The directories of this machine. On Linux, iceoryx2 keeps shared memory nowhere else.
 pub(super) static MACHINE: Machine = Machine {
     folders: "/tmp",
     segments: "/dev/shm",
@@ -34,40 +34,40 @@ pub(super) static MACHINE: Machine = Machine {
 const FOLDER_PREFIX: &str = "skein-";
 const SHARED_MEMORY_PREFIX: &str = "skein_";
 
-/// First characters of a run's segments.
+/// Returns the first characters of the names of a run's segments.
 pub(super) fn shared_memory_prefix(run: RunId) -> String {
     format!("{SHARED_MEMORY_PREFIX}{:016x}_", run.0)
 }
 
-/// Ends the name of the file in shared memory by which a run's processes are seen where another
-/// `/tmp` hides its folder.
+/// Suffix of the file in shared memory that shows a run's processes where another `/tmp` hides its
+/// folder.
 const PRESENCE: &str = ".presence";
 
-/// The learner's lock in a run's folder.
+/// Returns the learner's lock in a run's folder.
 pub(super) fn learner_lock(folder: &Path) -> PathBuf {
     folder.join("learner.lock")
 }
 
-/// The supervisor's lock in a run's folder.
+/// Returns the supervisor's lock in a run's folder.
 pub(super) fn supervisor_lock(folder: &Path) -> PathBuf {
     folder.join("supervisor.lock")
 }
 
-/// What a sweep did.
+/// Result of a sweep.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Swept {
-    /// Runs of which something was removed.
+pub struct SweepResult {
+    /// Runs with removed leftovers.
     pub runs: Vec<RunId>,
-    /// What could not be removed, and why.
+    /// Leftovers that could not be removed, with the cause.
     pub failures: Vec<String>,
 }
 
-/// Removes the shared memory and the transport folders of all runs of this user in which no process
-/// lives, whatever ended them.
+/// Removes the shared memory and the transport folders of all runs of this user that have no living
+/// process.
 ///
-/// Never touches anything of a run that lives or starts: every process of a run holds a
+/// Never touches a living or starting run: every process of a run holds a
 /// [`Presence`](super::Presence).
-pub fn sweep_leftovers() -> Swept {
+pub fn sweep_leftovers() -> SweepResult {
     MACHINE.sweep()
 }
 
@@ -76,14 +76,14 @@ impl Machine {
         Path::new(self.folders).join(format!("{FOLDER_PREFIX}{:016x}", run.0))
     }
 
-    /// Locked, as the folder is, by every process of the run: containers and services may share the
-    /// memory and not the folder.
+    /// Returns the file that every process of the run locks, as it locks the folder: containers and
+    /// services may share the memory but not the folder.
     pub(super) fn presence_file(&self, run: RunId) -> PathBuf {
         Path::new(self.segments).join(format!("{SHARED_MEMORY_PREFIX}{:016x}{PRESENCE}", run.0))
     }
 
-    fn sweep(&self) -> Swept {
-        let mut swept = Swept::default();
+    fn sweep(&self) -> SweepResult {
+        let mut swept = SweepResult::default();
         for run in self.runs() {
             match self.sweep_run(run) {
                 Ok(true) => swept.runs.push(run),
@@ -94,7 +94,7 @@ impl Machine {
         swept
     }
 
-    /// Runs of this user of which there is a trace.
+    /// Returns the runs of this user that left a trace.
     fn runs(&self) -> BTreeSet<RunId> {
         let folders = own_entries(Path::new(self.folders)).filter_map(|(name, about)| {
             let (run, length) = run_of(&name, FOLDER_PREFIX)?;
@@ -109,41 +109,41 @@ impl Machine {
         folders.chain(segments).collect()
     }
 
-    /// Removes what is left of `run` if no process of it lives; whether there was anything to
-    /// remove.
+    /// Removes the leftovers of `run` if none of its processes is alive; returns `true` if there
+    /// were any.
     fn sweep_run(&self, run: RunId) -> Result<bool, String> {
         let path = self.transport_folder(run);
-        let told = |error: io::Error| format!("{}: {error}", path.display());
-        // Segments alone have no folder by which they could be judged; a process that starts would
-        // make it, so it is made.
-        make_folder(&path).map_err(told)?;
+        let at_path = |error: io::Error| format!("{}: {error}", path.display());
+        // Segments may have no folder whose lock could be checked. A starting process would create
+        // it, so it is created here.
+        make_folder(&path).map_err(at_path)?;
         let Some(folder) = open_folder(&path).map_err(|error| error.to_string())? else {
             return Ok(false);
         };
-        if folder.try_lock().is_err() || !is_still_at(&folder, &path).map_err(told)? {
+        if folder.try_lock().is_err() || !is_still_at(&folder, &path).map_err(at_path)? {
             return Ok(false);
         }
-        if !is_ours(&path).map_err(told)? {
+        if !is_ours(&path).map_err(at_path)? {
             return Ok(false);
         }
-        // Held until all is removed: whoever starts waits for it.
-        let Some(_presence) = self.lock_presence(run).map_err(told)? else {
-            // Its folder lies in another place of that name; this one was made here.
+        // Held until all is removed: a starting process waits for it.
+        let Some(_presence) = self.lock_presence(run).map_err(at_path)? else {
+            // The run is alive, with its folder under another `/tmp`; this one was created above.
             let _ = fs::remove_dir(&path);
             return Ok(false);
         };
         self.remove(run);
         if path.exists() {
             return Err(format!(
-                "{}: not all of it could be removed",
+                "{}: it could not be removed completely",
                 path.display()
             ));
         }
         Ok(true)
     }
 
-    /// The lock of a run's presence in shared memory, had alone; `None` when a process of the run
-    /// incarnations.
+    /// Takes the exclusive lock of a run's presence in shared memory; returns `None` if a process
+    /// of the run is alive.
     fn lock_presence(&self, run: RunId) -> io::Result<Option<File>> {
         let path = self.presence_file(run);
         let presence = open_private(&path)?;
@@ -151,12 +151,13 @@ impl Machine {
         Ok(is_alone.then_some(presence))
     }
 
-    /// Removes everything of `run`. For who holds the locks of its folder and its presence alone.
+    /// Removes everything of `run`. The caller holds the locks of its folder and its presence
+    /// exclusively.
     pub(super) fn remove(&self, run: RunId) {
         self.remove_incarnations(run);
         let folder = self.transport_folder(run);
-        // The locks' files come last: by them a folder is known as ours, should this process die on
-        // the way.
+        // The lock files come last: they mark the folder as Skein's, should this process die
+        // meanwhile.
         let [learner, supervisor] = [learner_lock(&folder), supervisor_lock(&folder)];
         for file in [
             folder.join("incarnation.new"),
@@ -164,18 +165,18 @@ impl Machine {
             learner,
             supervisor,
         ] {
-            told(&file, fs::remove_file(&file));
+            warn_unless_removed(&file, fs::remove_file(&file));
         }
-        told(&folder, fs::remove_dir(&folder));
+        warn_unless_removed(&folder, fs::remove_dir(&folder));
         let presence = self.presence_file(run);
-        told(&presence, fs::remove_file(&presence));
+        warn_unless_removed(&presence, fs::remove_file(&presence));
     }
 
-    /// Removes all incarnations of `run`: segments and folders. For who holds the lock of its
-    /// learner.
+    /// Removes all incarnations of `run`: segments and folders. The caller holds the learner's
+    /// lock.
     pub(super) fn remove_incarnations(&self, run: RunId) {
         for segment in self.segments(&shared_memory_prefix(run)) {
-            told(&segment, fs::remove_file(&segment));
+            warn_unless_removed(&segment, fs::remove_file(&segment));
         }
         let folder = self.transport_folder(run);
         let incarnations = own_entries(&folder).filter_map(|(name, about)| {
@@ -184,11 +185,11 @@ impl Machine {
         });
         for incarnation in incarnations {
             let path = folder.join(incarnation.to_string());
-            told(&path, fs::remove_dir_all(&path));
+            warn_unless_removed(&path, fs::remove_dir_all(&path));
         }
     }
 
-    /// Segments of this user whose names begin with `prefix`.
+    /// Returns the segments of this user whose names begin with `prefix`.
     pub(super) fn segments(&self, prefix: &str) -> impl Iterator<Item = PathBuf> + use<> {
         let (segments, prefix) = (Path::new(self.segments), prefix.to_owned());
         own_entries(segments)
@@ -199,14 +200,14 @@ impl Machine {
     }
 }
 
-/// Whether a folder is one of this version: empty, or with a lock in it. Those of version 0.1 hold
-/// no lock, so that it cannot be told whether their run incarnations.
+/// Returns `true` if a folder is of this version: empty, or with a lock in it. Folders of version
+/// 0.1 hold no lock that would show whether their run is alive.
 fn is_ours(folder: &Path) -> io::Result<bool> {
     let has_lock = learner_lock(folder).exists() || supervisor_lock(folder).exists();
     Ok(has_lock || fs::read_dir(folder)?.next().is_none())
 }
 
-/// What in `folder` belongs to this user. Links are told as links.
+/// Returns the entries of `folder` that belong to this user. Links are not followed.
 fn own_entries(folder: &Path) -> impl Iterator<Item = (OsString, fs::Metadata)> {
     let user = user();
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
@@ -216,8 +217,8 @@ fn own_entries(folder: &Path) -> impl Iterator<Item = (OsString, fs::Metadata)> 
     })
 }
 
-/// Says what could not be removed. That it is gone already is what was wanted.
-fn told(path: &Path, removed: io::Result<()>) {
+/// Logs a warning if `path` could not be removed. A missing file is what was wanted.
+fn warn_unless_removed(path: &Path, removed: io::Result<()>) {
     match removed {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
             tracing::warn!(path = %path.display(), %error, "leftover not removed");
@@ -235,17 +236,17 @@ mod tests {
 
     const RUN: RunId = RunId(0x00ab_0000_0000_00cd);
 
-    /// A machine of the test's own.
+    /// Directories that only this test uses.
     fn machine() -> (&'static Machine, tempfile::TempDir) {
         let directory = tempfile::tempdir().unwrap();
-        let place = |name: &str| {
+        let directory_named = |name: &str| {
             let path = directory.path().join(name);
             fs::create_dir(&path).unwrap();
             &*path.to_str().unwrap().to_owned().leak()
         };
         let machine = Machine {
-            folders: place("tmp"),
-            segments: place("shm"),
+            folders: directory_named("tmp"),
+            segments: directory_named("shm"),
         };
         (Box::leak(Box::new(machine)), directory)
     }
@@ -256,7 +257,7 @@ mod tests {
         path
     }
 
-    /// What a killed run leaves.
+    /// Creates the leftovers of a killed run.
     fn leave(machine: &Machine) -> PathBuf {
         let folder = machine.transport_folder(RUN);
         let incarnation = folder.join(LearnerIncarnation::after(None).to_string());
@@ -278,16 +279,16 @@ mod tests {
     }
 
     #[test]
-    fn what_a_dead_run_left_is_removed() {
+    fn leftovers_of_a_dead_run_are_removed() {
         let (machine, _directory) = machine();
         leave(machine);
         assert_eq!(machine.sweep().runs, [RUN]);
         assert!(is_empty(machine));
-        assert_eq!(machine.sweep(), Swept::default());
+        assert_eq!(machine.sweep(), SweepResult::default());
     }
 
     #[test]
-    fn segments_of_a_run_whose_folder_lies_in_another_place_are_left_alone() {
+    fn segments_of_a_living_run_with_another_tmp_are_kept() {
         let (machine, directory) = machine();
         let elsewhere = directory.path().join("elsewhere");
         fs::create_dir(&elsewhere).unwrap();
@@ -297,14 +298,14 @@ mod tests {
         }));
         let living = Presence::enter_on(other, RUN).unwrap();
         let segment = segment(machine, &format!("{}0123", shared_memory_prefix(RUN)));
-        assert_eq!(machine.sweep(), Swept::default());
+        assert_eq!(machine.sweep(), SweepResult::default());
         assert!(segment.exists() && !machine.transport_folder(RUN).exists());
         drop(living);
         assert!(is_empty(machine) && is_empty(other));
     }
 
     #[test]
-    fn segments_that_have_lost_their_folder_are_removed() {
+    fn segments_without_a_folder_are_removed() {
         let (machine, _directory) = machine();
         segment(machine, &format!("{}0123", shared_memory_prefix(RUN)));
         assert_eq!(machine.sweep().runs, [RUN]);
@@ -312,21 +313,21 @@ mod tests {
     }
 
     #[test]
-    fn nothing_of_a_run_that_lives_or_starts_is_touched_and_the_last_one_to_go_removes_it() {
+    fn a_living_or_starting_run_is_kept_and_its_last_process_removes_it() {
         let (machine, _directory) = machine();
         let first = Presence::enter_on(machine, RUN).unwrap();
-        assert_eq!(machine.sweep(), Swept::default());
+        assert_eq!(machine.sweep(), SweepResult::default());
         let folder = leave(machine);
         let second = Presence::enter_on(machine, RUN).unwrap();
         drop(first);
-        assert_eq!(machine.sweep(), Swept::default());
+        assert_eq!(machine.sweep(), SweepResult::default());
         assert!(learner_lock(&folder).exists());
         drop(second);
         assert!(is_empty(machine));
     }
 
     #[test]
-    fn names_of_others_and_links_are_left_alone() {
+    fn foreign_names_and_links_are_kept() {
         let (machine, directory) = machine();
         let outside = directory.path().join("outside");
         fs::create_dir(&outside).unwrap();
@@ -344,13 +345,13 @@ mod tests {
         for name in ["skein_00ab0000000000cd", "skein_report", "iox2_1"] {
             segment(machine, name);
         }
-        // A run of version 0.1 may be under way.
+        // A run of version 0.1 may be alive.
         fs::create_dir_all(folders.join("skein-00000000000000dd/nodes")).unwrap();
-        assert_eq!(machine.sweep(), Swept::default());
+        assert_eq!(machine.sweep(), SweepResult::default());
         assert_eq!(fs::read_dir(machine.segments).unwrap().count(), 3);
         assert_eq!(fs::read_dir(machine.folders).unwrap().count(), 6);
 
-        // Nor is a link followed within what is removed.
+        // A link within a removed folder is not followed either.
         let folder = leave(machine);
         symlink(&outside, folder.join("2")).unwrap();
         machine.sweep();
@@ -358,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_enters_while_a_run_is_swept_is_present_in_the_end() {
+    fn a_process_that_enters_during_a_sweep_keeps_its_folder() {
         let (machine, _directory) = machine();
         let swept = std::sync::atomic::AtomicBool::new(false);
         std::thread::scope(|scope| {

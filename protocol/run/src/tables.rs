@@ -2,10 +2,10 @@
 
 use comfy_table::presets::UTF8_FULL_CONDENSED;
 use comfy_table::{CellAlignment, Table};
-use skein_protocol::evaluation::{EvaluationReport, Failures};
-use skein_protocol::stages::{Tally, Thread, Times};
+use skein_protocol::evaluation::{EvaluationReport, WallFailures};
+use skein_protocol::stages::{StageTime, StageTimes, ThreadRole};
 
-/// How a snapshot flies: a row for each course.
+/// Returns the evaluation of a snapshot as a table with one row per course.
 pub fn evaluation_table(report: &EvaluationReport) -> String {
     let mut table = Table::new();
     table.load_preset(UTF8_FULL_CONDENSED);
@@ -22,8 +22,9 @@ pub fn evaluation_table(report: &EvaluationReport) -> String {
     ]);
     for course in &report.courses {
         let walls: Vec<String> = course.walls_passed.iter().map(u64::to_string).collect();
-        let failed = |by: fn(&Failures) -> u64| course.failures.iter().map(by).collect::<Vec<_>>();
-        // Behind the last wall there is none to hit.
+        let failed =
+            |by: fn(&WallFailures) -> u64| course.failures.iter().map(by).collect::<Vec<_>>();
+        // No wall follows the last one.
         let mut hit_wall = failed(|failures| failures.hit_wall);
         hit_wall.truncate(walls.len());
         table.add_row([
@@ -44,7 +45,7 @@ pub fn evaluation_table(report: &EvaluationReport) -> String {
     table.to_string()
 }
 
-/// Counts one after the other, a dot for none; one dot for nothing at all.
+/// Formats counts in a row, with a dot for zero; a single dot if all are zero.
 fn counts(values: &[u64]) -> String {
     if values.iter().all(|&value| value == 0) {
         return "·".to_owned();
@@ -59,8 +60,8 @@ fn counts(values: &[u64]) -> String {
     values.iter().map(shown).collect::<Vec<_>>().join(" ")
 }
 
-/// Where the time of a run went: a row for each stage, in the order of the data's way.
-pub fn stages_table(times: &Times) -> String {
+/// Returns the times of a run as a table with one row per stage, in the order of the data flow.
+pub fn stages_table(times: &StageTimes) -> String {
     let mut table = Table::new();
     table.load_preset(UTF8_FULL_CONDENSED);
     table.set_header([
@@ -82,9 +83,9 @@ pub fn stages_table(times: &Times) -> String {
         table.add_row([
             title.to_owned(),
             stage.name().to_owned(),
-            some(tally.count, tally.count.to_string()),
+            blank_if_zero(tally.count, tally.count.to_string()),
             format!("{:.2} s", tally.secs()),
-            some(tally.count, each(tally)),
+            blank_if_zero(tally.count, each(tally)),
             format!(
                 "{:.1} %",
                 100.0 * tally.nanos as f64 / of_thread.max(1) as f64
@@ -97,12 +98,12 @@ pub fn stages_table(times: &Times) -> String {
     table.to_string()
 }
 
-/// `text`, unless there is nothing to be counted.
-fn some(count: u64, text: String) -> String {
+/// Returns `text`, or nothing if `count` is zero.
+fn blank_if_zero(count: u64, text: String) -> String {
     if count == 0 { String::new() } else { text }
 }
 
-fn each(tally: Tally) -> String {
+fn each(tally: StageTime) -> String {
     let secs = tally.secs() / tally.count.max(1) as f64;
     match secs {
         0.0..1e-3 => format!("{:.2} µs", secs * 1e6),
@@ -111,11 +112,11 @@ fn each(tally: Tally) -> String {
     }
 }
 
-const fn title(thread: Thread) -> &'static str {
+const fn title(thread: ThreadRole) -> &'static str {
     match thread {
-        Thread::Actors => "actors, together",
-        Thread::Receiving => "learner: receiving",
-        Thread::Training => "learner: training",
+        ThreadRole::Actors => "actors, together",
+        ThreadRole::Receiving => "learner: receiving",
+        ThreadRole::Training => "learner: training",
     }
 }
 
@@ -130,8 +131,8 @@ mod tests {
 
     use super::*;
 
-    fn sample() -> Times {
-        let mut times = Times::default();
+    fn sample() -> StageTimes {
+        let mut times = StageTimes::default();
         for (nanos, stage) in (1_234_567_891..).step_by(1_111_111_111).zip(Stage::ALL) {
             times.add(*stage, 7, Duration::from_nanos(nanos));
         }
@@ -175,7 +176,11 @@ mod tests {
             shares.push((stage.thread(), share));
         }
         assert_eq!(shares.len(), Stage::ALL.len());
-        for thread in [Thread::Actors, Thread::Receiving, Thread::Training] {
+        for thread in [
+            ThreadRole::Actors,
+            ThreadRole::Receiving,
+            ThreadRole::Training,
+        ] {
             assert_eq!(table.matches(title(thread)).count(), 1, "{table}");
             let own = shares.iter().filter(|(of, _)| *of == thread);
             let sum: f64 = own.map(|(_, share)| share).sum();
@@ -187,11 +192,11 @@ mod tests {
     }
 
     #[test]
-    fn times_are_told_in_units_that_one_can_read() {
-        let told = |nanos| each(Tally { count: 10, nanos });
-        assert_eq!(told(1_300), "0.13 µs");
-        assert_eq!(told(2_500_000), "250.00 µs");
-        assert_eq!(told(12_300_000), "1.23 ms");
-        assert_eq!(told(120_000_000_000), "12.00 s");
+    fn times_are_printed_in_readable_units() {
+        let printed = |nanos| each(StageTime { count: 10, nanos });
+        assert_eq!(printed(1_300), "0.13 µs");
+        assert_eq!(printed(2_500_000), "250.00 µs");
+        assert_eq!(printed(12_300_000), "1.23 ms");
+        assert_eq!(printed(120_000_000_000), "12.00 s");
     }
 }

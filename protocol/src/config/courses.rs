@@ -1,24 +1,26 @@
-//! `[courses]`.
+//! The `[courses]` section.
 
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require};
+use super::{InvalidValue, require};
 
-/// `[courses]`: what is flown through. Paths are relative to the configuration file; given with
-/// `--set`, to the working directory. Courses that are not named are those that come with Skein, in
-/// `configs/courses/`.
+/// The `[courses]` section: the courses of training and evaluation.
+///
+/// Paths are relative to the configuration file; with `--set`, to the working directory. Keys left
+/// out name the courses that come with Skein, in `configs/courses/`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoursesSection {
-    /// The course training flies.
+    /// Course file of the training episodes. Default `courses/training.toml`.
     pub training: PathBuf,
-    /// Share of training episodes flown on a generated course instead, a new one each, in [0, 1].
+    /// Share of training episodes that fly a generated course instead, a new one each, in [0, 1].
     /// Default 0: the training course only, as in the paper.
     pub generated_share: f64,
-    /// The courses of the final evaluation, in the order of its table. The first is the one
-    /// snapshots are confirmed on.
+    /// Course files of the final evaluation, in the order of its table; 1 to 64. Candidates for the
+    /// best snapshot are confirmed on the first. Default: `training.toml`, `rearranged_34125.toml`,
+    /// `rearranged_53412.toml` and `non_rectangular.toml`.
     pub evaluation: Vec<PathBuf>,
 }
 
@@ -41,7 +43,7 @@ impl Default for CoursesSection {
 }
 
 impl CoursesSection {
-    /// What a course is called in reports: its file's name without the ending.
+    /// Name of a course in reports: its file name without the extension.
     pub fn name_of(course: &Path) -> String {
         course
             .file_stem()
@@ -50,17 +52,17 @@ impl CoursesSection {
             .into_owned()
     }
 
-    /// Every course file.
+    /// Returns every course file.
     pub fn paths(&self) -> impl Iterator<Item = &PathBuf> {
         std::iter::once(&self.training).chain(&self.evaluation)
     }
 
-    /// Every course file, to be changed.
+    /// Returns every course file, mutable.
     pub fn paths_mut(&mut self) -> impl Iterator<Item = &mut PathBuf> {
         self.evaluation.iter_mut().chain([&mut self.training])
     }
 
-    pub(super) fn validate(&self) -> Result<(), Invalid> {
+    pub(super) fn validate(&self) -> Result<(), InvalidValue> {
         require(
             (0.0..=1.0).contains(&self.generated_share),
             "courses.generated_share",

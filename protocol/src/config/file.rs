@@ -1,4 +1,4 @@
-//! Reading a configuration file, with overrides, and writing it back.
+//! Reads a configuration file with overrides, and writes it back.
 
 use std::fs;
 use std::io;
@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 
 use toml::{Table, Value};
 
-use super::{Config, DEEPEST, Invalid};
+use super::{Config, InvalidValue, MAX_NESTING};
 
-/// Why a configuration cannot be used. Every variant names the file or the override it came from.
+/// Reason why a configuration cannot be used. Every variant names the file or the override.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
@@ -16,7 +16,7 @@ pub enum ConfigError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         #[source]
         source: io::Error,
     },
@@ -25,7 +25,7 @@ pub enum ConfigError {
     Syntax {
         /// The file.
         path: PathBuf,
-        /// Where and why.
+        /// Position and cause.
         #[source]
         source: Box<toml::de::Error>,
     },
@@ -34,43 +34,44 @@ pub enum ConfigError {
     Key {
         /// The file.
         path: PathBuf,
-        /// Which key, and what was expected.
+        /// The key, and what was expected.
         message: String,
     },
-    /// A value makes no sense.
+    /// A value is out of bounds, or contradicts another key.
     #[error("{}: {source}", path.display())]
     Invalid {
         /// The file.
         path: PathBuf,
-        /// Which key, and why.
+        /// The key, the value and the bound.
         #[source]
-        source: Invalid,
+        source: InvalidValue,
     },
-    /// An override cannot be understood.
+    /// An override cannot be parsed.
     #[error("--set {text}: {problem}; write it as section.key=value")]
     Override {
         /// The override as given.
         text: String,
-        /// What is wrong with it.
+        /// The problem.
         problem: String,
     },
-    /// The file could be used, were it not for an override.
+    /// The file is valid without an override.
     #[error("with --set {text}, {source}")]
     Overridden {
         /// The override as given.
         text: String,
-        /// What is wrong now.
+        /// The error with the override.
         #[source]
         source: Box<ConfigError>,
     },
 }
 
-/// The override that brought about the failure of `attempt` with all of `overrides`: since it, and
-/// not before, the attempt fails with these very words. `None` when the file alone fails so.
+/// Returns the override that causes the failure of `attempt` with all of `overrides`: the first
+/// that makes the attempt fail with exactly this message. Returns `None` when the file alone fails
+/// this way.
 ///
-/// `attempt` is given the first so many overrides, and returns what the user would be told; `None`
-/// when it succeeds.
-pub fn culprit(
+/// `attempt` receives the first overrides, from none to all; it returns the error message, or
+/// `None` when it succeeds.
+pub fn failing_override(
     overrides: &[String],
     attempt: impl Fn(&[String]) -> Option<String>,
 ) -> Option<&String> {
@@ -81,29 +82,29 @@ pub fn culprit(
         .map(|count| &overrides[count])
 }
 
-/// Names the folder of the configurations that come with Skein, whose `courses/` holds the default
-/// courses; the scripts in `launch/` set it. Without it they are looked for beside the
-/// configuration file.
+/// Environment variable that names the folder of the shipped configurations, whose `courses/` holds
+/// the default courses. The scripts in `launch/` set it. Without it, the folder of the
+/// configuration file is used.
 const SHIPPED_CONFIGS: &str = "SKEIN_CONFIGS";
 
 impl Config {
     /// Reads `path`, applies `overrides` (`section.key=value`, the value in TOML's notation or a
-    /// bare word) and validates the result. Course paths become relative to the working directory:
-    /// in the file they are relative to the file, in an override to the working directory.
+    /// bare word) and validates the result. Course paths in the file are relative to the file,
+    /// those in an override to the working directory.
     ///
     /// # Errors
-    /// [`ConfigError`] names file, key, value and remedy, and the override that is to blame.
+    /// [`ConfigError`] names file, key, value and remedy, and the override that caused it.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         let error = match Self::resolve(path, overrides) {
             Err(error) if !matches!(error, ConfigError::Override { .. }) => error,
-            settled => return settled,
+            other => return other,
         };
-        let told = |overrides: &[String]| {
+        let message = |overrides: &[String]| {
             Self::resolve(path, overrides)
                 .err()
                 .map(|error| error.to_string())
         };
-        Err(match culprit(overrides, told) {
+        Err(match failing_override(overrides, message) {
             Some(text) => ConfigError::Overridden {
                 text: text.clone(),
                 source: Box::new(error),
@@ -120,8 +121,8 @@ impl Config {
         Self::parse(&text, path, overrides)
     }
 
-    /// Reads a configuration from the `text` of a configuration file at `path`, as [`Config::load`]
-    /// does, but for telling which override is to blame.
+    /// Reads a configuration from the `text` of a configuration file at `path`. Unlike
+    /// [`Config::load`], an error does not name the override that caused it.
     ///
     /// # Errors
     /// [`ConfigError`] names file, key, value and remedy.
@@ -130,7 +131,8 @@ impl Config {
         Self::parse_with(text, path, overrides, shipped.as_deref())
     }
 
-    /// [`Config::parse`], with the courses that are not named in `shipped`, or beside the file.
+    /// Reads as [`Config::parse`] does. Courses that the file does not name lie in `shipped`, or
+    /// beside the file.
     fn parse_with(
         text: &str,
         path: &Path,
@@ -168,7 +170,8 @@ impl Config {
         for course in config.courses.paths() {
             if course.to_str().is_none() {
                 let message = format!(
-                    "[courses] {} is not UTF-8, so it could not be written into the files of a run; rename the folder",
+                    "[courses] {} is not UTF-8 and cannot be stored in the files of a run; \
+                    rename the folder",
                     course.display()
                 );
                 return Err(ConfigError::Key {
@@ -180,15 +183,15 @@ impl Config {
         Ok(config)
     }
 
-    /// The whole configuration as TOML, defaults included.
+    /// Returns the whole configuration as TOML, defaults included.
     pub fn to_toml(&self) -> String {
         toml::to_string_pretty(self)
             .expect("every field of the configuration is representable in TOML")
     }
 }
 
-/// Deserializes section by section, so that an error names its section: the parser itself only
-/// knows the key.
+/// Deserializes section by section, so that an error names its section: the parser itself knows
+/// only the key.
 fn from_table(mut table: Table) -> Result<Config, String> {
     let mut config = Config::default();
     fn section<T: serde::de::DeserializeOwned>(
@@ -220,7 +223,8 @@ fn from_table(mut table: Table) -> Result<Config, String> {
     match table.keys().next() {
         None => Ok(config),
         Some(unknown) => Err(format!(
-            "unknown section [{unknown}]; known are run, courses, learning, sac, td3, vae, replay, evaluation, checkpoints, transport, simulator"
+            "unknown section [{unknown}]; known are run, courses, learning, sac, td3, vae, \
+            replay, evaluation, checkpoints, transport, simulator"
         )),
     }
 }
@@ -235,10 +239,8 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
         .trim()
         .rsplit_once('.')
         .ok_or_else(|| fail("names no section"))?;
-    if sections.split('.').count() > DEEPEST {
-        return Err(fail(
-            "names sections deeper within each other than any section lies",
-        ));
+    if sections.split('.').count() > MAX_NESTING {
+        return Err(fail("nests sections deeper than any section lies"));
     }
     let mut target = table;
     for section in sections.split('.') {
@@ -251,14 +253,14 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
     let mut value = parse_value(value.trim());
     if matches!((sections, key), ("courses", "training" | "evaluation")) {
         make_absolute(&mut value)
-            .map_err(|error| fail(&format!("no path can be made of it ({error})")))?;
+            .map_err(|error| fail(&format!("is not a usable path ({error})")))?;
     }
     target.insert(key.to_owned(), value);
     Ok(())
 }
 
-/// Paths on the command line are the user's, who knows nothing of the configuration file's folder.
-/// What is no path is left for validation to refuse.
+/// Makes course paths absolute: paths on the command line are relative to the working directory,
+/// not to the configuration file. Other values are left for validation to refuse.
 fn make_absolute(value: &mut Value) -> io::Result<()> {
     match value {
         Value::String(path) => {
@@ -270,7 +272,8 @@ fn make_absolute(value: &mut Value) -> io::Result<()> {
     }
 }
 
-/// A value in TOML's notation, or else the text itself: `--set run.device=cpu` needs no quotes.
+/// Parses a value in TOML's notation, or else takes the text itself: `--set run.device=cpu` needs
+/// no quotes.
 fn parse_value(text: &str) -> Value {
     toml::from_str::<Table>(&format!("value = {text}"))
         .ok()
@@ -278,15 +281,14 @@ fn parse_value(text: &str) -> Value {
         .unwrap_or_else(|| Value::String(text.to_owned()))
 }
 
-/// Reads a text file of a size that people write. Of what is no file, a pipe or a device, the end
-/// might never come.
+/// Reads a text file of ordinary size. Reading a pipe or a device might never end.
 fn read_text(path: &Path) -> io::Result<String> {
-    /// Many times what a configuration with every key and a comment on each has.
-    const LONGEST: u64 = 1 << 20;
+    /// Many times the size of a configuration with every key and a comment on each.
+    const MAX_BYTES: u64 = 1 << 20;
     let about = fs::metadata(path)?;
-    if !about.is_file() || about.len() > LONGEST {
+    if !about.is_file() || about.len() > MAX_BYTES {
         return Err(io::Error::other(format!(
-            "is no text file of at most {LONGEST} bytes"
+            "it is not a text file of at most {MAX_BYTES} bytes"
         )));
     }
     fs::read_to_string(path)
@@ -323,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn every_device_has_its_engine_unless_another_is_asked_for() {
+    fn each_device_has_a_default_engine_that_a_key_overrides() {
         let engine = |overrides: &[&str]| load("", overrides).unwrap().run.engine();
         assert_eq!(engine(&[]), Engine::Native);
         assert_eq!(engine(&["run.device=cuda:1"]), Engine::Libtorch);
@@ -331,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn what_only_libtorch_computes_is_on_libtorch_and_the_rest_is_not() {
+    fn only_parts_without_native_kernels_are_computed_by_libtorch() {
         let engines = |overrides: &[&str]| {
             let config = load("", overrides).unwrap();
             (config.policy_engine(), config.vae.engine(&config.run))
@@ -405,7 +407,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_whose_name_cannot_be_written_down_is_refused() {
+    fn a_folder_name_that_is_not_utf8_is_refused() {
         use std::os::unix::ffi::OsStrExt;
         let path = Path::new(std::ffi::OsStr::from_bytes(b"/runs/\xff/config.toml"));
         let error = Config::parse_with("", path, &[], None)
@@ -418,7 +420,7 @@ mod tests {
     }
 
     #[test]
-    fn the_override_that_is_to_blame_is_named_and_no_other() {
+    fn the_override_that_causes_an_error_is_named_and_no_other() {
         for (text, overrides, blamed) in [
             (
                 "",
@@ -536,12 +538,14 @@ mod tests {
                 ],
             ),
             (
-                "[learning]\nsegment_steps = 2\nepisodes_per_epoch = 1\n[replay]\nsuccess = \"approach\"",
+                "[learning]\nsegment_steps = 2\nepisodes_per_epoch = 1\n\
+                [replay]\nsuccess = \"approach\"",
                 vec![],
                 vec!["replay.success = approach", "segment_steps = 2", "level-up"],
             ),
             (
-                "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1\n[transport]\nmax_records_per_episode = 300",
+                "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1\n\
+                [transport]\nmax_records_per_episode = 300",
                 vec![],
                 vec!["transport.max_records_per_episode = 300", "256", "lower it"],
             ),
@@ -551,7 +555,7 @@ mod tests {
                 vec![
                     "learning.history_steps = [2]",
                     "segment_steps = 1",
-                    "name none",
+                    "set it to []",
                 ],
             ),
             (
@@ -566,7 +570,7 @@ mod tests {
             (
                 "[learning]\nhistory_steps = [4, 2]",
                 vec![],
-                vec!["learning.history_steps = [4, 2]", "does not rise"],
+                vec!["learning.history_steps = [4, 2]", "must rise"],
             ),
             (
                 "[learning]\nhistory_steps = [0, 2]",
@@ -607,7 +611,7 @@ mod tests {
             (
                 "[learning]\nencoder = \"end-to-end\"\nhistory_steps = [2]",
                 vec![],
-                vec!["learning.history_steps = [2]", "end-to-end", "name none"],
+                vec!["learning.history_steps = [2]", "end-to-end", "set it to []"],
             ),
             (
                 "[learning]\nencoder = \"end-to-end\"",

@@ -1,5 +1,5 @@
-//! What of a configuration is the same wherever the run's directory lies: for comparing two of
-//! them.
+//! The part of a configuration that does not depend on the location of the run's directory, for
+//! comparing configurations.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -10,8 +10,8 @@ use xxhash_rust::xxh3::xxh3_64;
 use super::Config;
 
 impl Config {
-    /// The whole configuration as TOML, but of course files the names only, so that a run's
-    /// directory can be moved.
+    /// Returns the whole configuration as TOML, with only the names of course files, so that a
+    /// run's directory can be moved.
     pub fn portable(&self) -> String {
         let mut portable = self.clone();
         for course in portable.courses.paths_mut() {
@@ -20,22 +20,22 @@ impl Config {
         portable.to_toml()
     }
 
-    /// Fingerprint of the [portable](Config::portable) configuration; processes of one run compare
-    /// it.
+    /// Returns a fingerprint of the [portable](Config::portable) configuration. Processes of one
+    /// run compare it.
     pub fn digest(&self) -> u64 {
         Self::digest_of(&self.portable())
     }
 
-    /// The digest of the configuration whose portable text is `portable`.
+    /// Returns the digest of the configuration whose portable text is `portable`.
     pub fn digest_of(portable: &str) -> u64 {
         xxh3_64(portable.as_bytes())
     }
 
-    /// In what `other`, the portable text of another configuration, differs from this one: for each
-    /// key `section.key = value there, value here`.
+    /// Returns the keys in which `other`, the portable text of another configuration, differs from
+    /// this one: for each key `section.key = value there, value here`.
     ///
     /// # Errors
-    /// When `other` is not TOML.
+    /// If `other` is not TOML.
     pub fn differences(&self, other: &str) -> Result<Vec<String>, toml::de::Error> {
         let there = flat(&toml::from_str(other)?);
         let here =
@@ -61,7 +61,7 @@ impl Config {
     }
 }
 
-/// Values in TOML's notation by their full keys.
+/// Returns the values in TOML's notation by their full keys.
 fn flat(table: &Table) -> BTreeMap<String, String> {
     let mut values = BTreeMap::new();
     for (key, value) in table {
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn where_the_courses_lie_makes_no_difference() {
+    fn the_digest_does_not_depend_on_the_courses_folder() {
         let here = Config::default();
         let mut moved = here.clone();
         moved.courses.training =

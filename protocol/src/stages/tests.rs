@@ -2,8 +2,8 @@ use std::collections::HashSet;
 
 use super::*;
 
-fn sample() -> Times {
-    let mut times = Times::default();
+fn sample() -> StageTimes {
+    let mut times = StageTimes::default();
     for (nanos, stage) in (1_234_567_891..).step_by(1_111_111_111).zip(Stage::ALL) {
         times.add(*stage, 7, Duration::from_nanos(nanos));
     }
@@ -19,7 +19,7 @@ fn a_thread_names_each_of_its_stages_once_and_threads_do_not_mix() {
     assert_eq!(names.len(), STAGES);
     let of_actors = Stage::ALL
         .iter()
-        .filter(|stage| stage.thread() == Thread::Actors);
+        .filter(|stage| stage.thread() == ThreadRole::Actors);
     assert_eq!(of_actors.count(), ACTOR_STAGES);
     for (index, stage) in Stage::ALL.iter().enumerate() {
         assert_eq!(*stage as usize, index);
@@ -35,7 +35,7 @@ fn laps_are_a_threads_whole_time() {
         timer.lap(stage, 1);
     }
     let times = timer.times();
-    let total = Duration::from_nanos(times.total_nanos(Thread::Actors));
+    let total = Duration::from_nanos(times.total_nanos(ThreadRole::Actors));
     assert!(total >= Duration::from_millis(6) && total <= begun.elapsed());
     assert_eq!(
         (
@@ -45,33 +45,33 @@ fn laps_are_a_threads_whole_time() {
         (2, 1)
     );
     assert!(times.of(Stage::Physics).nanos > 4_000_000);
-    assert_eq!(times.total_nanos(Thread::Training), 0);
+    assert_eq!(times.total_nanos(ThreadRole::Training), 0);
 }
 
 #[test]
-fn what_was_is_taken_away_and_nothing_goes_below_nothing_or_overflows() {
-    let (all, none) = (sample(), Times::default());
+fn sums_and_differences_of_times_never_overflow_or_go_below_zero() {
+    let (all, none) = (sample(), StageTimes::default());
     assert_eq!(all.plus(&all).since(&all), all);
     assert_eq!(none.since(&all), none);
-    let endless = Times(
-        [Tally {
+    let endless = StageTimes(
+        [StageTime {
             count: u64::MAX,
             nanos: u64::MAX,
         }; STAGES],
     );
     assert_eq!(endless.plus(&all), endless);
-    assert_eq!(endless.total_nanos(Thread::Training), u64::MAX);
+    assert_eq!(endless.total_nanos(ThreadRole::Training), u64::MAX);
 }
 
 #[test]
-fn a_file_brings_back_what_was_spent_and_says_nothing_of_what_was_not() {
+fn a_file_restores_the_times_and_omits_stages_that_did_not_occur() {
     let json = serde_json::to_string(&sample()).unwrap();
-    assert_eq!(serde_json::from_str::<Times>(&json).unwrap(), sample());
-    assert_eq!(serde_json::to_string(&Times::default()).unwrap(), "[]");
+    assert_eq!(serde_json::from_str::<StageTimes>(&json).unwrap(), sample());
+    assert_eq!(serde_json::to_string(&StageTimes::default()).unwrap(), "[]");
 }
 
 #[test]
-fn whatever_a_file_says_is_a_time_and_stages_of_another_version_are_left_out() {
+fn any_number_in_a_file_becomes_a_time_and_unknown_stages_are_ignored() {
     let row = |thread: &str, stage: &str, count: u64, secs: &str| {
         format!(r#"{{"thread":"{thread}","stage":"{stage}","count":{count},"secs":{secs}}}"#)
     };
@@ -82,9 +82,9 @@ fn whatever_a_file_says_is_a_time_and_stages_of_another_version_are_left_out() {
         row("actors", "telepathy", 5, "1.0"),
         row("ground staff", "idle", 5, "1.0"),
     ];
-    let times: Times = serde_json::from_str(&format!("[{}]", rows.join(","))).unwrap();
-    assert_eq!(times.of(Stage::Physics), Tally { count: 1, nanos: 0 });
-    let most = Tally {
+    let times: StageTimes = serde_json::from_str(&format!("[{}]", rows.join(","))).unwrap();
+    assert_eq!(times.of(Stage::Physics), StageTime { count: 1, nanos: 0 });
+    let most = StageTime {
         count: u64::MAX,
         nanos: u64::MAX,
     };

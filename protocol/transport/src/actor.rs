@@ -1,4 +1,4 @@
-//! An actor's ends of the services.
+//! An actor's ports of the services.
 
 use std::time::Duration;
 
@@ -10,9 +10,9 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 
-use super::joining::{JoinError, learner_of};
-use super::memory::{let_go, reserve};
-use super::opening::{Manner, Opener};
+use super::join::{JoinError, find_learner};
+use super::memory::{release_pages, reserve};
+use super::open::{OpenMode, Opener};
 use super::wire::{LoanedTransition, Wire};
 use super::{Ipc, ServiceError, failed, node, wait};
 use skein_protocol::config::Config;
@@ -20,14 +20,15 @@ use skein_protocol::ids::RunId;
 use skein_protocol::segment::SegmentRecord;
 use skein_protocol::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 use skein_protocol::status::StatusRecord;
-use skein_protocol::ticket::{ControlRecord, Message};
+use skein_protocol::ticket::{ControlMessage, ControlRecord};
 use skein_protocol::transition::TransitionRecord;
 use skein_run::{LearnerIncarnation, RunIdentity};
 
-/// Samples an actor loans at one time: the record being completed and the next one, whose image its
-/// reward needs.
+/// Samples that an actor loans at one time: the record being completed and the next one, because
+/// the reward depends on the next image.
 const LOANED_RECORDS: usize = 2;
-/// An actor's ends.
+
+/// Ports of an actor.
 #[derive(Debug)]
 pub struct ActorPorts {
     run: RunId,
@@ -40,19 +41,19 @@ pub struct ActorPorts {
     weights: Subscriber<Ipc, [u8], Wire<SnapshotHeader>>,
     wake: Listener<Ipc>,
     wake_learner: Notifier<Ipc>,
-    // Held so that the node outlives its ports and is seen as alive.
+    // Keeps the node alive longer than its ports.
     _node: Node<Ipc>,
 }
 
 impl ActorPorts {
-    /// Joins the learner that lives now: opens an actor's ends of every service, on the thread that
-    /// will use them. Waits for nothing.
+    /// Joins the living learner: opens an actor's ports of every service, on the thread that will
+    /// use them. Does not block.
     ///
     /// # Errors
-    /// [`JoinError::NoLearner`] when there is none to join at this moment;
-    /// [`JoinError::Difference`] when this process and the learner's do not fit.
+    /// [`JoinError::NoLearner`] if there is no learner to join; [`JoinError::Mismatch`] if this
+    /// process does not match the learner.
     pub fn join(identity: &RunIdentity, config: &Config) -> Result<Self, JoinError> {
-        let incarnation = learner_of(identity, config)?.incarnation;
+        let incarnation = find_learner(identity, config)?.incarnation;
         let ports = Self::open(identity, incarnation, config)?;
         reserve(identity, incarnation)?;
         Ok(ports)
@@ -64,7 +65,7 @@ impl ActorPorts {
         config: &Config,
     ) -> Result<Self, ServiceError> {
         let node = node(identity, incarnation, "actor")?;
-        let open = Opener::new(&node, Manner::Join, identity, config)?;
+        let open = Opener::new(&node, OpenMode::Join, identity, config)?;
         Ok(Self {
             run: identity.run,
             incarnation,
@@ -112,29 +113,28 @@ impl ActorPorts {
         })
     }
 
-    /// The run.
+    /// Returns the run.
     pub fn run(&self) -> RunId {
         self.run
     }
 
-    /// The incarnation of the learner that was joined.
+    /// Returns the incarnation of the learner that was joined.
     pub fn incarnation(&self) -> LearnerIncarnation {
         self.incarnation
     }
 
-    /// Waits until the learner has something to say, `timeout` has passed, or a signal has come.
+    /// Waits until the learner has sent something, `timeout` has passed, or a signal has arrived.
     ///
     /// # Errors
-    /// [`ServiceError`] when the wait itself fails.
+    /// [`ServiceError`] if the wait itself fails.
     pub fn wait(&self, timeout: Duration) -> Result<(), ServiceError> {
         wait(&self.wake, timeout).map_err(failed("wake-actors", "waiting"))
     }
 
-    /// A record in shared memory, to be written in place. It holds whatever was in that memory
-    /// before.
+    /// Loans a record in shared memory, to be written in place. Its content is arbitrary.
     ///
     /// # Errors
-    /// [`ServiceError`] when the learner holds all of this actor's memory, which tickets rule out.
+    /// [`ServiceError`] if the learner holds all of this actor's memory, which tickets rule out.
     pub fn loan_transition(&self) -> Result<LoanedTransition, ServiceError> {
         let sample = self
             .transitions
@@ -145,10 +145,10 @@ impl ActorPorts {
         Ok(LoanedTransition(unsafe { sample.assume_init() }))
     }
 
-    /// Sends a record without a copy. That it arrives is not promised: the learner counts.
+    /// Sends a record without a copy. Its arrival is not guaranteed: the learner counts records.
     ///
     /// # Errors
-    /// [`ServiceError`] when the connection is broken.
+    /// [`ServiceError`] if the connection is broken.
     pub fn send_transition(&self, record: LoanedTransition) -> Result<(), ServiceError> {
         record
             .0
@@ -160,7 +160,7 @@ impl ActorPorts {
     /// Sends a heartbeat.
     ///
     /// # Errors
-    /// [`ServiceError`] when there is no memory to send it in.
+    /// [`ServiceError`] if there is no memory for it.
     pub fn send_status(&self, record: StatusRecord) -> Result<(), ServiceError> {
         self.status
             .send_copy(Wire(record))
@@ -168,29 +168,30 @@ impl ActorPorts {
             .map_err(failed("status", "sending"))
     }
 
-    /// The next message, if one has arrived. Tickets of segments come after all else.
+    /// Returns the next message, if one has arrived. Tickets of segments come last.
     ///
     /// # Errors
-    /// [`ServiceError`] when the learner's memory cannot be mapped.
-    pub fn receive_control(&self) -> Result<Option<Message>, ServiceError> {
+    /// [`ServiceError`] if the learner's memory cannot be mapped.
+    pub fn receive_control(&self) -> Result<Option<ControlMessage>, ServiceError> {
         if let Some(sample) = self
             .control
             .receive()
             .map_err(failed("control", "receiving"))?
         {
-            return Ok(Some(Message::Control(sample.0)));
+            return Ok(Some(ControlMessage::Control(sample.0)));
         }
         let sample = self
             .segments
             .receive()
             .map_err(failed("segments", "receiving"))?;
-        Ok(sample.map(|sample| Message::Segment(Box::new(sample.0))))
+        Ok(sample.map(|sample| ControlMessage::Segment(Box::new(sample.0))))
     }
 
-    /// The next snapshot, if one has arrived; the inner result says whether it can be flown.
+    /// Returns the next snapshot, if one has arrived; the inner result is an error if it cannot be
+    /// flown.
     ///
     /// # Errors
-    /// [`ServiceError`] when the learner's memory cannot be mapped.
+    /// [`ServiceError`] if the learner's memory cannot be mapped.
     pub fn receive_snapshot(
         &self,
     ) -> Result<Option<Result<Snapshot, skein_protocol::snapshot::SnapshotError>>, ServiceError>
@@ -206,7 +207,7 @@ impl ActorPorts {
                 self.run,
                 &self.layout,
             );
-            let_go(sample.payload());
+            release_pages(sample.payload());
             received
         }))
     }
@@ -214,7 +215,7 @@ impl ActorPorts {
     /// Wakes the learner.
     ///
     /// # Errors
-    /// [`ServiceError`] when the event cannot be raised.
+    /// [`ServiceError`] if the event cannot be raised.
     pub fn wake_learner(&self) -> Result<(), ServiceError> {
         self.wake_learner
             .notify()
@@ -222,10 +223,10 @@ impl ActorPorts {
             .map_err(failed("wake-learner", "notifying"))
     }
 
-    /// Connects to a learner that has come. To be called regularly.
+    /// Connects to a learner that has appeared. Called regularly.
     ///
     /// # Errors
-    /// [`ServiceError`] when the learner's memory cannot be mapped.
+    /// [`ServiceError`] if the learner's memory cannot be mapped.
     pub fn maintain(&self) -> Result<(), ServiceError> {
         self.control
             .update_connections()

@@ -1,4 +1,4 @@
-//! The learner's ends of the services.
+//! The learner's ports of the services.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -11,32 +11,32 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 
-use super::dead::Reclaimer;
-use super::joining::JoinError;
+use super::join::JoinError;
 use super::memory::reserve;
-use super::opening::{Manner, Opener, control_slots};
+use super::open::{OpenMode, Opener, control_slots};
+use super::reclaim::Reclaimer;
 use super::wire::{ReceivedTransition, Wire};
 use super::{Ipc, ServiceError, failed, node, wait};
 use skein_protocol::config::Config;
 use skein_protocol::segment::SegmentRecord;
 use skein_protocol::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 use skein_protocol::status::StatusRecord;
-use skein_protocol::ticket::{ControlRecord, Message};
+use skein_protocol::ticket::{ControlMessage, ControlRecord};
 use skein_protocol::transition::TransitionRecord;
-use skein_run::fault::{FaultPoint, pass};
+use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_run::{Announcement, LearnerIncarnation, RunIdentity};
 
-/// Snapshots that exist at once in shared memory: the history, one being written, and those that
-/// slow readers still hold.
+/// Snapshots in shared memory at one time: the history, one being written, and those that slow
+/// readers still hold.
 pub(super) const SNAPSHOT_SLOTS: usize = 8;
 
-/// The learner's ends.
+/// Ports of the learner.
 #[derive(Debug)]
 pub struct LearnerPorts {
     identity: RunIdentity,
     incarnation: LearnerIncarnation,
-    dead: Reclaimer,
-    /// What of it lies in shared memory from its start to its end.
+    reclaimer: Reclaimer,
+    /// Its segments that exist from its start to its end.
     shared_memory: Vec<PathBuf>,
     layout: SnapshotLayout,
     transitions: Subscriber<Ipc, Wire<TransitionRecord>, ()>,
@@ -49,8 +49,8 @@ pub struct LearnerPorts {
     node: Node<Ipc>,
 }
 
-/// Wakes the learner's receiving thread from another thread of the learner: ports belong to the
-/// thread that opened them.
+/// Wakes the learner's receiving thread from another thread of the learner. Needed because ports
+/// belong to the thread that opened them.
 #[derive(Debug)]
 pub struct LearnerWaker {
     wake_learner: Notifier<Ipc>,
@@ -58,11 +58,12 @@ pub struct LearnerWaker {
 }
 
 impl LearnerPorts {
-    /// Opens the learner's ends of every service for its new `incarnation`, on the thread that will
-    /// use them, and announces it. For who holds the [`LearnerLock`](skein_run::LearnerLock).
+    /// Opens the learner's ports of every service for its new `incarnation`, on the thread that
+    /// will use them, and announces it. The caller holds the
+    /// [`LearnerLock`](skein_run::LearnerLock).
     ///
     /// # Errors
-    /// [`JoinError`] says which service and why.
+    /// [`JoinError`] names the service and the cause.
     pub fn open(
         identity: &RunIdentity,
         incarnation: LearnerIncarnation,
@@ -71,7 +72,7 @@ impl LearnerPorts {
         let mut ports = Self::create(identity, incarnation, config)?;
         reserve(identity, incarnation)?;
         ports.shared_memory = identity.shared_memory(incarnation).collect();
-        pass(FaultPoint::LearnerStarted);
+        die_if_armed(FaultPoint::LearnerStarted);
         identity.announce(&Announcement::new(identity, incarnation, config))?;
         Ok(ports)
     }
@@ -83,16 +84,16 @@ impl LearnerPorts {
     ) -> Result<Self, ServiceError> {
         let node = node(identity, incarnation, "learner")?;
         identity
-            .close_to_others(incarnation)
+            .restrict_to_owner(incarnation)
             .map_err(failed("all", "closing shared memory to other users"))?;
-        let open = Opener::new(&node, Manner::Create, identity, config)?;
+        let open = Opener::new(&node, OpenMode::Create, identity, config)?;
         let layout = SnapshotLayout::of(config);
         let weights_factory = open.weights()?;
         let messages = control_slots(&config.transport);
         Ok(Self {
             identity: identity.clone(),
             incarnation,
-            dead: Reclaimer::new(identity, incarnation),
+            reclaimer: Reclaimer::new(identity, incarnation),
             shared_memory: Vec::new(),
             transitions: open
                 .transitions(config)?
@@ -143,18 +144,18 @@ impl LearnerPorts {
         })
     }
 
-    /// Waits until an actor has something to say, `timeout` has passed, or a signal has come.
+    /// Waits until an actor has sent something, `timeout` has passed, or a signal has arrived.
     ///
     /// # Errors
-    /// [`ServiceError`] when the wait itself fails.
+    /// [`ServiceError`] if the wait itself fails.
     pub fn wait(&self, timeout: Duration) -> Result<(), ServiceError> {
         wait(&self.wake, timeout).map_err(failed("wake-learner", "waiting"))
     }
 
-    /// The next transition record, if one has arrived.
+    /// Returns the next transition record, if one has arrived.
     ///
     /// # Errors
-    /// [`ServiceError`] when an actor's memory cannot be mapped.
+    /// [`ServiceError`] if an actor's memory cannot be mapped.
     pub fn receive_transition(&self) -> Result<Option<ReceivedTransition>, ServiceError> {
         let sample = self
             .transitions
@@ -163,10 +164,10 @@ impl LearnerPorts {
         Ok(sample.map(ReceivedTransition))
     }
 
-    /// The next status record, if one has arrived.
+    /// Returns the next status record, if one has arrived.
     ///
     /// # Errors
-    /// [`ServiceError`] when an actor's memory cannot be mapped.
+    /// [`ServiceError`] if an actor's memory cannot be mapped.
     pub fn receive_status(&self) -> Result<Option<StatusRecord>, ServiceError> {
         let sample = self
             .status
@@ -175,15 +176,14 @@ impl LearnerPorts {
         Ok(sample.map(|sample| sample.0))
     }
 
-    /// Sends `message` to the actors connected now; a lost one is made good by the ticket's
-    /// deadline.
+    /// Sends `message` to the actors connected now. The ticket's deadline covers a lost message.
     ///
     /// # Errors
-    /// [`ServiceError`] when there is no memory to send it in.
-    pub fn send(&self, message: &Message) -> Result<(), ServiceError> {
+    /// [`ServiceError`] if there is no memory for it.
+    pub fn send(&self, message: &ControlMessage) -> Result<(), ServiceError> {
         match message {
-            Message::Control(record) => self.send_control(*record),
-            Message::Segment(record) => self
+            ControlMessage::Control(record) => self.send_control(*record),
+            ControlMessage::Segment(record) => self
                 .segments
                 .send_copy(Wire(**record))
                 .map(drop)
@@ -194,7 +194,7 @@ impl LearnerPorts {
     /// Sends `record` as [`LearnerPorts::send`] does.
     ///
     /// # Errors
-    /// [`ServiceError`] when there is no memory to send it in.
+    /// [`ServiceError`] if there is no memory for it.
     pub fn send_control(&self, record: ControlRecord) -> Result<(), ServiceError> {
         self.control
             .send_copy(Wire(record))
@@ -205,7 +205,7 @@ impl LearnerPorts {
     /// Copies `snapshot` into shared memory once; every actor reads it there.
     ///
     /// # Errors
-    /// [`ServiceError`] when there is no memory to send it in.
+    /// [`ServiceError`] if there is no memory for it.
     pub fn publish(&self, snapshot: &Snapshot) -> Result<(), ServiceError> {
         let bytes: &[u8] = bytemuck::cast_slice(&snapshot.values);
         let mut sample = self
@@ -214,16 +214,16 @@ impl LearnerPorts {
             .map_err(failed("weights", "loaning"))?;
         *sample.user_header_mut() = Wire(snapshot.header(self.identity.run, &self.layout));
         let sample = sample.write_from_slice(bytes);
-        pass(FaultPoint::LearnerPublishing);
+        die_if_armed(FaultPoint::LearnerPublishing);
         sample.send().map_err(failed("weights", "sending"))?;
-        pass(FaultPoint::LearnerPublished);
+        die_if_armed(FaultPoint::LearnerPublished);
         Ok(())
     }
 
-    /// Wakes all actors that wait.
+    /// Wakes all waiting actors.
     ///
     /// # Errors
-    /// [`ServiceError`] when the event cannot be raised.
+    /// [`ServiceError`] if the event cannot be raised.
     pub fn wake_actors(&self) -> Result<(), ServiceError> {
         self.wake_actors
             .notify()
@@ -231,22 +231,22 @@ impl LearnerPorts {
             .map_err(failed("wake-actors", "notifying"))
     }
 
-    /// Connects to actors that have come, hands late joiners the newest snapshots, and reclaims
-    /// what dead processes held. To be called regularly.
+    /// Connects to new actors, sends late joiners the newest snapshots, and reclaims the resources
+    /// of dead processes. Called regularly.
     ///
     /// # Errors
-    /// [`ServiceError`] when a peer's memory cannot be mapped, or actors can no longer find this
+    /// [`ServiceError`] if a peer's memory cannot be mapped, or actors can no longer find this
     /// learner.
     pub fn maintain(&self) -> Result<(), ServiceError> {
         self.check_findable()?;
         self.connect()?;
-        self.dead.reclaim(&self.node)
+        self.reclaimer.reclaim(&self.node)
     }
 
-    /// Connects to actors that have come, and hands late joiners the newest snapshots.
+    /// Connects to new actors, and sends late joiners the newest snapshots.
     ///
     /// # Errors
-    /// [`ServiceError`] when a peer's memory cannot be mapped.
+    /// [`ServiceError`] if a peer's memory cannot be mapped.
     pub fn connect(&self) -> Result<(), ServiceError> {
         self.transitions
             .update_connections()
@@ -265,12 +265,12 @@ impl LearnerPorts {
             .map_err(failed("control", "connecting"))
     }
 
-    /// Looks for this learner as an actor would.
+    /// Checks that an actor could find this learner.
     fn check_findable(&self) -> Result<(), ServiceError> {
         let present = self
             .identity
-            .present_incarnation()
-            .map_err(failed("all", "looking at what actors need"))?;
+            .current_incarnation()
+            .map_err(failed("all", "checking what actors need"))?;
         let folder = self.identity.incarnation_folder(self.incarnation);
         let is_announced = present.is_some_and(|found| found.incarnation == self.incarnation);
         let gone = match self.shared_memory.iter().find(|segment| !segment.exists()) {
@@ -280,26 +280,26 @@ impl LearnerPorts {
         };
         Err(ServiceError {
             service: "all",
-            operation: "looking at what actors need",
-            cause: format!("{} was removed, or what was in it", gone.display()),
-            remedy: "; leave what is called skein alone in /tmp and /dev/shm while a run is under way",
+            operation: "checking what actors need",
+            cause: format!("{} or its content was removed", gone.display()),
+            remedy: "; do not remove skein's files in /tmp and /dev/shm during a run",
         })
     }
 }
 
 impl LearnerWaker {
-    /// Opens the waker, on the thread that will use it, once the receiving thread has opened its
-    /// ends.
+    /// Opens the waker on the thread that will use it, after the receiving thread has opened its
+    /// ports.
     ///
     /// # Errors
-    /// [`ServiceError`] says which service and why.
+    /// [`ServiceError`] names the service and the cause.
     pub fn open(
         identity: &RunIdentity,
         incarnation: LearnerIncarnation,
         config: &Config,
     ) -> Result<Self, ServiceError> {
         let node = node(identity, incarnation, "learner-waker")?;
-        let open = Opener::new(&node, Manner::Join, identity, config)?;
+        let open = Opener::new(&node, OpenMode::Join, identity, config)?;
         let wake_learner = open
             .event("wake-learner", open.actors, 1)?
             .notifier_builder()
@@ -314,7 +314,7 @@ impl LearnerWaker {
     /// Wakes the receiving thread.
     ///
     /// # Errors
-    /// [`ServiceError`] when the event cannot be raised.
+    /// [`ServiceError`] if the event cannot be raised.
     pub fn wake(&self) -> Result<(), ServiceError> {
         self.wake_learner
             .notify()

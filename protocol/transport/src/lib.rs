@@ -1,24 +1,25 @@
-//! The iceoryx2 services of a run: the only place that names or opens one, and sets every limit.
+//! The iceoryx2 services of a run. This is the only module that names or opens one, and it sets
+//! every limit.
 //!
 //! | service | pattern | from → to | carries |
 //! |---|---|---|---|
-//! | `transitions` | publish-subscribe | actors → learner | [`TransitionRecord`], rendered into the loaned sample |
-//! | `status` | publish-subscribe | actors → learner | [`StatusRecord`] |
-//! | `control` | publish-subscribe | learner → actors | [`ControlRecord`]: tickets, heartbeats, the stop |
-//! | `segments` | publish-subscribe | learner → actors | [`SegmentRecord`]: tickets of segments |
-//! | `weights` | publish-subscribe | learner → actors | snapshots' bytes behind a [`SnapshotHeader`] |
-//! | `wake-learner`, `wake-actors` | event | both | that there is something to read |
+//! | `transitions` | publish-subscribe | actor → learner | [`TransitionRecord`] (in place) |
+//! | `status` | publish-subscribe | actor → learner | [`StatusRecord`] |
+//! | `control` | publish-subscribe | learner → actor | [`ControlRecord`]: ticket, heartbeat, stop |
+//! | `segments` | publish-subscribe | learner → actor | [`SegmentRecord`]: tickets of segments |
+//! | `weights` | publish-subscribe | learner → actor | [`SnapshotHeader`] and a snapshot's bytes |
+//! | `wake-learner`, `wake-actors` | event | both | nothing: there is something to read |
 //!
-//! Nothing here blocks and nothing here is trusted to arrive: iceoryx2 loses samples silently when
-//! a peer dies or has not connected yet. Tickets bound what is outstanding, so no buffer can
-//! overflow but that of a process that was stopped, which misses what does not fit; an episode with
-//! a hole is discarded and its ticket issued again; every wait has a deadline.
+//! Nothing here blocks, and no sample is guaranteed to arrive: iceoryx2 drops samples silently when
+//! a peer dies or has not connected yet. Tickets bound the data in flight, so only the buffers of a
+//! process that was stopped can overflow; it misses what does not fit. An episode with a gap is
+//! discarded and its ticket issued again. Every wait has a deadline.
 //!
-//! Each incarnation of a learner has services of its own, see [`LearnerIncarnation`]. Only the
-//! learner creates them; everybody else joins those that it has announced.
+//! Each incarnation of a learner has its own services, see [`LearnerIncarnation`]. Only the learner
+//! creates them; all others join those that it has announced.
 //!
-//! Services carry protocol version, run, configuration and snapshot layout as attributes: a process
-//! that differs in one of them is refused on opening.
+//! Services carry protocol version, run, configuration and snapshot layout as attributes: opening
+//! one is refused to a process that differs in any of them.
 //!
 //! [`TransitionRecord`]: skein_protocol::transition::TransitionRecord
 //! [`StatusRecord`]: skein_protocol::status::StatusRecord
@@ -27,11 +28,11 @@
 //! [`SnapshotHeader`]: skein_protocol::snapshot::SnapshotHeader
 
 mod actor;
-mod dead;
-mod joining;
+mod join;
 mod learner;
 mod memory;
-mod opening;
+mod open;
+mod reclaim;
 #[cfg(test)]
 mod tests;
 mod wire;
@@ -46,7 +47,7 @@ use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::prelude::*;
 
 pub use actor::ActorPorts;
-pub use joining::JoinError;
+pub use join::JoinError;
 pub use learner::{LearnerPorts, LearnerWaker};
 pub use memory::shared_memory_needed;
 use skein_run::{LearnerIncarnation, RunIdentity};
@@ -54,26 +55,25 @@ pub use wire::{LoanedTransition, ReceivedTransition};
 
 type Ipc = ipc::Service;
 
-/// Shortest wait for an event: the system counts in microseconds and takes none of them for no
-/// limit at all.
+/// Shortest wait for an event: the system counts microseconds and takes zero as "no limit".
 const SHORTEST_WAIT: Duration = Duration::from_micros(1);
 
-/// What a service could not do.
+/// Error of a service.
 #[derive(Debug, thiserror::Error)]
 #[error("{operation} of service `{service}` failed: {cause}{remedy}")]
 pub struct ServiceError {
     /// The service.
     pub service: &'static str,
-    /// What was tried.
+    /// The failed operation.
     pub operation: &'static str,
-    /// iceoryx2's word for it.
+    /// iceoryx2's error.
     pub cause: String,
-    /// What to do about it.
+    /// The remedy.
     pub remedy: &'static str,
 }
 
 impl ServiceError {
-    /// Whether trying again cannot help, with this learner or its next incarnation: the two
+    /// Returns `true` if a retry cannot help, with this learner or its next incarnation: the two
     /// programs differ.
     fn is_final(&self) -> bool {
         self.cause.contains("Incompatible")
@@ -86,21 +86,21 @@ fn failed<E: Debug>(
 ) -> impl FnOnce(E) -> ServiceError {
     move |error| {
         let cause = format!("{error:?}");
-        let remedy = if cause.contains("IncompatibleAttributes")
-            || cause.contains("IncompatibleTypes")
-        {
-            "; this process and the run differ in program version or configuration: start it from the same build and run directory"
-        } else if cause.contains("DoesNotExist") {
-            "; the learner of this run has not opened it, or is gone"
-        } else if cause.contains("ExceedsMax") {
-            "; no slot is free: raise transport.max_actors"
-        } else if cause.contains("StorageFull") || cause.contains("code: 28") {
-            "; /dev/shm is full: make it larger, or start fewer actors"
-        } else if cause.contains("InsufficientPermissions") {
-            "; the run belongs to another user"
-        } else {
-            ""
-        };
+        let remedy =
+            if cause.contains("IncompatibleAttributes") || cause.contains("IncompatibleTypes") {
+                "; this process and the run differ in program version or configuration: start it \
+            from the same build and run directory"
+            } else if cause.contains("DoesNotExist") {
+                "; the learner of this run has not opened it yet, or has ended"
+            } else if cause.contains("ExceedsMax") {
+                "; no slot is free: raise transport.max_actors"
+            } else if cause.contains("StorageFull") || cause.contains("code: 28") {
+                "; /dev/shm is full: enlarge it, or start fewer actors"
+            } else if cause.contains("InsufficientPermissions") {
+                "; the run belongs to another user"
+            } else {
+                ""
+            };
         ServiceError {
             service,
             operation,
@@ -110,14 +110,13 @@ fn failed<E: Debug>(
     }
 }
 
-/// iceoryx2's settings for one incarnation of a run's learner. Called before anything else of
-/// iceoryx2 is.
+/// Returns iceoryx2's settings for one incarnation of a run's learner. Called before anything else
+/// of iceoryx2.
 fn transport_config(
     identity: &RunIdentity,
     incarnation: LearnerIncarnation,
 ) -> Result<IceoryxConfig, ServiceError> {
-    // Everything iceoryx2 would print goes wrong again, with our words, in the errors returned
-    // here.
+    // iceoryx2 would log every failure that is also returned here as an error.
     set_log_level(LogLevel::Fatal);
     let mut config = IceoryxConfig::default();
     let root = identity.incarnation_folder(incarnation);
@@ -126,8 +125,8 @@ fn transport_config(
     );
     config.global.prefix = FileName::new(identity.incarnation_prefix(incarnation).as_bytes())
         .map_err(failed("all", "setting the prefix"))?;
-    // The learner alone cleans up after the dead, at its heartbeats. Of an actor that is killed
-    // while it does, iceoryx2 could not tell whether it still does, and nobody would go on with it.
+    // Only the learner cleans up after dead processes, at its heartbeats. If an actor were killed
+    // during a cleanup, iceoryx2 could not detect it, and the cleanup would never finish.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
@@ -148,11 +147,11 @@ fn node(
         .map_err(failed("all", "creating the node"))
 }
 
-/// Waits for an event or a signal, not longer than `timeout`.
+/// Waits for an event or a signal, at most `timeout`.
 fn wait(wake: &Listener<Ipc>, timeout: Duration) -> Result<(), ListenerWaitError> {
     match wake.timed_wait(|_| {}, timeout.max(SHORTEST_WAIT)) {
-        // A process that was stopped and continued, from a terminal say, is interrupted too;
-        // whoever waits looks round and waits again.
+        // A process that was stopped and continued, for example from a terminal, is interrupted
+        // too; the caller checks and waits again.
         Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
         Err(error) => Err(error),
     }

@@ -1,8 +1,8 @@
-//! How much shared memory the services take, and that it is there before it is used.
+//! The shared memory that the services need, and its reservation.
 //!
-//! A segment is as long as its contents may become, but the system gives it memory page by page, as
-//! it is touched. If there is none left then, whoever touches it dies of SIGBUS. So whoever has
-//! opened its ends of the services reserves what they may need.
+//! A segment is as long as its contents may become, but the system assigns memory page by page, at
+//! the first access. If none is left then, the process dies of SIGBUS. So every process reserves
+//! the memory after it has opened its ports.
 
 use std::fs::{self, OpenOptions};
 use std::io;
@@ -11,7 +11,7 @@ use rustix::fs::FallocateFlags;
 use rustix::mm::{Advice, madvise};
 
 use super::learner::SNAPSHOT_SLOTS;
-use super::opening::{control_buffer, control_slots, segment_slots, transition_buffer};
+use super::open::{control_buffer, control_slots, segment_slots, transition_buffer};
 use super::{ServiceError, failed};
 use skein_protocol::config::Config;
 use skein_protocol::segment::SegmentRecord;
@@ -20,16 +20,16 @@ use skein_protocol::ticket::ControlRecord;
 use skein_protocol::transition::TransitionRecord;
 use skein_run::{LearnerIncarnation, RunIdentity};
 
-/// iceoryx2's header of a sample and what aligns it, generously.
+/// Generous estimate of iceoryx2's sample header and alignment.
 const SAMPLE_OVERHEAD: usize = 128;
-/// Queues and book-keeping of an actor's ends, besides what depends on the configuration.
+/// Queues and bookkeeping of an actor's ports, beyond what the configuration determines.
 const ACTOR_OVERHEAD: usize = 96 << 10;
-/// Queues and book-keeping of the learner's ends, likewise.
+/// Queues and bookkeeping of the learner's ports, likewise.
 const LEARNER_OVERHEAD: usize = 256 << 10;
-/// Book-keeping for an actor that there may be.
+/// Bookkeeping per possible actor.
 const SLOT_OVERHEAD: usize = 3 << 10;
 
-/// Bytes of shared memory that a learner and `actors` actors with `config` take.
+/// Returns the bytes of shared memory that a learner and `actors` actors with `config` need.
 pub fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
     let snapshot = SnapshotLayout::of(config).values() * size_of::<f32>() + SAMPLE_OVERHEAD;
     let control =
@@ -38,9 +38,9 @@ pub fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
         segment_slots(&config.transport) * (size_of::<SegmentRecord>() + SAMPLE_OVERHEAD / 2);
     let slots = config.transport.max_actors * SLOT_OVERHEAD;
     let learner = SNAPSHOT_SLOTS * snapshot + control + segments + slots + LEARNER_OVERHEAD;
-    // Episodes of all tickets, and what either side has in hand.
+    // Episodes of all tickets, and the records that either side is using.
     let records = transition_buffer(&config.transport) + 8;
-    // A queue of eight bytes a message there and back, and one byte to say who has it.
+    // A queue of eight bytes a message in each direction, and one byte for its owner.
     let queues = 2 * 8 * control_buffer(&config.transport) + control_slots(&config.transport);
     let actor =
         records * (size_of::<TransitionRecord>() + SAMPLE_OVERHEAD) + queues + ACTOR_OVERHEAD;
@@ -50,14 +50,14 @@ pub fn shared_memory_needed(config: &Config, actors: usize) -> u64 {
 /// Reserves the memory of all segments of `incarnation`.
 ///
 /// # Errors
-/// [`ServiceError`] when there is not enough.
+/// [`ServiceError`] if there is not enough.
 pub(super) fn reserve(
     identity: &RunIdentity,
     incarnation: LearnerIncarnation,
 ) -> Result<(), ServiceError> {
     for segment in identity.shared_memory(incarnation) {
         match reserve_segment(&segment) {
-            // Its owner has removed it meanwhile.
+            // Its owner has removed it in the meantime.
             Err(error) if error.kind() == io::ErrorKind::NotFound => {}
             reserved => reserved.map_err(failed("all", "reserving shared memory"))?,
         }
@@ -65,10 +65,10 @@ pub(super) fn reserve(
     Ok(())
 }
 
-/// Takes the whole pages of `shared`, which lies in a segment, out of this process's memory; they
-/// stay in the segment, and come back when they are read. An actor looks at each snapshot once: if
-/// it kept what it has looked at, all of the learner's segment would count as its own.
-pub(super) fn let_go(shared: &[u8]) {
+/// Unmaps the whole pages of `shared`, which lies in a segment, from this process's resident
+/// memory. They stay in the segment and are mapped again when read. An actor reads each snapshot
+/// once: otherwise the learner's whole segment would count as the actor's memory.
+pub(super) fn release_pages(shared: &[u8]) {
     let page = rustix::param::page_size();
     let skipped = shared.as_ptr().align_offset(page);
     let Some(pages) = shared.get(skipped..) else {
@@ -78,23 +78,23 @@ pub(super) fn let_go(shared: &[u8]) {
     if whole == 0 {
         return;
     }
-    // SAFETY: these pages lie within `shared`. They are mapped from a file and shared, so the file
-    // keeps what is written on them, and whoever reads them again is given the same bytes.
-    let let_go = unsafe {
+    // SAFETY: these pages lie within `shared`. They are a shared mapping of a file, so the file
+    // keeps their content, and any later read gets the same bytes.
+    let released = unsafe {
         madvise(
             pages.as_ptr().cast_mut().cast(),
             whole,
             Advice::LinuxDontNeed,
         )
     };
-    if let Err(error) = let_go {
-        tracing::debug!(%error, "pages of a snapshot are kept");
+    if let Err(error) = released {
+        tracing::debug!(%error, "the pages of a snapshot stay resident");
     }
 }
 
 fn reserve_segment(segment: &std::path::Path) -> io::Result<()> {
     use std::os::unix::fs::MetadataExt;
-    /// Bytes in which the system counts what a file takes.
+    /// Unit in which the system counts a file's blocks.
     const BLOCK: u64 = 512;
     let about = fs::metadata(segment)?;
     if about.len() <= about.blocks() * BLOCK {
@@ -117,8 +117,7 @@ mod tests {
     use super::super::{ActorPorts, LearnerPorts};
     use super::*;
 
-    /// Bytes of shared memory that this process has in its own, of the mapping that `address` lies
-    /// in.
+    /// Returns the resident bytes of shared memory in the mapping that contains `address`.
     fn resident(address: *const u8) -> usize {
         let maps = fs::read_to_string("/proc/self/smaps").unwrap();
         let number = |text: &str| usize::from_str_radix(text, 16).ok();
@@ -143,11 +142,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_let_go_is_out_of_this_process_and_comes_back_unchanged() {
+    fn released_pages_leave_this_process_and_are_read_again_unchanged() {
         let mut file = tempfile::tempfile_in("/dev/shm").unwrap();
         let written: Vec<u8> = (0..1 << 20).map(|index| (index % 251) as u8).collect();
         std::io::Write::write_all(&mut file, &written).unwrap();
-        // SAFETY: a new mapping of a file that nobody else has.
+        // SAFETY: a new mapping of a file that no other process uses.
         let mapped = unsafe {
             rustix::mm::mmap(
                 std::ptr::null_mut(),
@@ -159,23 +158,23 @@ mod tests {
             )
         };
         let start = mapped.unwrap().cast::<u8>();
-        // SAFETY: all of the mapping, which is never unmapped.
+        // SAFETY: the slice covers the mapping, which is never unmapped.
         let shared = unsafe { std::slice::from_raw_parts(start.cast_const(), written.len()) };
         assert_eq!(shared, written);
         let before = resident(start);
-        // Not on a page's boundary: what shares a page with others is not let go.
-        let_go(&shared[100..written.len() - 100]);
+        // Not page-aligned: pages shared with other data stay resident.
+        release_pages(&shared[100..written.len() - 100]);
         let after = resident(start);
         assert!(
             before >= written.len() && after <= 3 * rustix::param::page_size(),
             "{before} {after}"
         );
-        let_go(&shared[10..20]);
+        release_pages(&shared[10..20]);
         assert_eq!(shared, written);
     }
 
     #[test]
-    fn what_is_needed_is_what_is_taken_and_a_little_more() {
+    fn the_memory_estimate_covers_what_is_used_and_little_more() {
         for (max_actors, width) in [(2, 8), (64, 256), (256, 8)] {
             let run = Run::with(|config| {
                 config.transport.max_actors = max_actors;
@@ -196,7 +195,7 @@ mod tests {
                 let taken = taken();
                 assert!(
                     (least..=most).contains(&taken),
-                    "{joined} of {max_actors} actors take {taken} bytes where {needed} are foreseen"
+                    "{joined} of {max_actors} actors take {taken} bytes, estimated: {needed}"
                 );
                 actors.push(ActorPorts::join(&run.identity, &run.config).unwrap());
                 learner.maintain().unwrap();

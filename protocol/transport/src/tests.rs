@@ -1,9 +1,9 @@
-//! The services as two processes would use them, over real shared memory.
+//! Tests of the services as two processes use them, over real shared memory.
 
 use std::os::unix::fs::PermissionsExt;
 use std::time::Duration;
 
-use super::opening::{Manner, Opener};
+use super::open::{OpenMode, Opener};
 use super::*;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion, RunId};
@@ -144,20 +144,20 @@ fn the_largest_episode_of_every_ticket_fits_unread() {
 }
 
 #[test]
-fn a_wait_of_no_time_ends() {
-    let (say, heard) = std::sync::mpsc::channel();
+fn a_wait_of_zero_time_ends() {
+    let (sender, receiver) = std::sync::mpsc::channel();
     std::thread::spawn(move || {
         let run = Run::new();
         let (learner, actor) = (run.learner().unwrap(), run.actor().unwrap());
         learner.wait(Duration::ZERO).unwrap();
         actor.wait(Duration::from_nanos(1)).unwrap();
-        say.send(()).unwrap();
+        sender.send(()).unwrap();
     });
-    heard.recv_timeout(Duration::from_secs(5)).unwrap();
+    receiver.recv_timeout(Duration::from_secs(5)).unwrap();
 }
 
 #[test]
-fn a_process_that_was_stopped_and_continued_goes_on() {
+fn a_process_that_was_stopped_and_continued_keeps_working() {
     let run = Run::new();
     let (learner, actor) = (run.learner().unwrap(), run.actor().unwrap());
     for wait in
@@ -189,12 +189,12 @@ fn an_actor_of_another_configuration_is_refused() {
 }
 
 #[test]
-fn services_refuse_what_the_announcement_let_through() {
+fn services_refuse_a_mismatch_that_the_announcement_missed() {
     let mut run = Run::new();
     let _learner = run.learner().unwrap();
     run.identity.config_digest ^= 1;
     let node = node(&run.identity, run.lock.incarnation(), "actor").unwrap();
-    let open = Opener::new(&node, Manner::Join, &run.identity, &run.config).unwrap();
+    let open = Opener::new(&node, OpenMode::Join, &run.identity, &run.config).unwrap();
     let refusal = open.status().unwrap_err();
     assert!(refusal.is_final());
     assert!(
@@ -206,11 +206,11 @@ fn services_refuse_what_the_announcement_let_through() {
 }
 
 #[test]
-fn there_is_nobody_to_join_before_the_services_are_open_and_after_the_learner_is_gone() {
+fn no_learner_can_be_joined_before_its_services_are_open_or_after_it_is_gone() {
     let run = Run::new();
-    let nobody = || matches!(run.actor(), Err(JoinError::NoLearner(_)));
+    let no_learner = || matches!(run.actor(), Err(JoinError::NoLearner(_)));
     assert!(run.identity.is_learner_alive().unwrap());
-    assert!(nobody());
+    assert!(no_learner());
     let learner = run.learner().unwrap();
     assert_eq!(run.actor().unwrap().incarnation(), run.lock.incarnation());
     let Run {
@@ -229,7 +229,7 @@ fn there_is_nobody_to_join_before_the_services_are_open_and_after_the_learner_is
 }
 
 #[test]
-fn everything_of_a_run_is_its_users_alone() {
+fn only_the_user_can_access_a_runs_transport() {
     let run = Run::new();
     let (_learner, _actor) = (run.learner().unwrap(), run.actor().unwrap());
     let segments: Vec<_> = run.identity.shared_memory(run.lock.incarnation()).collect();

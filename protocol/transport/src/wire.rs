@@ -14,15 +14,15 @@ use skein_protocol::transition::TransitionRecord;
 
 use super::Ipc;
 
-/// A record of the protocol in shared memory. iceoryx2's marker cannot be put on the record itself:
-/// the protocol knows no transport.
+/// A protocol record in shared memory. The record itself cannot implement iceoryx2's marker trait,
+/// because the protocol knows no transport.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(transparent)]
 pub(super) struct Wire<T>(pub(super) T);
 
-/// A record that crosses the transport.
+/// A record that iceoryx2 sends.
 pub(super) trait WireRecord: Pod {
-    /// Name under which both ends know the record. Its number rises when the layout changes.
+    /// Name of the record for both ends. Its number rises when the layout changes.
     const NAME: &'static str;
 }
 
@@ -54,7 +54,7 @@ unsafe impl<T: WireRecord> ZeroCopySend for Wire<T> {
     }
 }
 
-/// A transition record in shared memory, being written.
+/// Transition record in shared memory, being written.
 #[derive(Debug)]
 pub struct LoanedTransition(pub(super) SampleMut<Ipc, Wire<TransitionRecord>, ()>);
 
@@ -72,7 +72,7 @@ impl DerefMut for LoanedTransition {
     }
 }
 
-/// A transition record in shared memory, received.
+/// Transition record in shared memory, received.
 #[derive(Debug)]
 pub struct ReceivedTransition(pub(super) Sample<Ipc, Wire<TransitionRecord>, ()>);
 

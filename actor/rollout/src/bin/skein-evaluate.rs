@@ -1,4 +1,4 @@
-//! `skein-evaluate`: flies a trained snapshot and counts.
+//! `skein-evaluate`: flies a trained snapshot and reports its results.
 
 use std::process::ExitCode;
 

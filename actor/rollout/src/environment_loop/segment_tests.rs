@@ -1,4 +1,4 @@
-//! A segment is a function of its ticket, whoever flew what came before.
+//! Tests that a segment is a function of its ticket, independent of who flew the earlier ones.
 
 use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion};
 use skein_protocol::ticket::{CourseChoice, Exploration};
@@ -8,19 +8,19 @@ use super::tests::{
 };
 use super::*;
 
-/// `ticket` for the `steps` that follow `flown`.
+/// Returns `ticket` for the `steps` that follow `flown`.
 fn segment(ticket: &Ticket, steps: u32, flown: &[[f32; ACTION]]) -> Ticket {
     Ticket {
         segment: Some(Segment {
             steps,
-            flown: flown.into(),
+            prior_actions: flown.into(),
         }),
         ..ticket.clone()
     }
 }
 
-/// Flies `ticket` in segments of `steps`, each with what `fly` makes of it; the records without the
-/// segments' ends, and those apart.
+/// Flies `ticket` in segments of `steps` with `fly`. Returns the records without the segments'
+/// ends, and those ends.
 fn flown_in_segments(
     ticket: &Ticket,
     steps: u32,
@@ -68,7 +68,7 @@ fn an_episode_in_segments_without_noise_is_the_episode_flown_whole() {
                 let (records, ends) =
                     flown_in_segments(&ticket, steps, |segment| fly(&mut used, segment));
                 assert!(raw(&records) == raw(&whole.sent), "in segments of {steps}");
-                // What a segment ends with is what the next one begins with.
+                // A segment ends with the observation that the next one begins with.
                 for (end, next) in ends
                     .iter()
                     .zip(records.iter().skip(steps as usize).step_by(steps as usize))
@@ -90,15 +90,14 @@ fn an_episode_in_segments_without_noise_is_the_episode_flown_whole() {
 }
 
 #[test]
-fn a_segment_is_the_same_whoever_flew_what_came_before() {
+fn a_segment_does_not_depend_on_who_flew_the_earlier_ones() {
     for simulator in ["", STORMY] {
         for exploration in [Exploration::Uniform, Exploration::Sample] {
             let ticket = ticket(exploration, 1);
             let mut one = environment_loop(simulator);
             let (alone, _) = flown_in_segments(&ticket, 2, |segment| fly(&mut one, segment));
             assert!(alone.len() > 6, "too short to compare anything");
-            // Each segment by a environment_loop that has flown nothing, or something else
-            // meanwhile.
+            // Each segment by a new loop, or by one that has flown another episode in between.
             let (strangers, _) = flown_in_segments(&ticket, 2, |segment| {
                 fly(&mut environment_loop(simulator), segment)
             });
@@ -122,15 +121,14 @@ fn a_segment_is_the_same_whoever_flew_what_came_before() {
 }
 
 #[test]
-fn an_environment_loop_flies_on_from_where_it_is_and_from_nowhere_else() {
+fn a_loop_resumes_only_the_exact_episode_that_it_paused() {
     let mut environment_loop = environment_loop("");
     let ticket = ticket(Exploration::Uniform, 1);
     let (_, tape) = fly(&mut environment_loop, &segment(&ticket, 2, &[]));
     let flown: Vec<_> = tape.sent[..2].iter().map(|record| record.action).collect();
     let flies_on = |environment_loop: &EnvironmentLoop, ticket: &Ticket| {
-        let under_way = environment_loop.under_way.as_ref();
-        under_way
-            .is_some_and(|under_way| under_way.is_before(ticket, ticket.segment.as_ref().unwrap()))
+        let paused = environment_loop.paused.as_ref();
+        paused.is_some_and(|paused| paused.is_before(ticket, ticket.segment.as_ref().unwrap()))
     };
     let next = segment(&ticket, 5, &flown);
     let again = Ticket {
@@ -167,9 +165,9 @@ fn an_environment_loop_flies_on_from_where_it_is_and_from_nowhere_else() {
     ] {
         assert!(!flies_on(&environment_loop, &elsewhere), "{elsewhere:?}");
     }
-    // A whole episode leaves nothing in the air.
+    // A whole episode leaves nothing unfinished.
     super::tests::flown(&mut environment_loop, &ticket);
-    assert!(environment_loop.under_way.is_none());
+    assert!(environment_loop.paused.is_none());
 }
 
 #[test]
@@ -186,7 +184,7 @@ fn a_segment_after_the_episodes_end_is_a_fault() {
     assert_eq!(
         fault.to_string(),
         format!(
-            "the episode ends in step {steps} of the {} that are said to have been flown before the segment",
+            "the episode ends in step {steps}, within the {} steps before the segment",
             steps + 1
         )
     );

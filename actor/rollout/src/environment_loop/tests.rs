@@ -2,7 +2,7 @@ use std::sync::Arc;
 
 use bytemuck::Zeroable;
 use skein_protocol::IMAGE_PIXELS;
-use skein_protocol::config::{Observation, View};
+use skein_protocol::config::{Observation, ObservationLayout};
 use skein_protocol::ids::{Attempt, EpisodeId, RunId};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::ticket::{CourseChoice, Exploration};
@@ -15,7 +15,7 @@ use skein_inference::Scratch;
 pub(super) const ACTOR: ActorId = ActorId(3);
 pub(super) const INCARNATION: ActorIncarnation = ActorIncarnation(8);
 
-/// Keeps what is sent, and where each image lay when it was loaned and when it was sent.
+/// Link that keeps the sent records, and the address of each image when loaned and when sent.
 #[derive(Default)]
 pub(super) struct Tape {
     pub(super) sent: Vec<Box<TransitionRecord>>,
@@ -69,9 +69,9 @@ pub(super) fn ticket(exploration: Exploration, seed: u64) -> Ticket {
 
 const NETWORK: skein_protocol::ids::PolicyVersion = skein_protocol::ids::PolicyVersion(4);
 
-/// What the policies here see.
-fn view() -> View {
-    View::present(Observation::LatentVelocityAction, 32)
+/// Returns the observation layout of the policies in these tests.
+fn observation_layout() -> ObservationLayout {
+    ObservationLayout::present(Observation::LatentVelocityAction, 32)
 }
 
 pub(super) fn environment_loop(simulator: &str) -> EnvironmentLoop {
@@ -80,15 +80,16 @@ pub(super) fn environment_loop(simulator: &str) -> EnvironmentLoop {
         ACTOR,
         INCARNATION,
         Simulators::new(Arc::new(courses)),
-        Agent::new(view()),
+        Agent::new(observation_layout()),
     )
 }
 
-/// Everything that may disturb an episode.
-pub(super) const STORMY: &str = "disturbances = { mass_spread = 0.2, latency_periods = 1, gust.force_rms_n = 0.15, depth.model = \"stereo\" }";
+/// All disturbances at once.
+pub(super) const STORMY: &str = "disturbances = { mass_spread = 0.2, latency_periods = 1, \
+    gust.force_rms_n = 0.15, depth.model = \"stereo\" }";
 
 pub(super) fn network(change: impl Fn(&mut [f32])) -> Network {
-    let layout = SnapshotLayout::new(&view(), 16);
+    let layout = SnapshotLayout::new(&observation_layout(), 16);
     let mut snapshot = random_snapshot(&layout, NETWORK.0);
     change(&mut snapshot.values[layout.policy()]);
     Network::new(&snapshot, &layout)
@@ -140,7 +141,7 @@ fn a_ticket_flown_again_is_the_same_episode_bit_for_bit() {
 }
 
 #[test]
-fn how_actions_are_chosen_does_not_move_the_start() {
+fn exploration_does_not_change_the_start() {
     let start = |exploration| {
         flown(&mut environment_loop(""), &ticket(exploration, 1))
             .1
@@ -179,7 +180,7 @@ fn an_episode_is_its_steps_without_a_gap_and_one_closing_record() {
 }
 
 #[test]
-fn each_record_holds_what_was_seen_and_the_reward_for_what_came_next() {
+fn each_record_holds_the_observation_and_the_reward_of_its_step() {
     let (_, tape) = flown(&mut environment_loop(""), &ticket(Exploration::Sample, 1));
     let (network, mut scratch) = (network(|_| {}), Scratch::default());
     for pair in tape.sent.windows(2) {
@@ -236,7 +237,7 @@ fn an_abandoned_episode_has_no_closing_record() {
 #[test]
 fn a_fault_ends_the_episode_with_a_record_that_says_so() {
     let mut tape = Tape::default();
-    // Finite parameters whose products are not: infinity minus infinity in the second layer.
+    // Finite parameters whose products are not finite: infinity minus infinity in the second layer.
     let network = network(|policy| {
         policy
             .iter_mut()
@@ -259,7 +260,7 @@ fn a_fault_ends_the_episode_with_a_record_that_says_so() {
 }
 
 #[test]
-fn a_ticket_for_what_is_not_there_is_a_fault_and_not_a_crash() {
+fn a_ticket_for_an_unknown_course_or_level_is_a_fault_and_not_a_crash() {
     for ticket in [
         Ticket {
             start_level: 99,
@@ -278,7 +279,7 @@ fn a_ticket_for_what_is_not_there_is_a_fault_and_not_a_crash() {
 }
 
 #[test]
-fn a_generated_course_is_the_tickets_own() {
+fn a_generated_course_depends_on_the_ticket_alone() {
     let generated = |seed| Ticket {
         course: CourseChoice::Generated(seed),
         ..ticket(Exploration::Mode, 1)
@@ -305,27 +306,27 @@ fn a_disturbed_episode_is_a_function_of_its_ticket_too() {
     assert_eq!(bytes(&first), bytes(&again));
     assert_eq!(bytes(&first), bytes(&elsewhere));
     assert_ne!(bytes(&first), bytes(&other));
-    // It starts where the calm episode of its ticket does, and sees it otherwise.
+    // It starts where the undisturbed episode of its ticket starts, but sees another image.
     let (_, calm) = flown(&mut environment_loop(""), &ticket(Exploration::Sample, 1));
     assert_eq!(first.sent[0].position_m, calm.sent[0].position_m);
     assert_ne!(first.sent[0].depth, calm.sent[0].depth);
 }
 
 #[test]
-fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
-    let view = View {
-        moment: Observation::LatentVelocityAction,
+fn a_policy_with_a_history_acts_on_the_steps_in_its_records() {
+    let observation_layout = ObservationLayout {
+        per_step: Observation::LatentVelocityAction,
         latent: 16,
         history_steps: vec![1, 3],
     };
-    let layout = SnapshotLayout::new(&view, 16);
+    let layout = SnapshotLayout::new(&observation_layout, 16);
     let network = Network::new(&random_snapshot(&layout, NETWORK.0), &layout);
     let courses = Arc::new(Courses::of_run(&config("")).unwrap());
     let mut environment_loop = EnvironmentLoop::new(
         ACTOR,
         INCARNATION,
         Simulators::new(courses),
-        Agent::new(view.clone()),
+        Agent::new(observation_layout.clone()),
     );
     // The second episode must not remember the first.
     for seed in [1, 2] {
@@ -337,15 +338,15 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
         assert!(steps > 4, "too short to have a history");
         for (step, record) in tape.sent[..steps].iter().enumerate() {
             let mut observed = Vec::new();
-            for moment in [step, step.max(1) - 1, step.max(3) - 3] {
-                let seen = &tape.sent[moment];
+            for seen_step in [step, step.max(1) - 1, step.max(3) - 3] {
+                let seen = &tape.sent[seen_step];
                 observed.extend(&seen.latent[..16]);
                 assert_eq!(seen.latent[16..], [0.0; 48]);
                 observed.extend(&seen.velocity_mps[1..]);
-                observed.extend(if moment == 0 {
+                observed.extend(if seen_step == 0 {
                     [0.0; 2]
                 } else {
-                    tape.sent[moment - 1].action
+                    tape.sent[seen_step - 1].action
                 });
             }
             let action = network
@@ -357,12 +358,11 @@ fn a_policy_with_a_history_acts_on_the_moments_that_its_records_hold() {
 }
 
 #[test]
-fn what_was_hit_is_in_the_closing_record() {
-    // A environment_loop that wants straight on hits the first wall; one that wants up, the
-    // ceiling.
+fn the_closing_record_names_the_wall_that_was_hit() {
+    // A policy that flies straight on hits the first wall; one that climbs hits the ceiling.
     let closing = |bias: f32| {
         let mut tape = Tape::default();
-        let layout = SnapshotLayout::new(&view(), 16);
+        let layout = SnapshotLayout::new(&observation_layout(), 16);
         let steady = network(|policy| {
             policy.fill(0.0);
             // The last layer's bias begins with the means: lateral, vertical.

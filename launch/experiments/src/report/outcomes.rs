@@ -1,6 +1,6 @@
 //! Outcomes of evaluation episodes: walls passed, and causes of failure, per wall.
 
-use skein_protocol::evaluation::{CourseEvaluation, Failures};
+use skein_protocol::evaluation::{CourseEvaluation, WallFailures};
 
 use super::Findings;
 use super::tables::{NOTHING, TitledTable, course_of, grid};
@@ -69,7 +69,7 @@ fn cells(of_seeds: &[&CourseEvaluation]) -> [String; HEADER.len() - 2] {
     let sum = |count: fn(&CourseEvaluation) -> u64| {
         of_seeds.iter().map(|course| count(course)).sum::<u64>()
     };
-    let failed = |by: fn(&Failures) -> u64| {
+    let failed = |by: fn(&WallFailures) -> u64| {
         summed(of_seeds, |course| course.failures.iter().map(by).collect())
     };
     let passed = summed(of_seeds, |course| course.walls_passed.clone());

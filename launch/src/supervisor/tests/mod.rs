@@ -22,7 +22,7 @@ struct Seen {
 }
 
 impl Watcher for Seen {
-    fn progress(&mut self, progress: &Progress, restarts: Restarts) {
+    fn progress(&mut self, progress: &ProgressReport, restarts: Restarts) {
         self.episodes.push(progress.episodes);
         self.restarts = restarts;
     }

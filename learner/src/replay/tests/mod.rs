@@ -9,7 +9,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::config::{CriticInput, Observation};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{IMAGE_PIXELS, TRUE_STATE};
+use skein_protocol::{IMAGE_PIXELS, PRIVILEGED_STATE};
 
 use super::*;
 use crate::episode::samples::{code, episode, shade, with_images};
@@ -234,7 +234,7 @@ fn rows_of_a_minibatch_belong_together() {
     }
     let mut batch = Minibatch::default();
     replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 64, &mut batch);
-    let width = config.view().len();
+    let width = config.observation_layout().len();
     for index in 0..64 {
         let observation = &batch.observations[index * width..(index + 1) * width];
         let next = &batch.next_observations[index * width..(index + 1) * width];
@@ -249,7 +249,7 @@ fn rows_of_a_minibatch_belong_together() {
             (&batch.true_states, observation),
             (&batch.next_true_states, next),
         ] {
-            let state = &states[index * TRUE_STATE..][..TRUE_STATE];
+            let state = &states[index * PRIVILEGED_STATE..][..PRIVILEGED_STATE];
             assert_eq!(
                 state[17..19],
                 seen[LATENT..LATENT + 2],

@@ -24,7 +24,7 @@ struct Transition {
 /// The model: both parts as queues of owned transitions, the oldest in front.
 struct Model {
     parts: [(VecDeque<Transition>, usize); 2],
-    view: View,
+    view: ObservationLayout,
     section: ReplaySection,
 }
 
@@ -34,7 +34,7 @@ impl Model {
         let parts = [(VecDeque::new(), success), (VecDeque::new(), regular)];
         Self {
             parts,
-            view: config.view(),
+            view: config.observation_layout(),
             section: config.replay.clone(),
         }
     }
@@ -43,10 +43,10 @@ impl Model {
         for step in 0..episode.steps() {
             let moment = |step: usize| {
                 let mut vector = episode.observations[step].latent[..self.view.latent].to_vec();
-                if self.view.moment != Observation::Latent {
+                if self.view.per_step != Observation::Latent {
                     vector.extend(&episode.observations[step].velocity_mps[1..]);
                 }
-                if self.view.moment == Observation::LatentVelocityAction {
+                if self.view.per_step == Observation::LatentVelocityAction {
                     vector.extend(if step == 0 {
                         [0.0; 2]
                     } else {
@@ -93,7 +93,7 @@ impl Model {
                 &mut transition.observation,
                 &mut transition.next_observation,
             ] {
-                for moment in vector.chunks_exact_mut(self.view.moment_len()) {
+                for moment in vector.chunks_exact_mut(self.view.step_len()) {
                     let made = latent(moment);
                     moment[..self.view.latent].copy_from_slice(&made[..self.view.latent]);
                 }

@@ -2,7 +2,7 @@
 //! both.
 
 use skein_kernels::{Isa, exp};
-use skein_protocol::LONGEST_LATENT;
+use skein_protocol::MAX_LATENT;
 
 use crate::networks::LOG_VARIANCE_BOUND;
 
@@ -20,7 +20,7 @@ pub(super) fn sample(
     codes: &mut [f32],
 ) -> f64 {
     let mut total = 0.0;
-    let terms = &mut [0.0_f32; LONGEST_LATENT][..latent];
+    let terms = &mut [0.0_f32; MAX_LATENT][..latent];
     let rows = heads
         .chunks_exact(2 * latent)
         .zip(noise.chunks_exact(latent));

@@ -1,6 +1,6 @@
 //! The whole step: exactness, determinism, and that it learns.
 
-use skein_protocol::config::{DecoderName, Observation, View};
+use skein_protocol::config::{DecoderName, Observation, ObservationLayout};
 use skein_protocol::snapshot::SnapshotLayout;
 
 use super::*;
@@ -43,7 +43,7 @@ fn divergence_matches_hand_calculation() {
 #[test]
 fn the_published_part_is_the_snapshots_encoder() {
     let vae = vae(1);
-    let layout = SnapshotLayout::new(&View::present(Observation::Latent, 32), 8);
+    let layout = SnapshotLayout::new(&ObservationLayout::present(Observation::Latent, 32), 8);
     assert_eq!(layout.encoder(), 0..vae.published_len());
     let mut start = 0;
     for (ours, snapshots) in vae

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::{Arc, LazyLock};
 
 use skein_experiments::definition::{Experiment, MOST_ARMS};
-use skein_protocol::config::{Config, ConfigError, culprit};
+use skein_protocol::config::{Config, ConfigError, failing_override};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_simulator::course::Course;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};

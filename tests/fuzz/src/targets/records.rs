@@ -13,7 +13,7 @@ use skein_protocol::config::TransportSection;
 use skein_protocol::ids::{
     ActorId, ActorIncarnation, Attempt, EpisodeId, Epoch, PolicyVersion, RunId,
 };
-use skein_protocol::stages::Times;
+use skein_protocol::stages::StageTimes;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
@@ -207,7 +207,7 @@ impl FuzzedLearner {
             ]),
             newest_policy: None,
             episodes_flown: 0,
-            times: Times::default(),
+            times: StageTimes::default(),
         };
         self.dispatcher.on_status(&status, self.now);
     }

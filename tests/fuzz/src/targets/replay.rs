@@ -10,7 +10,7 @@ use skein_learner::replay::{Minibatch, Replay, ReplayState, RingState};
 use skein_protocol::config::{Config, EncoderTraining};
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LONGEST_LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, MAX_LATENT};
 
 use super::{ReaderDecision, Target, USUAL};
 use crate::script::Script;
@@ -66,8 +66,7 @@ fn restore(bytes: &[u8]) -> ReaderDecision {
     }
     // One more episode: stored, or refused because its images do not fit.
     let _ = replay.insert(episode());
-    let encode =
-        |images: &[u8]| Ok::<_, ()>(vec![[0.5; LONGEST_LATENT]; images.len() / IMAGE_PIXELS]);
+    let encode = |images: &[u8]| Ok::<_, ()>(vec![[0.5; MAX_LATENT]; images.len() / IMAGE_PIXELS]);
     replay.recode_latents(8, encode).unwrap();
     replay.freeze();
     assert_eq!(replay.image_count(), None);
@@ -127,7 +126,7 @@ fn ring(script: &mut Script<'_>, capacity: usize) -> RingState {
 
 pub(super) fn episode() -> CommittedEpisode {
     let seen = StepObservation {
-        latent: [0.0; LONGEST_LATENT],
+        latent: [0.0; MAX_LATENT],
         velocity_mps: [0.0; 3],
         position_m: [0.0; 3],
         orientation: [0.0, 0.0, 0.0, 1.0],

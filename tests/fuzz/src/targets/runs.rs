@@ -10,7 +10,7 @@ use skein_protocol::PROTOCOL_VERSION;
 use skein_protocol::config::Config;
 use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
 use skein_protocol::ids::PolicyVersion;
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
 use skein_protocol::summary::Summary;
 use skein_protocol::transition::Outcome;
 use skein_run::{Announcement, LearnerIncarnation, RunDirectory, RunIdentity};
@@ -183,7 +183,7 @@ fn progress_samples() -> Vec<Vec<u8>> {
     let sample = lines.join("\n").into_bytes();
     let understood = sample
         .split(|byte| *byte == b'\n')
-        .all(|line| serde_json::from_slice::<Progress>(line).is_ok());
+        .all(|line| serde_json::from_slice::<ProgressReport>(line).is_ok());
     assert!(
         understood,
         "the samples are progress lines of another version"
@@ -195,7 +195,7 @@ fn progress(bytes: &[u8]) -> ReaderDecision {
     let mut display = ProgressDisplay::new();
     let mut verdict = ReaderDecision::Refused;
     for line in bytes.split(|byte| *byte == b'\n') {
-        if let Ok(progress) = serde_json::from_slice::<Progress>(line) {
+        if let Ok(progress) = serde_json::from_slice::<ProgressReport>(line) {
             let (head, figures) = display.text(&progress, Restarts::default());
             assert!(!head.is_empty() && !figures.is_empty());
             verdict = ReaderDecision::Accepted;

@@ -6,7 +6,7 @@ use std::time::Duration;
 use bytemuck::{Pod, Zeroable, bytes_of, pod_read_unaligned};
 use skein_protocol::ids::{ActorId, ActorIncarnation, PolicyVersion, RunId};
 use skein_protocol::segment::{Segment, SegmentRecord};
-use skein_protocol::stages::{Stage, Times};
+use skein_protocol::stages::{Stage, StageTimes};
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, ControlRecord};
 use skein_run::tables::stages_table;
@@ -32,7 +32,7 @@ pub(super) const SIGNALS: Target = Target {
 };
 
 fn signal_samples() -> Vec<Vec<u8>> {
-    let mut times = Times::default();
+    let mut times = StageTimes::default();
     times.add(Stage::Physics, 300, Duration::from_millis(450));
     times.add(Stage::ActorIdle, 2, Duration::from_secs(3));
     let status = ActorStatus {
@@ -48,7 +48,7 @@ fn signal_samples() -> Vec<Vec<u8>> {
     let ticket = sample_ticket(5);
     let segment = Segment {
         steps: 1,
-        flown: vec![[0.5, -1.0]; 3].into(),
+        prior_actions: vec![[0.5, -1.0]; 3].into(),
     };
     vec![
         bytes_of(&SegmentRecord::fly(
@@ -114,7 +114,7 @@ fn segment(record: SegmentRecord, run: RunId) -> Option<()> {
     assert!(
         segment.steps > 0
             && segment
-                .flown
+                .prior_actions
                 .iter()
                 .flatten()
                 .all(|command| command.abs() <= 1.0)

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use rustix::process::Signal;
 use skein_chaos::{ListedProcess, processes_of};
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::summary::{RunEnding, Summary};
 use skein_run::RunDirectory;
 use skein_run::fault::FAULTS;
 use skein_run::orphans::signal_when_orphaned;
@@ -150,7 +150,7 @@ impl TestedRun {
     /// Returns `true` if it completed.
     pub(crate) fn is_complete(&self) -> bool {
         self.summary()
-            .is_some_and(|summary| summary.ending == Ending::Completed)
+            .is_some_and(|summary| summary.ending == RunEnding::Completed)
     }
 
     /// Kills all its processes, after a failure.

@@ -1,4 +1,4 @@
-//! Opening services: every name and every limit.
+//! Opening of services: every name and every limit.
 
 use iceoryx2::node::Node;
 use iceoryx2::prelude::*;
@@ -15,39 +15,40 @@ use skein_protocol::ticket::ControlRecord;
 use skein_protocol::transition::TransitionRecord;
 use skein_run::RunIdentity;
 
-/// Records the learner holds while it looks at them.
+/// Records that the learner holds while it reads them.
 const BORROWED_RECORDS: usize = 2;
-/// Snapshots a late joiner still gets: with policy lag 1 two versions are in use, and an evaluation
-/// adds a third.
+/// Snapshots that a late joiner still receives: with policy lag 1 two versions are in use, and an
+/// evaluation adds a third.
 pub(super) const SNAPSHOT_HISTORY: usize = 4;
 /// Tickets of segments that may wait for an actor.
 const SEGMENT_BUFFER: usize = 1;
-/// How services come to be.
+
+/// Mode in which services are opened.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Manner {
+pub(super) enum OpenMode {
     /// The learner creates them.
     Create,
-    /// Others find them there.
+    /// All others join existing ones.
     Join,
 }
 
-/// Opens services of one run with the limits its configuration asks for.
+/// Opens services of one run with the limits of its configuration.
 pub(super) struct Opener<'a> {
     pub(super) node: &'a Node<Ipc>,
-    pub(super) manner: Manner,
+    pub(super) mode: OpenMode,
     attributes: AttributeVerifier,
     pub(super) actors: usize,
 }
 
-/// Creates or joins a service of the [`Opener`], as its manner says. A macro, because builders of
-/// different payloads have no trait in common.
+/// Creates or joins a service of the [`Opener`], depending on its mode. A macro, because builders
+/// of different payloads share no trait.
 macro_rules! opened {
     ($opener:expr, $service:expr, $builder:expr) => {
-        match $opener.manner {
-            Manner::Create => $builder
+        match $opener.mode {
+            OpenMode::Create => $builder
                 .open_or_create_with_attributes(&$opener.attributes)
                 .map_err(failed($service, "opening")),
-            Manner::Join => $builder
+            OpenMode::Join => $builder
                 .open_with_attributes(&$opener.attributes)
                 .map_err(failed($service, "opening")),
         }
@@ -57,7 +58,7 @@ macro_rules! opened {
 impl<'a> Opener<'a> {
     pub(super) fn new(
         node: &'a Node<Ipc>,
-        manner: Manner,
+        mode: OpenMode,
         identity: &RunIdentity,
         config: &Config,
     ) -> Result<Self, ServiceError> {
@@ -80,11 +81,11 @@ impl<'a> Opener<'a> {
                 .require(&key, &value)
                 .map_err(failed("all", "setting an attribute"))?;
         }
-        // A restarted actor may come before its dead predecessor's slots are reclaimed; the
+        // A restarted actor may join before its dead predecessor's slots are reclaimed, and the
         // learner's own waker takes one.
         Ok(Self {
             node,
-            manner,
+            mode,
             attributes,
             actors: 2 * config.transport.max_actors,
         })
@@ -114,8 +115,8 @@ impl<'a> Opener<'a> {
                 .max_publishers(self.actors)
                 .max_subscribers(1)
                 .max_nodes(self.nodes())
-                // Every episode an actor holds a ticket for fits whole, so a record is never
-                // refused for want of room.
+                // Every episode that an actor holds a ticket for fits whole, so no record is
+                // refused for lack of space.
                 .subscriber_max_buffer_size(transition_buffer(&config.transport))
                 .subscriber_max_borrowed_samples(BORROWED_RECORDS)
                 .history_size(0)
@@ -144,7 +145,7 @@ impl<'a> Opener<'a> {
                 .max_nodes(self.nodes())
                 .subscriber_max_buffer_size(8)
                 .subscriber_max_borrowed_samples(1)
-                // A late joiner of a learner, or a restarted one, hears of its actors at once.
+                // A restarted learner receives the status of its actors at once.
                 .history_size(1)
                 // Only the newest heartbeats matter.
                 .enable_safe_overflow(true)
@@ -200,8 +201,8 @@ impl<'a> Opener<'a> {
                 .subscriber_max_buffer_size(SEGMENT_BUFFER)
                 .subscriber_max_borrowed_samples(1)
                 .history_size(0)
-                // One episode is under way in segments at a time, and one segment of it: of tickets
-                // for segments the newest counts.
+                // One segment of one episode is in progress at a time, so only the newest ticket of
+                // a segment counts.
                 .enable_safe_overflow(true)
         };
         opened!(self, "segments", builder())
@@ -229,7 +230,7 @@ impl<'a> Opener<'a> {
                 .subscriber_max_buffer_size(SNAPSHOT_HISTORY)
                 .subscriber_max_borrowed_samples(1)
                 .history_size(SNAPSHOT_HISTORY)
-                // The newest snapshots win.
+                // Only the newest snapshots matter.
                 .enable_safe_overflow(true)
         };
         opened!(self, "weights", builder())
@@ -255,27 +256,27 @@ impl<'a> Opener<'a> {
     }
 }
 
-/// Records of an actor that may wait for the learner: every episode it holds a ticket for fits
-/// whole.
+/// Returns how many records of an actor may wait for the learner: every episode that it holds a
+/// ticket for, whole.
 pub(super) fn transition_buffer(transport: &TransportSection) -> usize {
     transport.max_records_per_episode * transport.tickets_per_actor
 }
 
-/// Messages that may wait for an actor. All tickets pass by every actor: room for everyone's, some
-/// of them twice, while this one flies.
+/// Returns how many messages may wait for an actor. Every actor receives all tickets, so there is
+/// room for everyone's, some of them twice, while this one flies.
 pub(super) fn control_buffer(transport: &TransportSection) -> usize {
     4 * transport.max_actors * transport.tickets_per_actor + 64
 }
 
-/// Messages to actors that exist at once. As a rule all actors are left the same ones; those that
-/// were stopped at different times keep what was said then, up to as many of them as are counted
-/// here. If there are more, nothing can be said to anybody, and the learner gives the transport up.
+/// Returns how many messages to actors exist at once. Usually all actors have the same ones left to
+/// read. Actors that were stopped at different times hold the messages of those times, up to this
+/// number. Beyond it no message can be sent, and the learner gives up the transport.
 pub(super) fn control_slots(transport: &TransportSection) -> usize {
     16 * control_buffer(transport)
 }
 
-/// Tickets of segments that exist at once: one that waits for each actor, one that it looks at, and
-/// one that is written.
+/// Returns how many tickets of segments exist at once: for each actor one that waits and one being
+/// read, and one being written.
 pub(super) fn segment_slots(transport: &TransportSection) -> usize {
     2 * transport.max_actors * (SEGMENT_BUFFER + 1) + 1
 }

@@ -1,4 +1,4 @@
-//! Folders and locks of ours in places that belong to everybody.
+//! Folders and locks in directories that all users share.
 
 use std::ffi::OsStr;
 use std::fs::{self, File, TryLockError};
@@ -12,55 +12,56 @@ use std::time::{Duration, Instant};
 use rustix::fs::{Mode, OFlags};
 use rustix::process::geteuid;
 
-/// How long a lock is tried that others may hold for the moment it takes them to look.
+/// Longest time to try a lock, which other processes may hold briefly while they look.
 const LOCK_PATIENCE: Duration = Duration::from_secs(1);
-/// Time between two tries.
+/// Time between two tries of a lock.
 const LOCK_INTERVAL: Duration = Duration::from_millis(5);
 
-/// Why a place cannot be used.
+/// Reason why a file, folder or lock cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub enum PlaceError {
-    /// It cannot be read or written.
+pub enum PathError {
+    /// The path cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {
         /// The path.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         #[source]
         source: io::Error,
     },
-    /// It is somebody else's.
-    #[error("{} belongs to user {owner}, this process to user {user}: a run is its owner's alone", path.display())]
+    /// The path belongs to another user.
+    #[error("{} belongs to user {owner}, but this process runs as user {user}: only its owner \
+        can use a run", path.display())]
     OtherUser {
         /// The path.
         path: PathBuf,
-        /// Its owner.
+        /// Owner.
         owner: u32,
-        /// This process's user.
+        /// User of this process.
         user: u32,
     },
-    /// Somebody holds it and does not let go.
-    #[error("{} is being removed and does not vanish", path.display())]
+    /// The folder is being removed and does not disappear.
+    #[error("{} is being removed but does not disappear", path.display())]
     Busy {
         /// The path.
         path: PathBuf,
     },
 }
 
-impl PlaceError {
-    /// A failure at `path`.
+impl PathError {
+    /// Returns the error for a failure at `path`.
     pub(super) fn at(path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();
         move |source| Self::Io { path, source }
     }
 }
 
-/// The user this process acts for.
+/// Returns the user that this process runs as.
 pub(super) fn user() -> u32 {
     geteuid().as_raw()
 }
 
-/// Makes a folder for this user alone. One that is there is all right too.
+/// Creates a folder for this user only. An existing one is accepted.
 pub(super) fn make_folder(path: &Path) -> io::Result<()> {
     match fs::DirBuilder::new().mode(0o700).create(path) {
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
@@ -68,94 +69,96 @@ pub(super) fn make_folder(path: &Path) -> io::Result<()> {
     }
 }
 
-/// A folder of this user, opened; `None` when it is not there. A link to one is none.
-pub(super) fn open_folder(path: &Path) -> Result<Option<File>, PlaceError> {
+/// Opens a folder of this user; returns `None` if it does not exist. A link is not accepted.
+pub(super) fn open_folder(path: &Path) -> Result<Option<File>, PathError> {
     let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
     let folder = match rustix::fs::open(path, flags, Mode::empty()) {
         Ok(folder) => File::from(folder),
         Err(rustix::io::Errno::NOENT) => return Ok(None),
-        // Whose it is says more than that it is closed.
+        // The owner explains more than the refused access.
         Err(error) => {
             let owner = fs::symlink_metadata(path).map(|about| about.uid()).ok();
             return Err(match owner.filter(|owner| *owner != user()) {
                 Some(owner) => other_user(path, owner),
-                None => PlaceError::at(path)(error.into()),
+                None => PathError::at(path)(error.into()),
             });
         }
     };
-    let about = folder.metadata().map_err(PlaceError::at(path))?;
+    let about = folder.metadata().map_err(PathError::at(path))?;
     if about.uid() != user() {
         return Err(other_user(path, about.uid()));
     }
     if about.mode() & 0o077 != 0 {
         folder
             .set_permissions(fs::Permissions::from_mode(0o700))
-            .map_err(PlaceError::at(path))?;
+            .map_err(PathError::at(path))?;
     }
     Ok(Some(folder))
 }
 
-fn other_user(path: &Path, owner: u32) -> PlaceError {
-    PlaceError::OtherUser {
+fn other_user(path: &Path, owner: u32) -> PathError {
+    PathError::OtherUser {
         path: path.to_owned(),
         owner,
         user: user(),
     }
 }
 
-/// Whether `file` is still what is found at `path`: somebody may have removed it before it was
-/// locked.
+/// Returns `true` if `file` is still found at `path`: another process may have removed it before it
+/// was locked.
 pub(super) fn is_still_at(file: &File, path: &Path) -> io::Result<bool> {
     let held = file.metadata()?;
     match fs::symlink_metadata(path) {
-        // Its number cannot have been given to another while it is open.
+        // The inode number is not reused while the file is open.
         Ok(found) => Ok((held.dev(), held.ino()) == (found.dev(), found.ino())),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
         Err(error) => Err(error),
     }
 }
 
-/// A lock that one process holds while it lives: the kernel frees it with the process, however that
-/// ends. Its file keeps a few words.
+/// A lock that one process holds while it is alive: the kernel releases it when the process ends,
+/// however that happens. Its file holds a short text.
 #[derive(Debug)]
-pub(super) struct HeldLock {
+pub(super) struct FileLock {
     file: File,
     path: PathBuf,
 }
 
-impl HeldLock {
-    /// What the file says.
-    pub(super) fn words(&self) -> Result<String, PlaceError> {
-        read_words(&self.file).map_err(PlaceError::at(&self.path))
+impl FileLock {
+    /// Returns the text in the file.
+    pub(super) fn content(&self) -> Result<String, PathError> {
+        read_content(&self.file).map_err(PathError::at(&self.path))
     }
 
-    /// Writes `words` in the place of others, at once: there is no moment at which none are there.
-    pub(super) fn write(&self, words: &str) -> Result<(), PlaceError> {
+    /// Replaces the text by `content` in one write, so the file is never empty.
+    pub(super) fn write(&self, content: &str) -> Result<(), PathError> {
         self.file
-            .write_all_at(format!("{words:<WORDS$}").as_bytes(), 0)
-            .map_err(PlaceError::at(&self.path))
+            .write_all_at(format!("{content:<CONTENT_LEN$}").as_bytes(), 0)
+            .map_err(PathError::at(&self.path))
     }
 }
 
-/// Characters of the words in a lock's file.
-const WORDS: usize = 40;
+/// Length of the text in a lock's file.
+const CONTENT_LEN: usize = 40;
 
-fn read_words(file: &File) -> io::Result<String> {
-    let mut words = [0; WORDS];
-    let length = file.read_at(&mut words, 0)?;
-    Ok(String::from_utf8_lossy(&words[..length]).trim().to_owned())
+fn read_content(file: &File) -> io::Result<String> {
+    let mut content = [0; CONTENT_LEN];
+    let length = file.read_at(&mut content, 0)?;
+    Ok(String::from_utf8_lossy(&content[..length])
+        .trim()
+        .to_owned())
 }
 
-/// What a [`HeldLock`] was tried for.
+/// Result of trying a [`FileLock`].
 #[derive(Debug)]
-pub(super) enum Locked {
-    /// This process holds it.
-    Mine(HeldLock),
-    /// Another holds it, and wrote this.
-    Taken { words: String },
+pub(super) enum LockAttempt {
+    /// This process holds the lock.
+    Acquired(FileLock),
+    /// Another process holds the lock, and wrote `content`.
+    HeldByOther { content: String },
 }
 
-/// A file for this user alone, made if need be. A link to one is none.
+/// Opens a file for this user only, creating it if needed. A link is not accepted.
 pub(super) fn open_private(path: &Path) -> io::Result<File> {
     fs::OpenOptions::new()
         .read(true)
@@ -167,19 +170,19 @@ pub(super) fn open_private(path: &Path) -> io::Result<File> {
         .open(path)
 }
 
-/// Takes the lock of the file at `path`, which is made if need be.
-pub(super) fn lock(path: &Path) -> Result<Locked, PlaceError> {
-    let file = open_private(path).map_err(PlaceError::at(path))?;
-    if lock_within(LOCK_PATIENCE, || file.try_lock()).map_err(PlaceError::at(path))? {
+/// Takes the lock of the file at `path`, which is created if needed.
+pub(super) fn lock(path: &Path) -> Result<LockAttempt, PathError> {
+    let file = open_private(path).map_err(PathError::at(path))?;
+    if lock_within(LOCK_PATIENCE, || file.try_lock()).map_err(PathError::at(path))? {
         let path = path.to_owned();
-        return Ok(Locked::Mine(HeldLock { file, path }));
+        return Ok(LockAttempt::Acquired(FileLock { file, path }));
     }
-    Ok(Locked::Taken {
-        words: read_words(&file).map_err(PlaceError::at(path))?,
+    Ok(LockAttempt::HeldByOther {
+        content: read_content(&file).map_err(PathError::at(path))?,
     })
 }
 
-/// Tries a lock until it is had or `patience` is over; whether it is had.
+/// Tries a lock until it is acquired or `patience` is over; returns `true` if it was acquired.
 pub(super) fn lock_within(
     patience: Duration,
     mut try_lock: impl FnMut() -> Result<(), TryLockError>,
@@ -195,8 +198,8 @@ pub(super) fn lock_within(
     }
 }
 
-/// Whether a process holds the lock of the file at `path`.
-pub(super) fn is_locked(path: &Path) -> Result<bool, PlaceError> {
+/// Returns `true` if a process holds the lock of the file at `path`.
+pub(super) fn is_locked(path: &Path) -> Result<bool, PathError> {
     let file = match File::open(path) {
         Ok(file) => file,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
@@ -205,18 +208,19 @@ pub(super) fn is_locked(path: &Path) -> Result<bool, PlaceError> {
             let owner = fs::symlink_metadata(folder).map(|about| about.uid()).ok();
             return Err(match owner.filter(|owner| *owner != user()) {
                 Some(owner) => other_user(folder, owner),
-                None => PlaceError::at(path)(error),
+                None => PathError::at(path)(error),
             });
         }
     };
     match file.try_lock_shared() {
         Ok(()) => Ok(false),
         Err(TryLockError::WouldBlock) => Ok(true),
-        Err(TryLockError::Error(error)) => Err(PlaceError::at(path)(error)),
+        Err(TryLockError::Error(error)) => Err(PathError::at(path)(error)),
     }
 }
 
-/// `name` as the number of a run behind `prefix`, which sixteen hexadecimal digits follow.
+/// Parses `name` as `prefix` and the sixteen hexadecimal digits of a run. Returns the run and the
+/// length of both.
 pub(super) fn run_of(name: &OsStr, prefix: &str) -> Option<(u64, usize)> {
     let bytes = name.as_bytes();
     let digits = bytes.strip_prefix(prefix.as_bytes())?.get(..16)?;

@@ -1,9 +1,9 @@
-//! Takes back what dead processes held.
+//! Reclaims the resources of dead processes.
 //!
-//! iceoryx2 does it for nodes whose process is gone. But where death left a file half made, or half
-//! removed, it stops: the slot of a port, of which there are few, is lost, or files stay behind,
-//! with each actor that is killed while it comes or goes. So what is half made is removed before
-//! iceoryx2 cleans up, and what still names a process that is gone is removed after.
+//! iceoryx2 does this for nodes whose process has ended. But where a file is half created or half
+//! removed, it stops: a port's slot, of which there are few, is lost, or files stay behind, for
+//! each actor that is killed while it joins or leaves. So half-created files are removed before
+//! iceoryx2 cleans up, and files that still name a dead process are removed afterwards.
 
 use std::collections::BTreeSet;
 use std::fs::{self, DirEntry};
@@ -18,12 +18,11 @@ use iceoryx2_bb_posix::unique_system_id::UniqueSystemId;
 use super::{Ipc, ServiceError, failed};
 use skein_run::{LearnerIncarnation, RunIdentity};
 
-/// Nobody takes as long to come, from the first file of its node to the lock by which others see
-/// that it incarnations. Who was stopped meanwhile finds its files gone, fails to join, and tries
-/// again.
-const LONGEST_COMING: Duration = Duration::from_secs(10);
+/// Longest time from the first file of a process's node to the lock that shows it is alive. A
+/// process that was stopped in between finds its files gone, fails to join, and tries again.
+const MAX_JOIN_TIME: Duration = Duration::from_secs(10);
 
-/// Takes back what the dead held in the transport of an incarnation.
+/// Reclaims the resources of dead processes in the transport of an incarnation.
 #[derive(Debug)]
 pub(super) struct Reclaimer {
     identity: RunIdentity,
@@ -38,11 +37,11 @@ impl Reclaimer {
         }
     }
 
-    /// Takes back what the dead held whose nodes lie beside `node`. What cannot be had now is tried
-    /// again at the next call.
+    /// Reclaims the resources of dead nodes beside `node`. What fails now is tried again at the
+    /// next call.
     ///
     /// # Errors
-    /// [`ServiceError`] when the nodes cannot be listed.
+    /// [`ServiceError`] if the nodes cannot be listed.
     pub(super) fn reclaim(&self, node: &Node<Ipc>) -> Result<(), ServiceError> {
         let mut living = BTreeSet::from([process_of(node.id().value())]);
         Node::<Ipc>::list(node.config(), |state| {
@@ -64,8 +63,8 @@ impl Reclaimer {
 
     fn reclaim_node(&self, dead: DeadNodeView<Ipc>) {
         let process = process_of(dead.id().value());
-        // Nothing hangs on what is half made: a tag is finished before its service or port is
-        // entered, a segment before anybody maps it.
+        // Nothing depends on half-created files: a tag is finished before its service or port is
+        // registered, a segment before anybody maps it.
         let tags = entries(self.nodes().join(dead.id().value().to_string()));
         let half_made_tags = tags.filter(|tag| mode(tag) & 0o200 != 0);
         let segments = self
@@ -84,7 +83,7 @@ impl Reclaimer {
             .join("nodes")
     }
 
-    /// Listeners' sockets, nodes' locks, and nodes' folders.
+    /// Returns listeners' sockets, nodes' locks, and nodes' folders.
     fn files(&self) -> Vec<PathBuf> {
         let sockets = entries(self.identity.incarnation_folder(self.incarnation));
         sockets.chain(entries(self.nodes())).collect()
@@ -95,16 +94,16 @@ impl Reclaimer {
     }
 }
 
-/// The process that made `id`, of a node or a port.
+/// Returns the process that made `id`, of a node or a port.
 fn process_of(id: u128) -> u32 {
     UniqueSystemId::from(id).pid().value().cast_unsigned()
 }
 
-/// The processes that made the nodes and ports that `path` is called after: two where it is a
-/// connection, none where it belongs to all.
+/// Returns the processes that made the nodes and ports in the name of `path`: two for a connection,
+/// none for a shared file.
 fn processes_in(path: &Path) -> impl Iterator<Item = u32> {
-    /// Ids are large: the incarnation's number, the run's and digests, in hexadecimal, are not
-    /// taken for one.
+    /// Length of ids. Other numbers in names, such as the incarnation and hexadecimal digests, are
+    /// shorter or not decimal.
     const DIGITS: std::ops::RangeInclusive<usize> = 20..=39;
     let name = path
         .file_name()
@@ -117,14 +116,14 @@ fn processes_in(path: &Path) -> impl Iterator<Item = u32> {
 }
 
 fn mode(path: &PathBuf) -> u32 {
-    // Of what is gone nothing is half made.
+    // A missing file counts as complete.
     fs::symlink_metadata(path).map_or(0o600, |about| about.mode())
 }
 
 fn is_old(path: &Path) -> bool {
     let changed = fs::symlink_metadata(path).and_then(|about| about.modified());
-    // A clock that was set back makes it young again, for as long.
-    changed.is_ok_and(|at| at.elapsed().is_ok_and(|age| age > LONGEST_COMING))
+    // After the clock was set back, the file counts as new for that much longer.
+    changed.is_ok_and(|at| at.elapsed().is_ok_and(|age| age > MAX_JOIN_TIME))
 }
 
 fn remove(path: &Path) {
@@ -134,7 +133,7 @@ fn remove(path: &Path) {
     };
 }
 
-/// What is in `folder`; nothing when it is gone.
+/// Returns the entries of `folder`; none if it does not exist.
 fn entries(folder: PathBuf) -> impl Iterator<Item = PathBuf> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     entries.map(|entry: DirEntry| entry.path())
@@ -159,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn what_names_a_process_that_is_gone_is_removed_once_it_is_old_and_nothing_else_is() {
+    fn old_files_of_dead_processes_are_removed_and_nothing_else_is() {
         let run = Run::with(|_| {});
         let learner =
             LearnerPorts::open(&run.identity, run.lock.incarnation(), &run.config).unwrap();
@@ -176,7 +175,8 @@ mod tests {
         let before = listed();
         before.iter().for_each(|path| age(path));
 
-        // A process that has ended, in the number of a node or port as iceoryx2 makes them.
+        // The id of a process that has ended, within the id of a node or port as iceoryx2 builds
+        // it.
         let mut gone = Command::new("true").spawn().unwrap();
         gone.wait().unwrap();
         let made_by = |process: u32| (7_u128 << 96) | (u128::from(process) << 64) | 1;
@@ -204,11 +204,7 @@ mod tests {
         let with_left = listed();
         assert_eq!(with_left.len(), before.len() + left.len());
         learner.maintain().unwrap();
-        assert_eq!(
-            listed(),
-            with_left,
-            "whoever made them may be about to come"
-        );
+        assert_eq!(listed(), with_left, "their process may still be joining");
         left.iter().for_each(|path| age(path));
         learner.maintain().unwrap();
         assert_eq!(listed(), before);

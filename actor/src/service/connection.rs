@@ -1,4 +1,4 @@
-//! The line from an actor to the learner that it has joined.
+//! Connection of an actor to its learner.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -11,34 +11,34 @@ use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, Ticket};
 use skein_protocol::transition::RecordKind;
 use skein_run::RunIdentity;
-use skein_run::fault::{FaultPoint, pass};
+use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_transport::{ActorPorts, LoanedTransition, ServiceError};
 use tracing::{debug, warn};
 
-use super::{Ending, Parting, Service};
-use crate::weights::Weights;
+use super::{DisconnectReason, ExitReason, Service};
+use crate::snapshot_cache::SnapshotCache;
 use skein_inference::Network;
 use skein_rollout::environment_loop::{Directive, RecordLink};
 
-/// The actor's end of the line to the learner: hears tickets, snapshots and the stop, sends records
-/// and heartbeats.
-pub(super) struct LearnerLine<'a> {
+/// Connection to the learner: receives tickets, snapshots and the stop, sends records and
+/// heartbeats.
+pub(super) struct LearnerConnection<'a> {
     ports: ActorPorts,
     identity: &'a RunIdentity,
     actor: ActorId,
     incarnation: ActorIncarnation,
-    weights: Weights,
+    weights: SnapshotCache,
     tickets: VecDeque<QueuedTicket>,
-    limits: Limits,
-    told_to_end: &'a AtomicBool,
-    /// What was found out and ends this line.
-    parting: Option<Parting>,
-    last_sign: Instant,
-    /// When the last heartbeat was given: whoever missed some has been stopped.
-    last_said: Instant,
+    limits: ConnectionLimits,
+    exit_requested: &'a AtomicBool,
+    /// Detected reason to disconnect.
+    disconnect_reason: Option<DisconnectReason>,
+    last_heard: Instant,
+    /// Time of the last heartbeat sent; a long gap means that this process was suspended.
+    last_heartbeat: Instant,
     timer: LapTimer,
-    /// Whether the learner was told that there is nothing to fly, since there was.
-    has_told_of_waiting: bool,
+    /// `true` if the learner was informed that this actor is idle, since it last was not.
+    reported_idle: bool,
     pub(super) episodes_flown: u64,
 }
 
@@ -48,7 +48,7 @@ struct QueuedTicket {
 }
 
 /// Deadlines and limits, from the `[transport]` section.
-struct Limits {
+struct ConnectionLimits {
     heartbeat: Duration,
     ticket_lifetime: Duration,
     actor_silence: Duration,
@@ -56,9 +56,9 @@ struct Limits {
     tickets: usize,
 }
 
-impl<'a> LearnerLine<'a> {
-    /// A line over `ports`, for the present incarnation of `service`. It begins with nothing: what
-    /// an earlier incarnation knew is not taken over.
+impl<'a> LearnerConnection<'a> {
+    /// Creates the connection over `ports`, for the current incarnation of `service`. It starts
+    /// empty: nothing is kept from an earlier incarnation.
     pub(super) fn new(service: &Service<'a>, ports: ActorPorts) -> Self {
         let transport = &service.config.transport;
         Self {
@@ -66,44 +66,45 @@ impl<'a> LearnerLine<'a> {
             identity: service.identity,
             actor: service.actor,
             incarnation: service.incarnation,
-            weights: Weights::of_run(service.config),
+            weights: SnapshotCache::of_run(service.config),
             tickets: VecDeque::new(),
-            limits: Limits {
+            limits: ConnectionLimits {
                 heartbeat: transport.heartbeat(),
                 ticket_lifetime: Duration::from_secs_f64(transport.episode_deadline_secs),
                 actor_silence: Duration::from_secs_f64(transport.actor_silence_secs),
                 learner_silence: Duration::from_secs_f64(transport.learner_silence_secs),
                 tickets: transport.tickets_per_actor,
             },
-            told_to_end: service.told_to_end,
-            parting: None,
-            last_sign: service.last_sign,
-            last_said: Instant::now(),
+            exit_requested: service.exit_requested,
+            disconnect_reason: None,
+            last_heard: service.last_heard,
+            last_heartbeat: Instant::now(),
             timer: LapTimer::start(),
-            has_told_of_waiting: false,
+            reported_idle: false,
             episodes_flown: 0,
         }
     }
 
-    /// When the learner last sent a heartbeat.
-    pub(super) fn last_sign(&self) -> Instant {
-        self.last_sign
+    /// Returns the time of the learner's last heartbeat.
+    pub(super) fn last_heard(&self) -> Instant {
+        self.last_heard
     }
 
-    /// Why to let go of the learner, if there is a reason.
-    pub(super) fn parting(&self) -> Option<Parting> {
-        if self.parting.is_some() {
-            self.parting
-        } else if self.told_to_end.load(Ordering::Relaxed) {
-            Some(Parting::Leave(Ending::Signalled))
-        } else if self.last_sign.elapsed() > self.limits.learner_silence {
-            Some(Parting::Leave(Ending::LearnerSilent))
+    /// Returns the reason to disconnect, if there is one.
+    pub(super) fn disconnect_reason(&self) -> Option<DisconnectReason> {
+        if self.disconnect_reason.is_some() {
+            self.disconnect_reason
+        } else if self.exit_requested.load(Ordering::Relaxed) {
+            Some(DisconnectReason::Exit(ExitReason::Signalled))
+        } else if self.last_heard.elapsed() > self.limits.learner_silence {
+            Some(DisconnectReason::Exit(ExitReason::LearnerSilent))
         } else {
             None
         }
     }
 
-    /// Hears everything there is to hear, and sends a heartbeat when one is due.
+    /// Receives all messages and snapshots, drops expired tickets, and sends a heartbeat if one is
+    /// due.
     pub(super) fn listen(&mut self) -> Result<(), ServiceError> {
         self.listen_for_control()?;
         self.timer.lap(Stage::ActorControl, 1);
@@ -117,11 +118,15 @@ impl<'a> LearnerLine<'a> {
             }
             self.timer.lap(Stage::TakeSnapshot, 1);
         }
-        let incarnation = self.limits.ticket_lifetime;
+        let lifetime = self.limits.ticket_lifetime;
         self.tickets.retain(|queued| {
-            let alive = queued.arrived.elapsed() < incarnation;
+            let alive = queued.arrived.elapsed() < lifetime;
             if !alive {
-                warn!(episode = %queued.ticket.episode, policy = %queued.ticket.policy_version, "ticket expired");
+                warn!(
+                    episode = %queued.ticket.episode,
+                    policy = %queued.ticket.policy_version,
+                    "ticket expired"
+                );
             }
             alive
         });
@@ -131,52 +136,61 @@ impl<'a> LearnerLine<'a> {
     fn listen_for_control(&mut self) -> Result<(), ServiceError> {
         while let Some(message) = self.ports.receive_control()? {
             match message.read(self.ports.run()) {
-                Ok(said) => {
-                    self.last_sign = Instant::now();
+                Ok(control) => {
+                    self.last_heard = Instant::now();
                     if message.is_for(self.actor, self.incarnation) {
-                        self.obey(said);
+                        self.handle(control);
                     }
                 }
                 Err(fault) => warn!(%fault, "control record refused"),
             }
         }
-        let unsaid = self.last_said.elapsed();
-        if unsaid > self.limits.actor_silence {
-            self.parting.get_or_insert(Parting::Overslept);
-        } else if unsaid >= self.limits.heartbeat {
-            self.look_at_learner();
+        let silence = self.last_heartbeat.elapsed();
+        if silence > self.limits.actor_silence {
+            self.disconnect_reason
+                .get_or_insert(DisconnectReason::Suspended);
+        } else if silence >= self.limits.heartbeat {
+            self.check_learner();
             self.ports.maintain()?;
-            self.last_said = Instant::now();
+            self.last_heartbeat = Instant::now();
             self.report(ActorState::Serving)?;
         }
         Ok(())
     }
 
-    /// Whether the learner that was joined is still the one that lives: a dead one falls silent
-    /// too, but this is known at once.
-    fn look_at_learner(&mut self) {
-        match self.identity.present_incarnation() {
+    /// Checks that the joined learner is still the living one. A dead learner also falls silent,
+    /// but this is known at once.
+    fn check_learner(&mut self) {
+        match self.identity.current_incarnation() {
             Ok(Some(present)) if present.incarnation == self.ports.incarnation() => {}
             Ok(_) => {
-                self.parting.get_or_insert(Parting::LearnerGone);
+                self.disconnect_reason
+                    .get_or_insert(DisconnectReason::LearnerGone);
             }
-            Err(error) => debug!(%error, "cannot look for the learner"),
+            Err(error) => debug!(%error, "cannot check the learner"),
         }
     }
 
-    fn obey(&mut self, said: Control) {
-        match said {
+    fn handle(&mut self, control: Control) {
+        match control {
             Control::Heartbeat => {}
             Control::Rejoin => {
-                self.parting.get_or_insert(Parting::AskedToRejoin);
+                self.disconnect_reason
+                    .get_or_insert(DisconnectReason::RejoinRequested);
             }
-            Control::Stop => self.parting = Some(Parting::Leave(Ending::Stopped)),
+            Control::Stop => {
+                self.disconnect_reason = Some(DisconnectReason::Exit(ExitReason::Stopped))
+            }
             Control::Fly(ticket) => {
-                // An episode issued again replaces its earlier ticket.
+                // A reissued episode replaces its earlier ticket.
                 self.tickets
                     .retain(|queued| queued.ticket.episode != ticket.episode);
                 if self.tickets.len() >= self.limits.tickets {
-                    warn!(episode = %ticket.episode, limit = self.limits.tickets, "more tickets than agreed; the oldest is dropped");
+                    warn!(
+                        episode = %ticket.episode,
+                        limit = self.limits.tickets,
+                        "more tickets than transport.tickets_per_actor; the oldest is dropped"
+                    );
                     self.tickets.pop_front();
                 }
                 self.tickets.push_back(QueuedTicket {
@@ -187,7 +201,7 @@ impl<'a> LearnerLine<'a> {
         }
     }
 
-    /// The first ticket whose snapshot is here.
+    /// Returns the first ticket whose snapshot is available, with its network.
     pub(super) fn take_ticket(&mut self) -> Option<(Ticket, Arc<Network>)> {
         let ready = self
             .tickets
@@ -195,24 +209,24 @@ impl<'a> LearnerLine<'a> {
             .position(|queued| self.weights.holds(queued.ticket.policy_version))?;
         let ticket = self.tickets.remove(ready)?.ticket;
         let network = self.weights.network(ticket.policy_version)?;
-        self.has_told_of_waiting = false;
+        self.reported_idle = false;
         self.timer.lap(Stage::TakeSnapshot, 0);
         Some((ticket, network))
     }
 
-    /// Waits for the learner, not longer than until the next heartbeat. The learner is told first:
-    /// it wakes actors only to what one that waits would miss.
+    /// Waits for the learner, at most until the next heartbeat. Reports to the learner first: it
+    /// wakes actors only for what an idle one would miss.
     pub(super) fn wait(&mut self) -> Result<(), ServiceError> {
-        if !self.has_told_of_waiting {
-            self.has_told_of_waiting = true;
+        if !self.reported_idle {
+            self.reported_idle = true;
             self.report(ActorState::Serving)?;
         }
         if let Err(error) = self.ports.wait(
             self.limits
                 .heartbeat
-                .saturating_sub(self.last_said.elapsed()),
+                .saturating_sub(self.last_heartbeat.elapsed()),
         ) {
-            // Anything lasting shows as silence, so there is no hurry.
+            // A lasting failure shows as silence, so there is no hurry.
             debug!(%error, "cannot wait for the learner");
             std::thread::sleep(Duration::from_millis(10));
         }
@@ -220,12 +234,13 @@ impl<'a> LearnerLine<'a> {
         Ok(())
     }
 
-    /// Calls the learner to what was sent.
+    /// Wakes the learner to read the records sent.
     pub(super) fn wake_learner(&self) -> Result<(), ServiceError> {
         self.ports.wake_learner()
     }
 
-    /// Tells how this actor stands. It is no heartbeat: one that was missed is still found missing.
+    /// Sends this actor's status. It does not count as a heartbeat, so that a suspension is still
+    /// detected.
     pub(super) fn report(&self, state: ActorState) -> Result<(), ServiceError> {
         let status = ActorStatus {
             actor: self.actor,
@@ -242,7 +257,7 @@ impl<'a> LearnerLine<'a> {
     }
 }
 
-impl RecordLink for LearnerLine<'_> {
+impl RecordLink for LearnerConnection<'_> {
     type Loan = LoanedTransition;
     type Error = ServiceError;
 
@@ -254,13 +269,13 @@ impl RecordLink for LearnerLine<'_> {
 
     fn send(&mut self, record: LoanedTransition) -> Result<(), ServiceError> {
         let (step, kind) = (record.step, record.kind);
-        pass(FaultPoint::ActorBeforeSend);
+        die_if_armed(FaultPoint::ActorBeforeSend);
         self.ports.send_transition(record)?;
         self.timer.lap(Stage::Send, 1);
         if kind == RecordKind::Closing.code() {
-            pass(FaultPoint::ActorAfterLastRecord);
+            die_if_armed(FaultPoint::ActorAfterLastRecord);
         } else if step == 2 {
-            pass(FaultPoint::ActorMidEpisode);
+            die_if_armed(FaultPoint::ActorMidEpisode);
         }
         Ok(())
     }
@@ -268,7 +283,7 @@ impl RecordLink for LearnerLine<'_> {
     fn directive(&mut self) -> Result<Directive, ServiceError> {
         self.listen_for_control()?;
         self.timer.lap(Stage::ActorControl, 1);
-        Ok(if self.parting().is_some() {
+        Ok(if self.disconnect_reason().is_some() {
             Directive::Abandon
         } else {
             Directive::Continue
