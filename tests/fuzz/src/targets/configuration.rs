@@ -152,7 +152,7 @@ fn overridden(bytes: &[u8]) -> ReaderDecision {
     if read.is_err() {
         // The empty file is valid, so an override must cause any error.
         let problem = |overrides: &[String]| parse(overrides).err().map(|error| error.to_string());
-        assert!(culprit(&overrides, problem).is_some());
+        assert!(failing_override(&overrides, problem).is_some());
     }
     check(read)
 }
