@@ -5,7 +5,7 @@
 //! away, and what dead processes left is swept. The rest is what all of our programs do alike:
 //! files written whole ([`durable`]), logs ([`logging`]), the allocator ([`allocation`]), errors on
 //! one line ([`failure`]), points at which tests kill a process ([`fault`]), tables for the
-//! terminal ([`tables`]).
+//! terminal ([`tables`]), and the frames in TensorBoard's event files ([`write_event_record`]).
 //!
 //! Identity and announcement are here and not in the protocol: they name this machine's folders and
 //! locks, and only processes of this machine read them.
@@ -15,6 +15,7 @@ mod claims;
 mod courses;
 mod directory;
 pub mod durable;
+mod event_records;
 pub mod failure;
 pub mod fault;
 mod identity;
@@ -30,6 +31,7 @@ pub mod tables;
 
 pub use claims::ActorClaim;
 pub use directory::{RunDirectory, RunError};
+pub use event_records::{EventRecordError, split_event_record, write_event_record};
 pub use identity::{Announcement, Difference, LearnerIncarnation, RunIdentity};
 pub use lock::{LearnerLock, LockError, SupervisorLock};
 pub use place::PlaceError;
