@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use skein_run::write_event_record;
 
 use crate::disk::{Disk, PatientWriter};
-use crate::report::notify_user;
+use crate::notice::notify_user;
 
 /// Start of our files' names, before the second of their creation. TensorBoard reads files whose
 /// name contains `tfevents`.
