@@ -1,4 +1,4 @@
-//! The interface between a learning algorithm and the rest of the learner, and the choice of one.
+//! The interface between a learning algorithm and the rest of the learner.
 //!
 //! An algorithm receives minibatches and noise, and yields a policy. Replay, transport and actors
 //! know nothing of it. To add one: write a module beside [`crate::sac`] and [`crate::td3`] that
@@ -7,18 +7,15 @@
 
 use std::fmt;
 
-use skein_kernels::{Isa, Team};
-use skein_protocol::config::{AlgorithmName, Config, CriticInput, Engine};
+use skein_kernels::Team;
+use skein_protocol::config::{Config, CriticInput};
 use skein_protocol::{ACTION, IMAGE_PIXELS, PRIVILEGED_STATE};
-use tch::Device;
 
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::networks::Layout;
 use crate::noise::Noise;
-use crate::sac::{NativeSac, TorchSac};
 use crate::state::Stateful;
-use crate::td3::Td3;
 
 /// A method that learns a policy from transitions.
 ///
@@ -59,21 +56,6 @@ pub trait Algorithm: Stateful + fmt::Debug {
     /// # Panics
     /// When `into` is not as long as the encoder.
     fn publish_encoder(&self, into: &mut [f32]);
-}
-
-/// Returns the algorithm that a configuration names, untrained. `device` is libtorch's; the native
-/// engine always runs on the CPU.
-pub fn new(config: &Config, device: Device) -> Box<dyn Algorithm> {
-    let (inputs, seed, engine) = (Inputs::of(config), config.run.seed, config.policy_engine());
-    match (config.learning.algorithm, engine) {
-        (AlgorithmName::Sac, Engine::Native) => {
-            Box::new(NativeSac::new(&config.sac, inputs, seed, Isa::best()))
-        }
-        (AlgorithmName::Sac, Engine::Libtorch) => {
-            Box::new(TorchSac::new(&config.sac, inputs, seed, device))
-        }
-        (AlgorithmName::Td3, _) => Box::new(Td3::new(&config.td3, inputs, seed, device)),
-    }
 }
 
 /// Input widths of policy and critic, and where the inputs come from.

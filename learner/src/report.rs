@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use skein_protocol::progress::ProgressReport;
 
 use crate::disk::Disk;
-use crate::episodes::receiver::Shared;
+use crate::episodes::ReceiverState;
 use crate::watchdog::Watchdog;
 
 /// Time between two lines.
@@ -28,14 +28,6 @@ pub struct Reporter {
     thread: Option<JoinHandle<()>>,
 }
 
-/// Shows `line` to the user. The program that reads the progress lines shows every line that is not
-/// JSON as it is.
-pub fn notify_user(line: &str) {
-    tracing::warn!("{line}");
-    // Standard output may be closed; the line is in the log.
-    let _ = writeln!(std::io::stdout().lock(), "{line}");
-}
-
 impl Reporter {
     /// Starts reporting, with `progress` as the first line. Its `elapsed_secs` are those of earlier
     /// incarnations; the time of this one is added.
@@ -44,7 +36,7 @@ impl Reporter {
     /// When the system grants no thread.
     pub fn start(
         progress: ProgressReport,
-        receiver: Arc<Shared>,
+        receiver: Arc<ReceiverState>,
         disk: Disk,
     ) -> std::io::Result<Self> {
         let progress = Arc::new(Mutex::new(progress));
@@ -85,7 +77,12 @@ impl Drop for Reporter {
     }
 }
 
-fn report(progress: &Mutex<ProgressReport>, ended: &AtomicBool, receiver: &Shared, disk: &Disk) {
+fn report(
+    progress: &Mutex<ProgressReport>,
+    ended: &AtomicBool,
+    receiver: &ReceiverState,
+    disk: &Disk,
+) {
     let started = Instant::now();
     let mut watchdog = Watchdog::new(started);
     let mut marks: VecDeque<(f64, u64, u64)> = VecDeque::new();

@@ -6,7 +6,7 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 use skein_protocol::stages::StageTimes;
 
-use crate::episodes::receiver::Shared;
+use crate::faults::Faults;
 
 /// Time and losses over all incarnations of the learner, as stored in checkpoints: work lost with a
 /// killed learner is not counted.
@@ -24,17 +24,17 @@ pub struct RunCosts {
 
 impl RunCosts {
     /// Adds the costs of the present incarnation, started at `started`. `training` is the time of
-    /// its training thread; `shared` has the time of all other threads.
+    /// its training thread, `others` that of all other threads.
     pub fn with_this_incarnation(
         &self,
         started: Instant,
         training: &StageTimes,
-        shared: &Shared,
+        others: &StageTimes,
+        faults: &Faults,
     ) -> Self {
-        let faults = shared.faults();
         Self {
             wall_secs: self.wall_secs + started.elapsed().as_secs_f64(),
-            stages: self.stages.plus(training).plus(&shared.times()),
+            stages: self.stages.plus(training).plus(others),
             tickets_reissued: sum(&self.tickets_reissued, faults.reissued_by_reason()),
             records_refused: sum(&self.records_refused, faults.refused_by_reason()),
         }

@@ -9,14 +9,15 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_inference::{Encoder, encoder};
 use skein_kernels::{Isa, Team};
-use skein_protocol::config::{Config, Engine};
+use skein_protocol::config::{AlgorithmName, Config, Engine};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::Exploration;
+use tch::Device;
 
-use crate::algorithm::{self, Algorithm, Columns};
+use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::average::PolicyAverage;
 use crate::checkpoint::TrainingProgress;
 use crate::device::{self, DeviceError};
@@ -26,7 +27,9 @@ use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::noise::Noise;
 use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
+use crate::sac::{NativeSac, TorchSac};
 use crate::state::{self, NamedTensor, Stateful};
+use crate::td3::Td3;
 use crate::vae::{Vae, VaeMetrics};
 
 /// Images encoded at once when stored latent codes are computed again.
@@ -73,6 +76,21 @@ pub struct Trainer {
     recodings: u64,
 }
 
+/// Returns the algorithm that a configuration names, untrained. `device` is libtorch's; the native
+/// engine always runs on the CPU.
+pub(crate) fn new_algorithm(config: &Config, device: Device) -> Box<dyn Algorithm> {
+    let (inputs, seed, engine) = (Inputs::of(config), config.run.seed, config.policy_engine());
+    match (config.learning.algorithm, engine) {
+        (AlgorithmName::Sac, Engine::Native) => {
+            Box::new(NativeSac::new(&config.sac, inputs, seed, Isa::best()))
+        }
+        (AlgorithmName::Sac, Engine::Libtorch) => {
+            Box::new(TorchSac::new(&config.sac, inputs, seed, device))
+        }
+        (AlgorithmName::Td3, _) => Box::new(Td3::new(&config.td3, inputs, seed, device)),
+    }
+}
+
 impl Trainer {
     /// Creates untrained networks and an empty buffer. Starts the native engine's threads and sets
     /// the number of tensor threads of the calling thread, so training must stay on this thread.
@@ -93,7 +111,7 @@ impl Trainer {
             threads,
             "engines chosen"
         );
-        let algorithm = algorithm::new(config, device);
+        let algorithm = new_algorithm(config, device);
         let averaged = config.learning.average_updates;
         Ok(Self {
             layout: SnapshotLayout::of(config),

@@ -32,7 +32,8 @@ use crate::checkpoint::{CheckpointWriter, EpochOrder, TrainingProgress};
 use crate::curriculum;
 use crate::disk::Disk;
 use crate::episode::CommittedEpisode;
-use crate::episodes::receiver::{EpisodeBatch, EpisodeReceiver, ReceiverError};
+use crate::episodes::ReceiverError;
+use crate::episodes::receiver::{EpisodeBatch, EpisodeReceiver};
 use crate::metrics::{Metrics, Scalar};
 use crate::report::Reporter;
 use crate::trainer::Trainer;
@@ -242,14 +243,14 @@ impl Training<'_> {
         self.timer.lap(Stage::OtherTraining, 0);
         self.reporter
             .update(|progress| progress.phase = LearnerPhase::Flying);
-        let (is_mid_episode, shared) = (self.open_episode.is_some(), self.receiver.shared());
+        let (is_mid_episode, state) = (self.open_episode.is_some(), self.receiver.state());
         if let Some(OrderInFlight {
             batch, episodes, ..
         }) = self.in_flight.front_mut()
         {
             let watch = &mut self.stop_monitor;
             let mut next = || match is_mid_episode {
-                true => batch.next_unless(|| watch.during_episode(&shared)),
+                true => batch.next_unless(|| watch.during_episode(&state)),
                 false => Ok(batch.next(self.stop)?),
             };
             while let Some(episode) = next()? {
@@ -305,8 +306,8 @@ impl Training<'_> {
     /// Writes the curves' points of the epoch just learned from.
     fn write_curves(&mut self) -> Result<(), TrainingError> {
         let curves = std::mem::take(&mut self.curves);
-        let shared = self.receiver.shared();
-        let points = curves.points(self.epoch_started.elapsed(), self.trainer.replay(), &shared);
+        let faults = self.receiver.state().faults();
+        let points = curves.points(self.epoch_started.elapsed(), self.trainer.replay(), &faults);
         self.epoch_started = Instant::now();
         self.metrics.scalars(self.last_episode(), &points)?;
         Ok(self.metrics.flush()?)

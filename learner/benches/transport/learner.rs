@@ -95,7 +95,7 @@ impl Learner {
             self.actors.push(actor);
         }
         let deadline = Instant::now() + PATIENCE;
-        while self.receiver.shared().live_actors().len() < self.actors.len() {
+        while self.receiver.state().live_actors().len() < self.actors.len() {
             assert!(
                 Instant::now() < deadline,
                 "not all of {count} actors have come"
@@ -117,7 +117,7 @@ impl Learner {
         let (took, (thread_after, process_after)) = (began.elapsed(), cpu());
         self.take_rest();
 
-        let faults = self.receiver.shared().faults();
+        let faults = self.receiver.state().faults();
         assert!(
             faults
                 .reissued_by_reason()

@@ -21,9 +21,9 @@ use skein_protocol::transition::{RecordFault, TransitionRecord};
 
 use super::assembly::{Assembled, Assembly, SegmentEnd};
 use super::failures::EpisodeFailures;
-use super::faults::{Faults, Refusal, Reissue};
 use super::situation::{EpisodeOut, Situation};
 use crate::episode::CommittedEpisode;
+use crate::faults::{Faults, Refusal, Reissue};
 
 pub use super::failures::HopelessEpisode;
 pub use super::order::{BatchPlace, EpisodeOrder};

@@ -6,26 +6,22 @@
 //! training thread updates the networks, this thread takes in records, issues tickets and sends
 //! heartbeats.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
-use std::sync::{Arc, PoisonError, RwLock};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use skein_protocol::config::Config;
 use skein_protocol::ids::Epoch;
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::stages::StageTimes;
 use skein_protocol::ticket::Ticket;
-use skein_run::failure::with_causes;
 use skein_run::{LearnerIncarnation, RunIdentity};
 use skein_transport::{LearnerPorts, LearnerWaker};
 
-use super::assembly::KeptData;
-use super::dispatcher::{Dispatcher, HopelessEpisode};
-use super::faults::Faults;
+use super::exchange::{Command, ReceiverError, ReceiverState};
+use super::order::KeptData;
 use super::server::Server;
-use super::situation::Situation;
 use crate::episode::CommittedEpisode;
 
 /// Longest time to open the services.
@@ -41,20 +37,8 @@ pub struct EpisodeReceiver {
     commands: Sender<Command>,
     waker: LearnerWaker,
     thread: Option<JoinHandle<()>>,
-    shared: Arc<Shared>,
+    state: Arc<ReceiverState>,
     next_batch: u64,
-}
-
-/// State that the receiving thread shares at any time.
-#[derive(Debug, Default)]
-pub struct Shared {
-    /// Attached actors, in ascending order.
-    live_actors: RwLock<Vec<u32>>,
-    faults: RwLock<Faults>,
-    times: RwLock<StageTimes>,
-    situation: RwLock<Option<(Instant, Situation)>>,
-    /// Reason why the receiving thread ended early.
-    failure: RwLock<Option<ReceiverError>>,
 }
 
 /// Episodes ordered together, taken out in order.
@@ -62,42 +46,7 @@ pub struct Shared {
 pub struct EpisodeBatch {
     episodes: Receiver<CommittedEpisode>,
     remaining: usize,
-    shared: Arc<Shared>,
-}
-
-/// Reason why no episode arrives.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum ReceiverError {
-    /// The run was stopped.
-    #[error("stopped while waiting for episodes")]
-    Stopped,
-    /// No actor can fly an episode, however often it is issued.
-    #[error(transparent)]
-    Hopeless(#[from] HopelessEpisode),
-    /// The transport failed; nothing that was computed is at fault. A new incarnation of the
-    /// learner has a new transport.
-    #[error("the transport failed: {0}")]
-    Transport(String),
-}
-
-impl ReceiverError {
-    fn transport(error: &(dyn std::error::Error + 'static)) -> Self {
-        Self::Transport(with_causes(error))
-    }
-}
-
-/// Commands of the training thread.
-#[derive(Debug)]
-pub(super) enum Command {
-    Publish(Snapshot),
-    Fly {
-        batch: u64,
-        epoch: Epoch,
-        keep: KeptData,
-        tickets: Vec<Ticket>,
-        deliver: Sender<CommittedEpisode>,
-    },
-    Finish,
+    state: Arc<ReceiverState>,
 }
 
 impl EpisodeReceiver {
@@ -113,9 +62,9 @@ impl EpisodeReceiver {
     ) -> Result<Self, ReceiverError> {
         let (commands, inbox) = mpsc::channel();
         let (ready, is_ready) = mpsc::channel();
-        let shared = Arc::new(Shared::default());
+        let state = Arc::new(ReceiverState::default());
         let (thread_identity, thread_config, thread_shared) =
-            (identity.clone(), config.clone(), shared.clone());
+            (identity.clone(), config.clone(), state.clone());
         let thread = thread::Builder::new()
             .name("receiver".to_owned())
             .spawn(move || {
@@ -139,14 +88,14 @@ impl EpisodeReceiver {
             commands,
             waker,
             thread: Some(thread),
-            shared,
+            state,
             next_batch: 0,
         })
     }
 
     /// State that the receiving thread shares at any time.
-    pub fn shared(&self) -> Arc<Shared> {
-        self.shared.clone()
+    pub fn state(&self) -> Arc<ReceiverState> {
+        self.state.clone()
     }
 
     /// Publishes `snapshot` to all actors, including those that attach later.
@@ -182,7 +131,7 @@ impl EpisodeReceiver {
         Ok(EpisodeBatch {
             episodes,
             remaining,
-            shared: self.shared.clone(),
+            state: self.state.clone(),
         })
     }
 
@@ -209,85 +158,12 @@ impl EpisodeReceiver {
     fn send(&self, command: Command) -> Result<(), ReceiverError> {
         self.commands
             .send(command)
-            .map_err(|_| self.shared.failed())?;
+            .map_err(|_| self.state.failed())?;
         if let Err(error) = self.waker.wake() {
             // The thread also looks for commands at every heartbeat.
             tracing::debug!(%error, "receiving thread not woken");
         }
         Ok(())
-    }
-}
-
-impl Shared {
-    /// Numbers of the attached actors, in ascending order.
-    pub fn live_actors(&self) -> Vec<u32> {
-        self.live_actors
-            .read()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone()
-    }
-
-    /// Faults repaired since the learner's start.
-    pub fn faults(&self) -> Faults {
-        *self.faults.read().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Time by stage of the receiving thread and all actors since the learner's start, as last
-    /// reported by each.
-    pub fn times(&self) -> StageTimes {
-        *self.times.read().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Situation at the receiving thread's last heartbeat, and its age; `None` before the first
-    /// heartbeat.
-    pub fn situation(&self) -> Option<(Duration, Situation)> {
-        let situation = self
-            .situation
-            .read()
-            .unwrap_or_else(PoisonError::into_inner);
-        situation
-            .as_ref()
-            .map(|(at, situation)| (at.elapsed(), situation.clone()))
-    }
-
-    /// Reason why the receiving thread has ended. A panic leaves no reason; only a broken transport
-    /// can cause one there.
-    fn failed(&self) -> ReceiverError {
-        let failure = self.failure.read().unwrap_or_else(PoisonError::into_inner);
-        failure.clone().unwrap_or_else(|| {
-            ReceiverError::Transport("the receiving thread has ended".to_owned())
-        })
-    }
-
-    fn fail(&self, error: ReceiverError) {
-        tracing::error!(%error, "receiving thread failed");
-        *self.failure.write().unwrap_or_else(PoisonError::into_inner) = Some(error);
-    }
-
-    pub(super) fn update(&self, dispatcher: &Dispatcher) {
-        let mut live = self
-            .live_actors
-            .write()
-            .unwrap_or_else(PoisonError::into_inner);
-        if !dispatcher
-            .actors()
-            .map(|actor| actor.0)
-            .eq(live.iter().copied())
-        {
-            *live = dispatcher.actors().map(|actor| actor.0).collect();
-        }
-        *self.faults.write().unwrap_or_else(PoisonError::into_inner) = dispatcher.faults();
-    }
-
-    pub(super) fn update_times(&self, times: StageTimes) {
-        *self.times.write().unwrap_or_else(PoisonError::into_inner) = times;
-    }
-
-    pub(super) fn update_situation(&self, situation: Situation, now: Instant) {
-        *self
-            .situation
-            .write()
-            .unwrap_or_else(PoisonError::into_inner) = Some((now, situation));
     }
 }
 
@@ -325,7 +201,7 @@ impl EpisodeBatch {
                     return Ok(Some(episode));
                 }
                 Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => return Err(self.shared.failed().into()),
+                Err(RecvTimeoutError::Disconnected) => return Err(self.state.failed().into()),
             }
         }
         Ok(None)
@@ -338,7 +214,7 @@ fn serve(
     incarnation: LearnerIncarnation,
     config: &Config,
     inbox: &Receiver<Command>,
-    shared: &Shared,
+    state: &ReceiverState,
     ready: &Sender<Result<(), ReceiverError>>,
 ) {
     let ports = match LearnerPorts::open(identity, incarnation, config) {
@@ -350,8 +226,8 @@ fn serve(
         }
     };
     let _ = ready.send(Ok(()));
-    if let Err(error) = Server::new(identity, config, ports).run(inbox, shared) {
-        shared.fail(error);
+    if let Err(error) = Server::new(identity, config, ports).run(inbox, state) {
+        state.fail(error);
     }
     // Waiting threads notice the end of their channel.
 }

@@ -22,7 +22,7 @@ use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_transport::{LearnerPorts, ServiceError};
 
 use super::dispatcher::{BatchPlace, Dispatcher, EpisodeOrder, HopelessEpisode};
-use super::receiver::{Command, ReceiverError, Shared};
+use super::exchange::{Command, ReceiverError, ReceiverState};
 use crate::episode::CommittedEpisode;
 
 /// Time of failures in every round after which the transport is given up.
@@ -105,7 +105,7 @@ impl Server {
     pub(super) fn run(
         &mut self,
         inbox: &Receiver<Command>,
-        shared: &Shared,
+        shared: &ReceiverState,
     ) -> Result<(), ReceiverError> {
         loop {
             match self.take_commands(inbox) {
@@ -173,7 +173,7 @@ impl Server {
         }
     }
 
-    fn take_status(&mut self, now: Instant, shared: &Shared) {
+    fn take_status(&mut self, now: Instant, shared: &ReceiverState) {
         let (mut heard, mut anyone_empty_handed) = (false, false);
         while let Some(record) = self.trouble.unless(self.ports.receive_status()).flatten() {
             heard = true;
@@ -198,7 +198,7 @@ impl Server {
         }
     }
 
-    fn share_times(&self, shared: &Shared) {
+    fn share_times(&self, shared: &ReceiverState) {
         shared.update_times(self.dispatcher.actor_times().plus(self.timer.times()));
     }
 
@@ -279,7 +279,7 @@ impl Server {
         }
     }
 
-    fn send_heartbeat(&mut self, now: Instant, shared: &Shared) {
+    fn send_heartbeat(&mut self, now: Instant, shared: &ReceiverState) {
         let last = self.last_heartbeat;
         if last.is_some_and(|last| now.duration_since(last) < self.heartbeat) {
             return;

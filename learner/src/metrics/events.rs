@@ -3,10 +3,6 @@
 //! An event file is a sequence of framed protocol buffer messages. The two crates that write them
 //! depend on superseded protocol buffer libraries, so the few messages needed are defined here.
 //! Field numbers are those of TensorFlow's `event.proto` and `summary.proto`.
-//!
-//! A frame is `length u64 | masked CRC of length u32 | message | masked CRC of message u32`,
-//! little-endian. The CRC is CRC-32C. Masking rotates it and adds a constant, so that the checksum
-//! of data that contains checksums stays a good one (TensorFlow's `record_writer.h`).
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
@@ -15,9 +11,10 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use prost::Message;
 use serde::{Deserialize, Serialize};
+use skein_run::write_event_record;
 
 use crate::disk::{Disk, PatientWriter};
-use crate::report::notify_user;
+use crate::notice::notify_user;
 
 /// Start of our files' names, before the second of their creation. TensorBoard reads files whose
 /// name contains `tfevents`.
@@ -141,9 +138,11 @@ impl EventWriter {
             what: Some(what),
         };
         let bytes =
-            write_record(&mut self.file, &event.encode_to_vec()).map_err(|source| EventError {
-                path: self.path.clone(),
-                source,
+            write_event_record(&mut self.file, &event.encode_to_vec()).map_err(|source| {
+                EventError {
+                    path: self.path.clone(),
+                    source,
+                }
             })?;
         if let Some(present) = self.files.last_mut() {
             present.bytes += bytes;
@@ -246,22 +245,6 @@ fn now_secs() -> f64 {
         .map_or(0.0, |elapsed| elapsed.as_secs_f64())
 }
 
-/// Writes one record; returns its length.
-fn write_record(into: &mut impl Write, message: &[u8]) -> io::Result<u64> {
-    let length = (message.len() as u64).to_le_bytes();
-    into.write_all(&length)?;
-    into.write_all(&masked_crc(&length).to_le_bytes())?;
-    into.write_all(message)?;
-    into.write_all(&masked_crc(message).to_le_bytes())?;
-    Ok(8 + 4 + message.len() as u64 + 4)
-}
-
-fn masked_crc(bytes: &[u8]) -> u32 {
-    crc32c::crc32c(bytes)
-        .rotate_right(15)
-        .wrapping_add(0xa282_ead8)
-}
-
 #[derive(Clone, PartialEq, Message)]
 struct Event {
     /// Seconds since 1970.
@@ -311,24 +294,15 @@ const SESSION_START: i32 = 1;
 /// Reads back what was written.
 #[cfg(test)]
 pub(super) mod testing {
+    use skein_run::split_event_record;
+
     use super::*;
 
     /// Reads records back, checking every length and checksum.
     pub(in super::super::events) fn read_records(mut bytes: &[u8]) -> Result<Vec<Event>, String> {
         let mut events = Vec::new();
         while !bytes.is_empty() {
-            let (length, rest) = bytes.split_first_chunk::<8>().ok_or("length cut short")?;
-            let (length_crc, rest) = rest.split_first_chunk::<4>().ok_or("checksum cut short")?;
-            if masked_crc(length) != u32::from_le_bytes(*length_crc) {
-                return Err("length damaged".to_owned());
-            }
-            let (message, rest) = rest
-                .split_at_checked(u64::from_le_bytes(*length) as usize)
-                .ok_or("message cut short")?;
-            let (crc, rest) = rest.split_first_chunk::<4>().ok_or("checksum cut short")?;
-            if masked_crc(message) != u32::from_le_bytes(*crc) {
-                return Err("message damaged".to_owned());
-            }
+            let (message, rest) = split_event_record(bytes).map_err(|error| error.to_string())?;
             events.push(Event::decode(message).map_err(|error| error.to_string())?);
             bytes = rest;
         }
@@ -380,17 +354,6 @@ mod tests {
     }
 
     #[test]
-    fn masking_agrees_with_the_published_vector() {
-        // CRC-32C of 32 zero bytes is 8a9136aa (RFC 3720, B.4); rotated right by 15 bits it is
-        // 6d551522.
-        assert_eq!(crc32c::crc32c(&[0; 32]), 0x8a91_36aa);
-        assert_eq!(
-            masked_crc(&[0; 32]),
-            0x6d55_1522_u32.wrapping_add(0xa282_ead8)
-        );
-    }
-
-    #[test]
     fn written_events_read_back() {
         let events = read_records(&sample_file(5)).unwrap();
         let what: Vec<_> = events
@@ -421,16 +384,6 @@ mod tests {
             [5, 5, 7, 8]
         );
         assert!(events.iter().all(|event| event.wall_time > 1.7e9));
-    }
-
-    #[test]
-    fn a_damaged_byte_anywhere_is_noticed() {
-        let sound = sample_file(0);
-        for index in 0..sound.len() {
-            let mut damaged = sound.clone();
-            damaged[index] ^= 0x10;
-            assert!(read_records(&damaged).is_err(), "byte {index}");
-        }
     }
 
     #[test]

@@ -7,6 +7,7 @@
 
 mod episodes;
 mod events;
+mod faults;
 mod scalars;
 mod window;
 
@@ -20,6 +21,7 @@ use crate::episode::CommittedEpisode;
 
 pub use episodes::{EpisodeRow, EpisodesCsv, EpisodesError, EpisodesExtent};
 pub use events::{EventError, EventFile, EventWriter};
+pub use faults::fault_points;
 pub use scalars::Scalar;
 pub use window::MovingAverage;
 

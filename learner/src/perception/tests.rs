@@ -7,12 +7,13 @@ use skein_protocol::snapshot::SnapshotLayout;
 use tch::Device;
 
 use super::*;
-use crate::algorithm::{self, Algorithm};
+use crate::algorithm::{Algorithm, Inputs};
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::noise::Noise;
 use crate::sac::samples::{Transitions, shade};
 use crate::state::TensorValues;
+use crate::trainer::new_algorithm;
 
 const ALGORITHMS: [AlgorithmName; 2] = [AlgorithmName::Sac, AlgorithmName::Td3];
 /// Length of the latent code.
@@ -34,7 +35,7 @@ fn config(algorithm: AlgorithmName) -> Config {
 
 fn new(config: &Config) -> Box<dyn Algorithm> {
     crate::device::use_threads(1);
-    algorithm::new(config, Device::Cpu)
+    new_algorithm(config, Device::Cpu)
 }
 
 fn update(
@@ -180,9 +181,9 @@ fn policy_inputs_carry_no_gradient_and_critic_inputs_do() {
     let critic = Parameters::initialise(layout.clone(), 1, Device::Cpu);
     let target = Parameters::initialise(layout, 2, Device::Cpu);
     let seen = random(3, 1);
-    let inputs = algorithm::Inputs {
+    let inputs = Inputs {
         from_image: Some(LATENT),
-        ..algorithm::Inputs::same(OBSERVATION)
+        ..Inputs::same(OBSERVATION)
     };
     for ahead in [NextStateEncoder::Learned, NextStateEncoder::Target] {
         let mut batch = TensorBatch::new(seen.columns(), inputs, Device::Cpu);

@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use crate::episodes::receiver::Shared;
-use crate::metrics::Scalar;
+use crate::faults::Faults;
+use crate::metrics::{Scalar, fault_points};
 use crate::replay::Replay;
 use crate::trainer::MetricMeans;
 use crate::vae::VaeMetrics;
@@ -28,7 +28,7 @@ impl EpochCurves {
         self,
         duration: Duration,
         replay: &Replay,
-        receiver: &Shared,
+        faults: &Faults,
     ) -> Vec<(Scalar, f64)> {
         let mut points = vec![
             (Scalar::ReplayTransitions, replay.len() as f64),
@@ -38,7 +38,7 @@ impl EpochCurves {
                 self.steps as f64 / duration.as_secs_f64(),
             ),
         ];
-        points.extend(receiver.faults().scalars());
+        points.extend(fault_points(faults));
         if let Some(vae) = self.vae {
             points.extend([
                 (Scalar::VaeLoss, vae.loss.into()),

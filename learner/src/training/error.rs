@@ -8,7 +8,7 @@ use skein_protocol::snapshot::SnapshotError;
 use crate::UpdateError;
 use crate::checkpoint::CheckpointError;
 use crate::device::DeviceError;
-use crate::episodes::receiver::ReceiverError;
+use crate::episodes::ReceiverError;
 use crate::evaluation::EvaluationWriteError;
 use crate::metrics::MetricsError;
 use crate::replay::InsertError;

@@ -24,7 +24,8 @@ use crate::disk::Disk;
 use crate::episodes::receiver::EpisodeReceiver;
 use crate::incarnations::begin_incarnation;
 use crate::metrics::{Metrics, MetricsError};
-use crate::report::{Reporter, notify_user};
+use crate::notice::notify_user;
+use crate::report::Reporter;
 use crate::threads;
 use crate::trainer::Trainer;
 
@@ -71,12 +72,9 @@ impl<'a> Training<'a> {
         };
         let receiver = EpisodeReceiver::start(identity, incarnation, config)?;
         // Started before anything is written, so that waiting for a full disk is reported.
-        let reporter = Reporter::start(
-            first_report(config, &saved),
-            receiver.shared(),
-            disk.clone(),
-        )
-        .map_err(TrainingError::Thread)?;
+        let reporter =
+            Reporter::start(first_report(config, &saved), receiver.state(), disk.clone())
+                .map_err(TrainingError::Thread)?;
         let incarnations = directory.incarnations_csv();
         let resumes = disk
             .with_room(&incarnations, || {
@@ -222,6 +220,7 @@ impl<'a> Training<'a> {
     /// Returns the progress, with the counters that other parts keep.
     fn full_progress(&self) -> TrainingProgress {
         let newest = self.snapshots.get(&self.progress.version());
+        let receiver = self.receiver.state();
         TrainingProgress {
             policy_sha256: newest.map(Snapshot::sha256).unwrap_or_default(),
             environment_steps: self.trainer.steps(),
@@ -232,7 +231,8 @@ impl<'a> Training<'a> {
             spent: self.progress.spent.with_this_incarnation(
                 self.started,
                 self.timer.times(),
-                &self.receiver.shared(),
+                &receiver.times(),
+                &receiver.faults(),
             ),
             ..self.progress.clone()
         }

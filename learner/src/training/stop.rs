@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use super::TrainingError;
-use crate::episodes::receiver::Shared;
+use crate::episodes::ReceiverState;
 
 /// Time for the rest of an epoch's updates after a stop, and for the rest of an episode in
 /// segments. It exceeds what any shipped configuration takes, so everything learned is usually
@@ -33,7 +33,7 @@ impl<'a> StopMonitor<'a> {
     ///
     /// # Errors
     /// [`TrainingError::Abandoned`] when that takes too long, or no actor is there to fly it.
-    pub(super) fn during_episode(&mut self, receiver: &Shared) -> Result<(), TrainingError> {
+    pub(super) fn during_episode(&mut self, receiver: &ReceiverState) -> Result<(), TrainingError> {
         if self.stop.load(Ordering::Relaxed) && receiver.live_actors().is_empty() {
             return Err(TrainingError::Abandoned);
         }

@@ -15,6 +15,7 @@ mod claims;
 mod courses;
 mod directory;
 pub mod durable;
+mod event_records;
 pub mod failure;
 pub mod fault;
 mod identity;
@@ -30,6 +31,7 @@ pub mod tables;
 
 pub use claims::ActorClaim;
 pub use directory::{RunDirectory, RunError};
+pub use event_records::{EventRecordError, split_event_record, write_event_record};
 pub use identity::{Announcement, JoinMismatch, LearnerIncarnation, RunIdentity};
 pub use lock::{LearnerLock, LockError, SupervisorLock};
 pub use presence::Presence;

@@ -1,6 +1,6 @@
 //! Reads every point of every TensorBoard curve of a run, across all its event files.
 //!
-//! The learner writes the same field numbers and frames. Every length and checksum is checked.
+//! Field numbers are those that the learner writes; every length and checksum is checked.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,6 +8,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use prost::Message;
+use skein_run::split_event_record;
 
 /// Values of each curve at each step, in the order of the files. A sound run has one value per
 /// step.
@@ -85,26 +86,9 @@ fn read_file(bytes: &[u8], curves: &mut Curves) -> Result<(), (usize, String)> {
 }
 
 fn take_event(rest: &mut &[u8]) -> Result<Event, String> {
-    let cut = || "truncated".to_owned();
-    let (length, after) = rest.split_first_chunk::<8>().ok_or_else(cut)?;
-    let (length_crc, after) = after.split_first_chunk::<4>().ok_or_else(cut)?;
-    if masked_crc(length) != u32::from_le_bytes(*length_crc) {
-        return Err("the checksum of its length is wrong".to_owned());
-    }
-    let length = usize::try_from(u64::from_le_bytes(*length)).map_err(|_| cut())?;
-    let (message, after) = after.split_at_checked(length).ok_or_else(cut)?;
-    let (crc, after) = after.split_first_chunk::<4>().ok_or_else(cut)?;
-    if masked_crc(message) != u32::from_le_bytes(*crc) {
-        return Err("its checksum is wrong".to_owned());
-    }
+    let (message, after) = split_event_record(rest).map_err(|error| error.to_string())?;
     *rest = after;
     Event::decode(message).map_err(|error| error.to_string())
-}
-
-fn masked_crc(bytes: &[u8]) -> u32 {
-    crc32c::crc32c(bytes)
-        .rotate_right(15)
-        .wrapping_add(0xa282_ead8)
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -131,6 +115,8 @@ struct Value {
 
 #[cfg(test)]
 pub(super) mod samples {
+    use skein_run::write_event_record;
+
     use super::*;
 
     /// Returns an event file with one point per element of `points`: tag, step, value.
@@ -143,11 +129,7 @@ pub(super) mod samples {
             };
             let summary = Some(Summary { value: vec![value] });
             let message = Event { step, summary }.encode_to_vec();
-            let length = (message.len() as u64).to_le_bytes();
-            bytes.extend_from_slice(&length);
-            bytes.extend_from_slice(&masked_crc(&length).to_le_bytes());
-            bytes.extend_from_slice(&message);
-            bytes.extend_from_slice(&masked_crc(&message).to_le_bytes());
+            write_event_record(&mut bytes, &message).expect("a vector takes all bytes");
         }
         bytes
     }

@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 
 use skein_chaos::read_curves;
 use skein_reports::{NamedCourse, RunMaterial, draw_all};
-use skein_run::RunDirectory;
+use skein_run::{RunDirectory, write_event_record};
 use skein_simulator::course::{Course, CourseLayout};
 
 use super::courses::layout;
@@ -60,17 +60,11 @@ pub(super) const CURVES: Target = Target {
     },
 };
 
-/// Returns one message as in an event file: length, masked CRC-32C of the length, message, masked
-/// CRC-32C of the message.
+/// Returns a message as one record of an event file.
 fn framed(message: &[u8]) -> Vec<u8> {
-    let length = (message.len() as u64).to_le_bytes();
-    let masked = |bytes: &[u8]| {
-        crc32c::crc32c(bytes)
-            .rotate_right(15)
-            .wrapping_add(0xa282_ead8)
-            .to_le_bytes()
-    };
-    [&length[..], &masked(&length), message, &masked(message)].concat()
+    let mut record = Vec::new();
+    write_event_record(&mut record, message).expect("a vector takes all bytes");
+    record
 }
 
 /// Returns a step with two values, bare and as a complete file with its frame.

@@ -4,11 +4,9 @@ use std::collections::BTreeMap;
 
 use skein_protocol::transition::RecordFault;
 
-use crate::metrics::Scalar;
-
 macro_rules! reasons {
     ($(#[$doc:meta])* $name:ident {
-        $($(#[$variant_doc:meta])* $variant:ident => $text:literal, $scalar:ident),* $(,)?
+        $($(#[$variant_doc:meta])* $variant:ident => $text:literal),* $(,)?
     }) => {
         $(#[$doc])*
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -22,11 +20,6 @@ macro_rules! reasons {
             pub const fn name(self) -> &'static str {
                 match self { $(Self::$variant => $text),* }
             }
-
-            /// Curve of this reason.
-            pub const fn scalar(self) -> Scalar {
-                match self { $(Self::$variant => Scalar::$scalar),* }
-            }
         }
     };
 }
@@ -36,19 +29,19 @@ reasons! {
     Reissue {
         /// Records of a later ticket of the same actor came first: the ticket or its records were
         /// lost.
-        Skipped => "was skipped", ReissuedSkipped,
+        Skipped => "was skipped",
         /// One of its records was lost.
-        Hole => "has a hole", ReissuedHole,
+        Hole => "has a hole",
         /// Its records are invalid, or the simulator failed.
-        Failed => "failed", ReissuedFailed,
+        Failed => "failed",
         /// It took longer than `transport.episode_deadline_secs`.
-        Late => "took too long", ReissuedLate,
+        Late => "took too long",
         /// Its actor gave no heartbeat for `transport.actor_silence_secs`.
-        Silent => "is silent", ReissuedSilent,
+        Silent => "is silent",
         /// Its actor started another incarnation.
-        Restarted => "restarted", ReissuedRestarted,
+        Restarted => "restarted",
         /// Its actor left.
-        Left => "left", ReissuedLeft,
+        Left => "left",
     }
 }
 
@@ -56,21 +49,21 @@ reasons! {
     /// Reason why a record was refused.
     Refusal {
         /// Its sender is not attached, or a former incarnation.
-        Stranger => "of no living actor", RefusedStranger,
+        Stranger => "of no living actor",
         /// It belongs to no ticket that its actor holds: a record of an episode that was given up.
-        NoTicket => "of no ticket", RefusedNoTicket,
+        NoTicket => "of no ticket",
         /// It does not follow the one before, or belongs to something else.
-        OutOfOrder => "out of order", RefusedOutOfOrder,
+        OutOfOrder => "out of order",
         /// A field has a value that no episode produces.
-        Impossible => "impossible value", RefusedImpossible,
+        Impossible => "impossible value",
         /// A number is infinite or NaN.
-        NotFinite => "not finite", RefusedNotFinite,
+        NotFinite => "not finite",
         /// A number, an action or the episode is larger than possible.
-        TooLarge => "too large", RefusedTooLarge,
+        TooLarge => "too large",
         /// It contradicts itself or the records before it.
-        Contradiction => "contradiction", RefusedContradiction,
+        Contradiction => "contradiction",
         /// A heartbeat is invalid.
-        Status => "status", RefusedStatus,
+        Status => "status",
     }
 }
 
@@ -118,28 +111,28 @@ impl Faults {
 
     /// Number of tickets issued again by reason; reasons that did not occur are left out.
     pub fn reissued_by_reason(&self) -> BTreeMap<String, u64> {
-        occurred(Reissue::ALL.iter().map(|why| why.name()).zip(self.reissued))
+        occurred(
+            self.reissue_counts()
+                .map(|(why, count)| (why.name(), count)),
+        )
     }
 
     /// Number of records refused by reason; reasons that did not occur are left out.
     pub fn refused_by_reason(&self) -> BTreeMap<String, u64> {
-        occurred(Refusal::ALL.iter().map(|why| why.name()).zip(self.refused))
+        occurred(
+            self.refusal_counts()
+                .map(|(why, count)| (why.name(), count)),
+        )
     }
 
-    /// Returns a point for each curve.
-    pub fn scalars(&self) -> Vec<(Scalar, f64)> {
-        let reissued = Reissue::ALL
-            .iter()
-            .map(|why| why.scalar())
-            .zip(self.reissued);
-        let refused = Refusal::ALL
-            .iter()
-            .map(|why| why.scalar())
-            .zip(self.refused);
-        reissued
-            .chain(refused)
-            .map(|(scalar, count)| (scalar, count as f64))
-            .collect()
+    /// Returns the count of each reason to issue a ticket again.
+    pub fn reissue_counts(&self) -> impl Iterator<Item = (Reissue, u64)> {
+        Reissue::ALL.iter().copied().zip(self.reissued)
+    }
+
+    /// Returns the count of each reason to refuse a record.
+    pub fn refusal_counts(&self) -> impl Iterator<Item = (Refusal, u64)> {
+        Refusal::ALL.iter().copied().zip(self.refused)
     }
 }
 
@@ -155,7 +148,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_reason_has_its_own_count_and_curve() {
+    fn every_reason_has_its_own_count() {
         let mut faults = Faults::default();
         for (count, why) in (1..).zip(Reissue::ALL) {
             (0..count).for_each(|_| faults.reissue(*why));
@@ -169,14 +162,5 @@ mod tests {
             faults.refused_by_reason(),
             [("status".to_owned(), 1)].into()
         );
-        let mut tags: Vec<_> = faults
-            .scalars()
-            .iter()
-            .map(|(scalar, _)| scalar.tag())
-            .collect();
-        assert_eq!(tags.len(), Reissue::ALL.len() + Refusal::ALL.len());
-        tags.sort_unstable();
-        tags.dedup();
-        assert_eq!(tags.len(), Reissue::ALL.len() + Refusal::ALL.len());
     }
 }
