@@ -45,8 +45,8 @@ pub enum ActionDistribution {
 }
 
 impl Policy {
-    /// `tensor` returns a parameter by its name in a snapshot (`policy.layer1.weight`, …), as a slice
-    /// in PyTorch's order.
+    /// `tensor` returns a parameter by its name in a snapshot (`policy.layer1.weight`, …), as a
+    /// slice in PyTorch's order.
     ///
     /// # Panics
     /// If a tensor does not have the length of its shape.

@@ -1,7 +1,7 @@
 //! Time to encode an image as images grow: the encoder's four convolutions, one image at a time.
 //!
-//! The system's images have a fixed size. The kernels accept any, so the same layers can be measured
-//! with others.
+//! The system's images have a fixed size. The kernels accept any, so the same layers can be
+//! measured with others.
 
 use std::hint::black_box;
 

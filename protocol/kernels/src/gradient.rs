@@ -156,8 +156,8 @@ impl GradientJob<'_> {
                 } else {
                     Begin::Output
                 };
-                // SAFETY: `gradient` has checked the instructions and all lengths; this member alone
-                // writes its columns.
+                // SAFETY: `gradient` has checked the instructions and all lengths; this member
+                // alone writes its columns.
                 unsafe { do_block(self, terms, scratch, begin) };
             }
         });

@@ -1,13 +1,13 @@
-//! Functions of one number that vectorised loops can call, equal bit for bit on every processor; and
-//! the compilation of such loops for an instruction set.
+//! Functions of one number that vectorised loops can call, equal bit for bit on every processor;
+//! and the compilation of such loops for an instruction set.
 
 use crate::isa::Isa;
 
 /// Returns eˣ within two units in the last place; infinity above 88.72, zero below -87.33, NaN for
 /// NaN.
 ///
-/// x = n ln 2 + r, |r| ≤ ½ ln 2; eʳ by its Taylor polynomial (degree 7: remainder below 1e-8), 2ⁿ by
-/// its bits.
+/// x = n ln 2 + r, |r| ≤ ½ ln 2; eʳ by its Taylor polynomial (degree 7: remainder below 1e-8), 2ⁿ
+/// by its bits.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
     const LN_2_HIGH: f32 = 0.693_359_4;
@@ -53,11 +53,11 @@ pub fn sigmoid(x: f32) -> f32 {
 }
 
 impl Isa {
-    /// Runs `work` compiled for these instructions: its loops are vectorised with them, and `mul_add`
-    /// is one instruction.
+    /// Runs `work` compiled for these instructions: its loops are vectorised with them, and
+    /// `mul_add` is one instruction.
     ///
-    /// `work` and everything it calls must be marked `#[inline(always)]`. Otherwise the compiler may
-    /// keep a long closure outside, compiled for the baseline processor.
+    /// `work` and everything it calls must be marked `#[inline(always)]`. Otherwise the compiler
+    /// may keep a long closure outside, compiled for the baseline processor.
     ///
     /// # Panics
     /// If this machine does not have the instructions.

@@ -47,7 +47,11 @@ proptest! {
 
     #[test]
     fn a_product_is_its_definition_to_the_last_bit(
-        count in 0_usize..40, terms in 1_usize..600, columns in 1_usize..70, way in 0..4, seed in 1_u64..1000,
+        count in 0_usize..40,
+        terms in 1_usize..600,
+        columns in 1_usize..70,
+        way in 0..4,
+        seed in 1_u64..1000,
     ) {
         let (left, right) = (numbers(count * terms, seed), numbers(terms * columns, seed + 1));
         let (bias, gate) = (numbers(columns, seed + 2), numbers(count * columns, seed + 3));
@@ -56,7 +60,10 @@ proptest! {
         } else {
             Matrix::of_rows(&right, terms).transposed()
         };
-        let at = |term: usize, column: usize| if way % 2 == 0 { right[term * columns + column] } else { right[column * terms + term] };
+        let at = |term: usize, column: usize| match way % 2 {
+            0 => right[term * columns + column],
+            _ => right[column * terms + term],
+        };
         let rows: Vec<Vec<f32>> = left.chunks(terms).map(<[f32]>::to_vec).collect();
         let (start, finish) = match way {
             0 => (Start::Zero, Finish::Plain),
@@ -64,7 +71,8 @@ proptest! {
             2 => (Start::Zero, Finish::Gated(&gate)),
             _ => (Start::Bias(&bias), Finish::Plain),
         };
-        let mut expected = defined(&rows, at, columns, |column| if way % 2 == 0 { 0.0 } else { bias[column] });
+        let begin = |column: usize| if way % 2 == 0 { 0.0 } else { bias[column] };
+        let mut expected = defined(&rows, at, columns, begin);
         for (element, gate) in expected.iter_mut().zip(&gate) {
             if way == 1 && *element < 0.0 || way == 2 && *gate <= 0.0 {
                 *element = 0.0;
@@ -82,11 +90,16 @@ proptest! {
 
     #[test]
     fn a_convolution_is_its_definition_and_so_is_its_gradient(
-        height in 1_usize..9, width in 1_usize..9, channels in 1_usize..20, kernel_height in 1_usize..4, kernel_width in 1_usize..4,
-        stride in 1_usize..3, outputs in 1_usize..20, images in 1_usize..4, seed in 1_u64..1000,
+        size in [1_usize..9, 1_usize..9],
+        channels in 1_usize..20,
+        kernel in [1_usize..4, 1_usize..4],
+        stride in 1_usize..3,
+        outputs in 1_usize..20,
+        images in 1_usize..4,
+        seed in 1_u64..1000,
     ) {
-        prop_assume!(kernel_height <= height && kernel_width <= width);
-        let windows = Windows::new([height, width], channels, [kernel_height, kernel_width], stride);
+        prop_assume!(kernel[0] <= size[0] && kernel[1] <= size[1]);
+        let windows = Windows::new(size, channels, kernel, stride);
         let input = numbers(images * windows.image_len(), seed);
         let weights = numbers(outputs * windows.window_len(), seed + 1);
         let grad = numbers(images * windows.count() * outputs, seed + 2);
@@ -96,21 +109,28 @@ proptest! {
             .flat_map(|image| (0..windows.count()).map(move |window| (image, window)))
             .map(|(image, window)| {
                 let (top, left) = (window / across * stride, window % across * stride);
-                let places = (0..kernel_height).flat_map(|y| (0..kernel_width).map(move |x| (y, x)));
-                places.flat_map(|(y, x)| &image[((top + y) * width + left + x) * channels..][..channels]).copied().collect()
+                let places =
+                    (0..kernel[0]).flat_map(|y| (0..kernel[1]).map(move |x| (top + y, left + x)));
+                let pixel = |(y, x)| &image[(y * size[1] + x) * channels..][..channels];
+                places.flat_map(pixel).copied().collect()
             })
             .collect();
         let len = windows.window_len();
-        let expected = defined(&seen, |term, output| weights[output * len + term], outputs, |_| 0.0);
+        let weight = |term: usize, output: usize| weights[output * len + term];
+        let expected = defined(&seen, weight, outputs, |_| 0.0);
         let grad_columns: Vec<Vec<f32>> = (0..outputs)
             .map(|output| grad.iter().skip(output).step_by(outputs).copied().collect())
             .collect();
-        let expected_gradient = defined(&grad_columns, |term, number| seen[term][number], len, |_| 0.0);
+        let number = |term: usize, number: usize| seen[term][number];
+        let expected_gradient = defined(&grad_columns, number, len, |_| 0.0);
         for isa in available() {
             let panels = Panels::of(isa, Matrix::of_rows(&weights, len).transposed());
             let mut output = vec![f32::NAN; expected.len()];
-            for (image, output) in input.chunks(windows.image_len()).zip(output.chunks_mut(windows.count() * outputs)) {
-                product(Rows::Windows(&windows, image), &panels, Start::Zero, Finish::Plain, output);
+            let output_len = windows.count() * outputs;
+            let input_images = input.chunks(windows.image_len());
+            for (image, output) in input_images.zip(output.chunks_mut(output_len)) {
+                let rows = Rows::Windows(&windows, image);
+                product(rows, &panels, Start::Zero, Finish::Plain, output);
             }
             prop_assert_eq!(&output, &expected, "{}", isa);
             let mut found = vec![f32::NAN; expected_gradient.len()];
@@ -126,8 +146,10 @@ proptest! {
                 len,
                 |_| 0.0,
             );
-            let panels = [Isa::Portable, isa].map(|isa| Panels::of(isa, Matrix::of_rows(&weights, len)));
-            for (rows, columns) in output.chunks(windows.count() * outputs).zip(columns.chunks(windows.count() * len)) {
+            let weights = Matrix::of_rows(&weights, len);
+            let panels = [Isa::Portable, isa].map(|isa| Panels::of(isa, weights));
+            let columns = columns.chunks(windows.count() * len);
+            for (rows, columns) in output.chunks(output_len).zip(columns) {
                 let mut added = vec![0.5; windows.image_len()];
                 windows.add_back(isa, 0..windows.count(), columns, &mut added);
                 let [portable, found] = panels.each_ref().map(|panels| {
@@ -137,7 +159,8 @@ proptest! {
                 });
                 prop_assert_eq!(&found, &portable, "{}", isa);
                 for (found, added) in found.iter().zip(&added) {
-                    prop_assert!((found - added).abs() <= 1e-4 * (1.0 + added.abs()), "{} is not {}", found, added);
+                    let apart = (found - added).abs();
+                    prop_assert!(apart <= 1e-4 * (1.0 + added.abs()), "{} is not {}", found, added);
                 }
             }
         }
@@ -145,14 +168,19 @@ proptest! {
 
     #[test]
     fn spread_in_place_is_its_definition_to_the_last_bit(
-        size in [1_usize..8, 1_usize..9], kernel in [1_usize..4, 1_usize..5], stride in 1_usize..4, registers in 1_usize..3,
-        terms in prop_oneof![1_usize..40, 250_usize..300], seed in 1_u64..1000,
+        size in [1_usize..8, 1_usize..9],
+        kernel in [1_usize..4, 1_usize..5],
+        stride in 1_usize..4,
+        registers in 1_usize..3,
+        terms in prop_oneof![1_usize..40, 250_usize..300],
+        seed in 1_u64..1000,
     ) {
         prop_assume!(kernel[0] <= size[0] && kernel[1] <= size[1]);
         let channels = 32 * registers;
         let windows = Windows::new(size, channels, kernel, stride);
         let (len, [_, across]) = (windows.window_len(), windows.positions());
-        let (rows, weights) = (numbers(windows.count() * terms, seed), numbers(terms * len, seed + 1));
+        let rows = numbers(windows.count() * terms, seed);
+        let weights = numbers(terms * len, seed + 1);
         let held = numbers(windows.image_len(), seed + 2);
         // For each number of a window: the terms of all windows in turn, added to the image's
         // content.
@@ -162,7 +190,10 @@ proptest! {
             for (window, row) in rows.chunks(terms).enumerate() {
                 let pixel = (window / across * stride + y) * size[1] + window % across * stride + x;
                 let sum = &mut expected[pixel * channels + number % channels];
-                *sum = row.iter().enumerate().fold(*sum, |sum, (term, left)| left.mul_add(weights[term * len + number], sum));
+                let terms = row.iter().enumerate();
+                *sum = terms.fold(*sum, |sum, (term, left)| {
+                    left.mul_add(weights[term * len + number], sum)
+                });
             }
         }
         for isa in available() {

@@ -113,7 +113,9 @@ macro_rules! of_height {
     };
     (@ $simd:ident, $rows:expr, $function:ident $arguments:tt $($height:literal)*) => {
         match $rows {
-            $($height if $height == $simd::ROWS => of_height!(# $function, $simd, $height, $arguments),)*
+            $($height if $height == $simd::ROWS => {
+                of_height!(# $function, $simd, $height, $arguments)
+            })*
             $($height if $height < $simd::ROWS => $simd::outlined(
                 #[inline(always)]
                 || of_height!(# $function, $simd, $height, $arguments),

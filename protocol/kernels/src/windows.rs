@@ -37,8 +37,8 @@ impl Windows {
             channels > 0
                 && stride > 0
                 && (0..2).all(|axis| (1..=size[axis]).contains(&kernel[axis])),
-            "a kernel of {kernel:?} with stride {stride} does not fit into an image of {size:?} with \
-             {channels} channels"
+            "a kernel of {kernel:?} with stride {stride} does not fit into an image of {size:?} \
+             with {channels} channels"
         );
         let positions = [0, 1].map(|axis| (size[axis] - kernel[axis]) / stride + 1);
         let row_len = size[1] * channels;
@@ -114,8 +114,8 @@ impl Windows {
         self.spans[number / row_len].offset + number % row_len
     }
 
-    /// Adds the numbers of some windows, `[windows, window_len]`, to their places in `image`, kernel
-    /// row by kernel row. The adjoint of reading the windows.
+    /// Adds the numbers of some windows, `[windows, window_len]`, to their places in `image`,
+    /// kernel row by kernel row. The adjoint of reading the windows.
     ///
     /// # Panics
     /// If a length does not match.
