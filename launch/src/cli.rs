@@ -39,7 +39,7 @@ pub(crate) enum Command {
 /// table of how it flew and the paths of everything the run left go to standard output.
 #[derive(Args)]
 pub(crate) struct RunArguments {
-    /// What to train, and how; launch/run_local.sh sets configs/local.toml by default.
+    /// Configuration to train; launch/run_local.sh sets configs/local.toml by default.
     #[arg(
         long,
         value_name = "FILE",
@@ -171,7 +171,7 @@ pub(crate) struct ReportArguments {
     pub(crate) run: PathBuf,
 }
 
-/// What `skein run` is to do.
+/// Task of `skein run`.
 pub(crate) enum Task<'a> {
     New { config: &'a Path, run_dir: &'a Path },
     Resume(&'a Path),

@@ -160,8 +160,8 @@ impl CommittedEpisode {
         view.write(step, into, |step, into| self.write_moment(step, view, into));
     }
 
-    /// Writes the critic's input at the beginning of `step`, `[PRIVILEGED_STATE]`, where the critic sees
-    /// the [ground truth](skein_protocol::config::CriticInput::GroundTruth).
+    /// Writes the critic's input at the beginning of `step`, `[PRIVILEGED_STATE]`, where the critic
+    /// sees the [ground truth](skein_protocol::config::CriticInput::GroundTruth).
     ///
     /// It holds the ground truth, the velocity, the tilt, and the action before, which under
     /// latency has yet to take effect. Each number is roughly within [-2, 2].

@@ -5,36 +5,36 @@
 //! every random draw has its own seed, and nothing depends on which actor flew an episode, or when.
 
 pub mod algorithm;
-pub mod average;
+mod average;
 mod batch;
-pub mod best;
+mod best;
 pub mod checkpoint;
-pub mod curriculum;
+mod curriculum;
 pub mod device;
 pub mod disk;
 pub mod episode;
 pub mod episodes;
 mod error;
-pub mod evaluation;
+mod evaluation;
 pub mod faults;
-pub mod incarnations;
+mod incarnations;
 pub mod metrics;
 mod mirror;
 pub mod networks;
 pub mod noise;
 mod notice;
-pub mod optimizer;
+mod optimizer;
 mod perception;
 pub mod replay;
-pub mod report;
+mod report;
 pub mod sac;
-pub mod spent;
+mod spent;
 pub mod state;
-pub mod td3;
+mod td3;
 pub mod threads;
-pub mod trainer;
+mod trainer;
 pub mod training;
 pub mod vae;
-pub mod watchdog;
+mod watchdog;
 
 pub use error::UpdateError;

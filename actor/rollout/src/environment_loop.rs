@@ -258,7 +258,7 @@ impl PausedEpisode {
 }
 
 /// Returns the simulator in the state in which `ticket` begins, and the actions that led there.
-/// That state is the reset or, for a later segment, the end of the previous one. If this loop does
+/// The state is the reset or, for a later segment, the end of the previous one. If this loop does
 /// not hold that state, it repeats the actions, with the same result.
 fn position_at_start<'a>(
     simulators: &'a mut Simulators,
