@@ -67,17 +67,15 @@ fi
 begin lints
 # In the profile of the tests: both share build scripts and macros. Examples are checked here alone.
 cargo clippy --release --locked --workspace --all-targets -- -D warnings
-# The whole-system tests start the built programs. All three builds have the same settings, so that each crate is compiled once,
-# and once more with its own tests.
+# The whole-system tests start the built programs. Programs, tests and benchmarks are built with the same settings: each crate is
+# compiled once, and once more with its own tests.
 begin "build: programs"
 cargo build --release --locked --workspace --bins
 begin "build: tests"
-# There are no tests in documentation comments.
-cargo test --release --locked --workspace --lib --bins --tests --no-run
-begin "build: benchmarks"
-cargo bench --locked --workspace --benches --no-run
+# --tests leaves out examples, documentation comments (there are no tests in them) and programs without tests.
+cargo test --release --locked --workspace --tests --no-run
 begin tests
-CARGO_TERM_COLOR=never cargo test --release --locked --workspace --lib --bins --tests 2>&1 | tee "$tests"
+CARGO_TERM_COLOR=never cargo test --release --locked --workspace --tests 2>&1 | tee "$tests"
 # Every benchmark, the rare ones too.
-begin benchmarks
+begin "benchmarks, with their build"
 "$repository/tests/bench.sh" --quick --growth

@@ -165,7 +165,7 @@ fn an_experiment_is_interrupted_resumed_reported_and_published() {
         "`replay.success_share=0.0`",
         "non_rectangular",
         "The best snapshot in the suite `few.toml`",
-        "| in any order |     2 |       5 |",
+        "| in any order |     2 |        5 |",
         "| hit wall 1, 2, … | hit the corridor before 1, …, end | timed out before 1, …, end |",
         "How the episodes of the suite `few.toml` ended",
         "2 seeds an arm",
