@@ -7,5 +7,5 @@ help_if_asked skein attach -- "$@" <<END
 launch/attach_actor.sh OPTIONS builds Skein and runs "skein attach" with these options.
 END
 
-build
+build_training
 run_built skein attach "$@"

@@ -27,13 +27,53 @@ help_if_asked() {
     done
 }
 
-# Cargo reads .cargo/config.toml from the directory it is run in; the user's relative paths stay relative to where the user is.
+# Builds what evaluation needs: no libtorch, no learner, no python.
+build_evaluation() {
+    local tool
+    for tool in cargo:"Rust from https://rustup.rs, then open a new shell" cc:"a C compiler, on Debian or Ubuntu with: sudo apt install gcc"; do
+        command -v "${tool%%:*}" >/dev/null || {
+            echo "${tool%%:*} is missing: install ${tool#*:}" >&2
+            exit 1
+        }
+    done
+    cargo_build "building skein-evaluate and what flying needs (about 3 minutes on two cores the first time)" --bin skein-evaluate
+}
+
+# Builds what training needs.
+build_training() {
+    "$repository/launch/setup.sh"
+    cargo_build "building learner, actor and supervisor (about 7 minutes on two cores the first time)" \
+        --bin skein --bin skein-learner --bin skein-actor
+}
+
+# Builds every program.
 build() {
     "$repository/launch/setup.sh"
-    (cd "$repository" && cargo build --release --locked --workspace --bins) || {
+    cargo_build "building all programs (about 8 minutes on two cores the first time)" --bins
+}
+
+# Builds of the workspace what the arguments name; says what and how long only if something is to be done. Always --workspace: a
+# package alone would be built with fewer features of shared packages, and all of them again for the next program.
+cargo_build() {
+    local what=$1 colour=never
+    shift
+    [[ ! -t 2 ]] || colour=always
+    # Cargo reads .cargo/config.toml from the directory it is run in; the user's relative paths stay relative to where the user is.
+    (cd "$repository" && CARGO_TERM_COLOR=$colour cargo build --release --locked --workspace "$@" 2>&1) | say_once "$what" >&2 || {
         echo "the build failed; cargo's messages above say why" >&2
         exit 1
     }
+}
+
+# Copies cargo's messages, after a line that says what is built. Copies nothing if nothing is built.
+say_once() {
+    local what=$1 line
+    while IFS= read -r line; do
+        [[ $line != *Finished* ]] || continue
+        [[ -z $what ]] || printf '%s\n' "$what"
+        what=
+        printf '%s\n' "$line"
+    done
 }
 
 # Where cargo builds. Asked, not assumed: CARGO_TARGET_DIR or the user's own cargo configuration may put it elsewhere.

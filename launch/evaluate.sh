@@ -4,8 +4,8 @@ set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 
 help_if_asked skein-evaluate -- "$@" <<END
-launch/evaluate.sh OPTIONS builds Skein and runs "skein-evaluate" with these options.
+launch/evaluate.sh OPTIONS builds what flying needs and runs "skein-evaluate" with these options.
 END
 
-build
+build_evaluation
 run_built skein-evaluate "$@"

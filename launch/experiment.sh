@@ -7,5 +7,5 @@ help_if_asked skein experiment -- "$@" <<END
 launch/experiment.sh NAME [OPTIONS] builds Skein and runs "skein experiment" with these options.
 END
 
-build
+build_training
 run_built skein experiment --repository "$repository" "$@"

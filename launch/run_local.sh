@@ -8,7 +8,7 @@ launch/run_local.sh [OPTIONS] builds Skein and runs "skein run" with these optio
 trains configs/local.toml in runs/<date>_<time>.
 END
 
-build
+build_training
 for argument in "$@"; do
     if [[ $argument == --resume || $argument == --resume=* ]]; then
         run_built skein run "$@"
