@@ -1,10 +1,10 @@
 //! Starts, watches, restarts, stops and reaps the processes of a run.
 //!
 //! The learner starts first; the actors start once it has reported for the first time. An error
-//! that keeps the learner from starting is therefore printed once, and no actor waits for a
-//! learner that does not come. A process that dies is restarted: a learner resumes from its newest checkpoint, and the
-//! actors stay alive and find it again by themselves. A process that is alive but silent is killed
-//! first.
+//! that keeps the learner from starting is therefore printed once, and no actor waits for a learner
+//! that does not come. A process that dies is restarted: a learner resumes from its newest
+//! checkpoint, and the actors stay alive and find it again by themselves. A process that is alive
+//! but silent is killed first.
 //!
 //! The order of a stop matters. The learner is stopped first, because it abandons the episodes in
 //! the air, saves its state and notifies the actors itself; only actors that still run afterwards
