@@ -13,7 +13,7 @@ const BEGINNING: f32 = 10.0;
 
 /// A moving average of a policy's parameters.
 #[derive(Debug)]
-pub struct PolicyAverage {
+pub(crate) struct PolicyAverage {
     /// Weight of the latest policy.
     weight: f32,
     values: Vec<f32>,
@@ -22,7 +22,7 @@ pub struct PolicyAverage {
 
 impl PolicyAverage {
     /// Starts as the policy of `algorithm`; averages exponentially over about `updates` updates.
-    pub fn new(updates: usize, algorithm: &dyn Algorithm) -> Self {
+    pub(crate) fn new(updates: usize, algorithm: &dyn Algorithm) -> Self {
         let mut values = vec![0.0; algorithm.policy_layout().len()];
         algorithm.publish(&mut values);
         Self {
@@ -33,7 +33,7 @@ impl PolicyAverage {
     }
 
     /// Takes in the policy as an update left it.
-    pub fn take_in(&mut self, algorithm: &dyn Algorithm) {
+    pub(crate) fn take_in(&mut self, algorithm: &dyn Algorithm) {
         algorithm.publish(&mut self.latest);
         let weight = self
             .weight
@@ -47,7 +47,7 @@ impl PolicyAverage {
     ///
     /// # Panics
     /// When `into` is not as long as the policy's part of a snapshot.
-    pub fn publish(&self, into: &mut [f32]) {
+    pub(crate) fn publish(&self, into: &mut [f32]) {
         into.copy_from_slice(&self.values);
     }
 }

@@ -12,7 +12,7 @@ use crate::metrics::MovingAverage;
 /// `true` if the snapshot after `episodes` training episodes is worth confirming. It must be late
 /// enough after the last candidate at `latest`, have a full window, and an average not far below
 /// the best snapshot's.
-pub fn is_candidate(
+pub(crate) fn is_candidate(
     section: &EvaluationSection,
     episodes: u64,
     latest: Option<u64>,
@@ -31,7 +31,7 @@ pub fn is_candidate(
 
 /// `true` if a confirmed candidate replaces the best: more walls passed in confirmation episodes,
 /// or equally many and a better training average.
-pub fn is_better(candidate: &BestSnapshot, best: Option<&BestSnapshot>) -> bool {
+pub(crate) fn is_better(candidate: &BestSnapshot, best: Option<&BestSnapshot>) -> bool {
     best.is_none_or(|best| {
         let rank = |snapshot: &BestSnapshot| {
             (

@@ -14,7 +14,7 @@ use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 const EVALUATION_STRIDE: u64 = 1 << 24;
 
 /// Number of epochs of the whole run; the last one may be shorter.
-pub fn epochs(config: &Config) -> u64 {
+pub(crate) fn epochs(config: &Config) -> u64 {
     config
         .run
         .episodes
@@ -23,7 +23,7 @@ pub fn epochs(config: &Config) -> u64 {
 
 /// Tickets of `epoch`, in episode order. With episodes flown in segments, an epoch is one episode,
 /// and `flown` holds the actions of its segments so far, from the reset on.
-pub fn training(
+pub(crate) fn training(
     config: &Config,
     run: RunId,
     epoch: Epoch,
@@ -54,7 +54,7 @@ pub fn training(
 ///
 /// Episode i has the same seed on every course and in every evaluation, so that snapshots are
 /// compared on the same starts. `evaluation` numbers the evaluations of a run.
-pub fn evaluation(
+pub(crate) fn evaluation(
     config: &Config,
     run: RunId,
     evaluation: u64,
@@ -80,7 +80,7 @@ pub fn evaluation(
 
 /// Tickets of the confirmation episodes for a candidate. Generated courses are the same for every
 /// candidate, and training never uses them.
-pub fn confirmation(
+pub(crate) fn confirmation(
     config: &Config,
     run: RunId,
     number: u64,

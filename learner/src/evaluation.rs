@@ -64,7 +64,7 @@ struct TrajectoryRow<'a> {
 ///
 /// # Errors
 /// [`EvaluationWriteError`] names the file.
-pub fn write_report(
+pub(crate) fn write_report(
     directory: &RunDirectory,
     config: &Config,
     policy_version: PolicyVersion,
@@ -143,7 +143,7 @@ fn write_trajectory(
 ///
 /// # Errors
 /// [`EvaluationWriteError`] names the file.
-pub fn write_reconstructions(
+pub(crate) fn write_reconstructions(
     directory: &RunDirectory,
     trainer: &mut Trainer,
     episodes: &[CommittedEpisode],

@@ -14,7 +14,7 @@ const HEADER: &str = "incarnation,unix_secs,episodes\n";
 ///
 /// # Errors
 /// Errors of the file system.
-pub fn begin_incarnation(path: &Path, episodes: u64) -> io::Result<u64> {
+pub(crate) fn begin_incarnation(path: &Path, episodes: u64) -> io::Result<u64> {
     let mut text = match fs::read_to_string(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => HEADER.to_owned(),
         Err(error) if error.kind() == io::ErrorKind::InvalidData => {

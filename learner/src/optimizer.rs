@@ -14,7 +14,7 @@ const EPSILON: f64 = 1e-8;
 /// Adam with its usual constants, β₁ = 0.9, β₂ = 0.999, ε = 1e-8 (Kingma and Ba 2015,
 /// arXiv:1412.6980, algorithm 1).
 #[derive(Debug)]
-pub struct Adam {
+pub(crate) struct Adam {
     learning_rate: f64,
     first_moment: Tensor,
     second_moment: Tensor,
@@ -25,7 +25,7 @@ pub struct Adam {
 
 impl Adam {
     /// Starts an optimizer for a vector like `parameters`.
-    pub fn new(parameters: &Tensor, learning_rate: f64) -> Self {
+    pub(crate) fn new(parameters: &Tensor, learning_rate: f64) -> Self {
         let zeros = || parameters.zeros_like();
         Self {
             learning_rate,
@@ -36,12 +36,12 @@ impl Adam {
     }
 
     /// Number of steps done so far.
-    pub fn steps(&self) -> u64 {
+    pub(crate) fn steps(&self) -> u64 {
         self.steps.int64_value(&[0]).unsigned_abs()
     }
 
     /// Makes one step of `parameters` against `gradient`, both of the shape given to [`Adam::new`].
-    pub fn step(&mut self, parameters: &mut Tensor, gradient: &Tensor) {
+    pub(crate) fn step(&mut self, parameters: &mut Tensor, gradient: &Tensor) {
         let _guard = no_grad_guard();
         self.steps += 1;
         let steps = self.steps() as f64;
@@ -62,7 +62,7 @@ impl Adam {
     }
 
     /// The state, under names that begin with `prefix`.
-    pub fn parts(&mut self, prefix: &str) -> Vec<(String, StatePart<'_>)> {
+    pub(crate) fn parts(&mut self, prefix: &str) -> Vec<(String, StatePart<'_>)> {
         [
             ("first_moment", &self.first_moment),
             ("second_moment", &self.second_moment),

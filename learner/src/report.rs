@@ -22,7 +22,7 @@ const RATE_INTERVALS: usize = 10;
 
 /// Prints the learner's progress at intervals, whatever the training thread is doing.
 #[derive(Debug)]
-pub struct Reporter {
+pub(crate) struct Reporter {
     progress: Arc<Mutex<ProgressReport>>,
     ended: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -34,7 +34,7 @@ impl Reporter {
     ///
     /// # Errors
     /// When the system grants no thread.
-    pub fn start(
+    pub(crate) fn start(
         progress: ProgressReport,
         receiver: Arc<ReceiverState>,
         disk: Disk,
@@ -53,7 +53,7 @@ impl Reporter {
     }
 
     /// Changes the contents of the next line.
-    pub fn update(&self, change: impl FnOnce(&mut ProgressReport)) {
+    pub(crate) fn update(&self, change: impl FnOnce(&mut ProgressReport)) {
         change(&mut self.progress.lock().unwrap_or_else(PoisonError::into_inner));
     }
 }

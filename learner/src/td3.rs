@@ -25,7 +25,7 @@ use crate::state::{StatePart, Stateful};
 
 /// Policy and critic, their target networks, and their optimizers.
 #[derive(Debug)]
-pub struct Td3 {
+pub(crate) struct Td3 {
     inputs: Inputs,
     settings: Td3Section,
     device: Device,
@@ -43,7 +43,7 @@ pub struct Td3 {
 
 impl Td3 {
     /// Returns untrained networks; their parameters depend on the run's seed alone.
-    pub fn new(section: &Td3Section, inputs: Inputs, run_seed: u64, device: Device) -> Self {
+    pub(crate) fn new(section: &Td3Section, inputs: Inputs, run_seed: u64, device: Device) -> Self {
         let width = section.hidden_width as i64;
         let mut layout = Layout::default();
         let policy = Policy::with_outputs(&mut layout, inputs.policy as i64, width, ACTION as i64);

@@ -58,7 +58,7 @@ pub enum TrainerRestoreError {
 
 /// Networks and replay buffer.
 #[derive(Debug)]
-pub struct Trainer {
+pub(crate) struct Trainer {
     config: Config,
     layout: SnapshotLayout,
     /// Threads of the native engine.
@@ -97,7 +97,7 @@ impl Trainer {
     ///
     /// # Errors
     /// [`DeviceError`] when the configured device does not exist.
-    pub fn new(config: &Config) -> Result<Self, DeviceError> {
+    pub(crate) fn new(config: &Config) -> Result<Self, DeviceError> {
         device::use_threads(config.run.learner_threads);
         let device = device::open(config.run.device)?;
         let engine = config.policy_engine();
@@ -134,7 +134,7 @@ impl Trainer {
     ///
     /// # Errors
     /// [`TrainerRestoreError`] names what does not fit; do not use the trainer then.
-    pub fn restore(
+    pub(crate) fn restore(
         &mut self,
         progress: &TrainingProgress,
         tensors: &[NamedTensor],
@@ -167,32 +167,32 @@ impl Trainer {
     }
 
     /// Environment steps learned from so far.
-    pub fn steps(&self) -> u64 {
+    pub(crate) fn steps(&self) -> u64 {
         self.steps
     }
 
     /// Policy updates done so far.
-    pub fn updates(&self) -> u64 {
+    pub(crate) fn updates(&self) -> u64 {
         self.algorithm.updates()
     }
 
     /// Policy updates and VAE steps done so far.
-    pub fn all_updates(&self) -> u64 {
+    pub(crate) fn all_updates(&self) -> u64 {
         self.updates() + self.vae_updates()
     }
 
     /// VAE steps done so far.
-    pub fn vae_updates(&self) -> u64 {
+    pub(crate) fn vae_updates(&self) -> u64 {
         self.vae.as_ref().map_or(0, Vae::updates)
     }
 
     /// The replay buffer.
-    pub fn replay(&self) -> &Replay {
+    pub(crate) fn replay(&self) -> &Replay {
         &self.replay
     }
 
     /// Exploration of the next episodes to be ordered.
-    pub fn exploration(&self) -> Exploration {
+    pub(crate) fn exploration(&self) -> Exploration {
         if self.steps < self.config.learning.warmup_steps as u64 {
             Exploration::Uniform
         } else {
@@ -201,7 +201,7 @@ impl Trainer {
     }
 
     /// Data to keep of the next episodes to be ordered.
-    pub fn keep(&self) -> KeptData {
+    pub(crate) fn keep(&self) -> KeptData {
         match self.has_images() || self.config.learning.mirror {
             true => KeptData::Depth,
             false => KeptData::Latents,
@@ -218,7 +218,7 @@ impl Trainer {
     ///
     /// # Errors
     /// [`InsertError`] when the episode's parts do not fit together.
-    pub fn take_in(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
+    pub(crate) fn take_in(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
         let learning = &self.config.learning;
         let mirrored = learning.mirror.then(|| episode.mirrored());
         // With policy lag, some episodes arrive after the freeze that were flown with an older
@@ -261,7 +261,7 @@ impl Trainer {
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; any error of `after_each`.
-    pub fn train_vae<E: From<UpdateError>>(
+    pub(crate) fn train_vae<E: From<UpdateError>>(
         &mut self,
         version: PolicyVersion,
         timer: &mut LapTimer,
@@ -344,7 +344,7 @@ impl Trainer {
     ///
     /// # Errors
     /// [`UpdateError`] when a number is no longer finite; any error of `after_each`.
-    pub fn train_policy<E: From<UpdateError>>(
+    pub(crate) fn train_policy<E: From<UpdateError>>(
         &mut self,
         version: PolicyVersion,
         timer: &mut LapTimer,
@@ -379,7 +379,7 @@ impl Trainer {
     }
 
     /// Returns the parameters that actors fly with, as they are now.
-    pub fn snapshot(&self, version: PolicyVersion) -> Snapshot {
+    pub(crate) fn snapshot(&self, version: PolicyVersion) -> Snapshot {
         let mut values = vec![0.0; self.layout.values()];
         let encoder = &mut values[self.layout.encoder()];
         match &self.vae {
@@ -395,7 +395,7 @@ impl Trainer {
     }
 
     /// Returns the VAE's reconstruction of `images`, both `[n, 72, 128]` u8; `None` without a VAE.
-    pub fn reconstruct(&mut self, images: &[u8]) -> Option<Vec<u8>> {
+    pub(crate) fn reconstruct(&mut self, images: &[u8]) -> Option<Vec<u8>> {
         let depth = self.vae.as_mut()?.reconstruct(images).into_iter();
         Some(
             depth
@@ -405,7 +405,7 @@ impl Trainer {
     }
 
     /// Copies all tensors that updates change.
-    pub fn tensors(&mut self) -> Vec<NamedTensor> {
+    pub(crate) fn tensors(&mut self) -> Vec<NamedTensor> {
         let mut all = self
             .vae
             .as_mut()
@@ -446,7 +446,7 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
 
 /// MetricMeans of the metrics of an epoch's updates.
 #[derive(Debug, Default)]
-pub struct MetricMeans {
+pub(crate) struct MetricMeans {
     sums: Vec<(Scalar, f64)>,
     count: usize,
 }
@@ -463,7 +463,7 @@ impl MetricMeans {
     }
 
     /// Returns the means; empty if there was no update.
-    pub fn finish(self) -> Vec<(Scalar, f64)> {
+    pub(crate) fn finish(self) -> Vec<(Scalar, f64)> {
         let mean = |(scalar, sum)| (scalar, sum / self.count as f64);
         self.sums.into_iter().map(mean).collect()
     }

@@ -15,7 +15,7 @@ const RECEIVER_PATIENCE: Duration = Duration::from_secs(20);
 
 /// Examines every progress report.
 #[derive(Debug)]
-pub struct Watchdog {
+pub(crate) struct Watchdog {
     done: Option<WorkDone>,
     /// Time at which this state was first seen.
     since: Instant,
@@ -36,7 +36,7 @@ struct WorkDone {
 
 impl Watchdog {
     /// Starts at `now`, with nothing seen yet.
-    pub fn new(now: Instant) -> Self {
+    pub(crate) fn new(now: Instant) -> Self {
         Self {
             done: None,
             since: now,
@@ -47,7 +47,7 @@ impl Watchdog {
     /// Returns what is waited for, if nothing has moved for a while. `obstacle`: a known obstacle
     /// to the training thread. `receiver`: age and content of the receiving thread's last
     /// heartbeat.
-    pub fn look(
+    pub(crate) fn look(
         &mut self,
         now: Instant,
         progress: &ProgressReport,

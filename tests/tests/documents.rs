@@ -1,5 +1,10 @@
 //! Documents that stay true: links, named files and symbols, commands and settings in them exist.
 
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
+
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -146,8 +146,8 @@ proptest! {
         mount_pitch_deg in -30.0f32..30.0,
     ) {
         let course = Course::generate(seed, &GeneratorRanges::default()).unwrap();
-        let lens = lens_in_the_middle();
-        let settings = CameraSettings { horizontal_fov_deg, mount_pitch_deg, ..lens };
+        let middle = lens_in_the_middle();
+        let settings = CameraSettings { horizontal_fov_deg, mount_pitch_deg, ..middle };
         let world_from_body = pose(lens(&course, wall, spot, share), quaternion);
         let comparison = compare(&course, &settings, &world_from_body);
         prop_assert!(comparison.wrong.is_empty(), "{:?}", comparison.wrong);
