@@ -61,7 +61,7 @@ pub(super) fn attach(
 fn status(actor: u32, incarnation: ActorIncarnation) -> ActorStatus {
     ActorStatus {
         actor: ActorId(actor),
-        incarnation: incarnation,
+        incarnation,
         pid: 1,
         state: ActorState::Serving,
         newest_policy: None,
