@@ -206,6 +206,6 @@ mod tests {
             .unwrap()
             .replace("seed = 1", "seed = 2");
         fs::write(run.config(), text).unwrap();
-        assert!(refusal(run.root()).contains("was changed"));
+        assert!(refusal(run.root()).contains("has changed since the run was started"));
     }
 }

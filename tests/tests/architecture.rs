@@ -212,7 +212,6 @@ fn confined_dependencies_are_found_where_they_belong() {
         ("skein-transport", "iceoryx2-bb-posix"),
         ("skein-learner", "tokio"),
         ("skein-rollout", "rapier3d"),
-        ("skein-protocol", "iceoryx2"),
         ("skein-actor", "rapier3d"),
         ("skein-reports", "plotters"),
     ] {

@@ -219,7 +219,7 @@ fn a_segment_that_is_too_short_or_too_long_or_of_a_whole_episode_is_refused() {
         refusal(&[onward(1), onward(2), onward(3)], segment(None))
             .contains("after the segment's last")
     );
-    assert!(refusal(&[onward(0)], segment(None)).contains("step is 0 where 1"));
+    assert!(refusal(&[onward(0)], segment(None)).contains("step is 0, expected 1"));
     assert!(refusal(&[segment_end(1)], segment(None)).contains("before its last step"));
     assert!(
         refusal(&[onward(0), segment_end(1)], assembly(KeptData::Latents)).contains("flown whole")
