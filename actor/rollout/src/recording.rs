@@ -470,7 +470,7 @@ mod tests {
         assert_eq!(values::<u32>(&names)[9], 0xe4);
         let (header, names) = array(&file, "reward_term_names");
         assert!(
-            header.contains("'<U11'") && header.contains("(4,)"),
+            header.contains("'<U11'") && header.contains(&format!("({REWARD_TERMS},)")),
             "{header}"
         );
         let letters: String = values::<u32>(&names)

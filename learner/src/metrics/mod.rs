@@ -303,21 +303,19 @@ mod tests {
         let (_directory, run) = run();
         let mut metrics = metrics(&run, new());
         let mut episode = samples::episode(0, 2, Outcome::Collided);
-        episode.reward_terms = vec![[-1.0, 0.5, 0.0, 0.25], [0.0, 0.5, 2.0, 0.25]];
+        let of_step = |step: f32| std::array::from_fn(|index| step * (index as f32 + 1.0));
+        episode.reward_terms = vec![of_step(1.0), of_step(-4.0)];
         metrics.episode(&episode).unwrap();
         metrics.flush().unwrap();
         let parts = points(&run)
             .into_iter()
             .filter(|(tag, ..)| tag.starts_with("reward/"))
             .map(|(tag, _, bits)| (tag, f32::from_bits(bits)));
-        let expected = [
-            ("collision", -1.0),
-            ("destination", 2.0),
-            ("level_up", 1.0),
-            ("open_view", 0.5),
-        ];
-        let expected = expected.map(|(name, part)| (format!("reward/{name}"), part));
-        assert_eq!(parts.collect::<Vec<_>>(), expected);
+        let expected: std::collections::BTreeMap<_, _> = (1u8..)
+            .zip(REWARD_TERM_NAMES)
+            .map(|(number, name)| (format!("reward/{name}"), -3.0 * f32::from(number)))
+            .collect();
+        assert!(parts.eq(expected));
     }
 
     #[test]
@@ -345,6 +343,6 @@ mod tests {
         let mut second = metrics(&run, state);
         feed(&mut second, 3..6);
         assert_eq!(second.files().len(), 2);
-        assert_eq!(points(&run).len(), 3 * 9);
+        assert_eq!(points(&run).len(), 3 * (5 + REWARD_TERMS));
     }
 }
