@@ -458,6 +458,26 @@ fn mirrored_transitions_make_no_update_due() {
 }
 
 #[test]
+fn mirrored_or_not_an_episode_of_an_older_encoder_is_encoded_again() {
+    for lag in [0, 1] {
+        let mut config = config();
+        config.learning.mirror = true;
+        config.learning.observation = Observation::LatentVelocityAction;
+        config.learning.policy_lag = lag;
+        config.replay.capacity = 1000;
+        let mut trainer = Trainer::new(&config).unwrap();
+        // Frozen after the third epoch. With a lag, the fourth was flown before that; without one,
+        // its codes are the actors' and are believed.
+        (0..4).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
+        assert_eq!(
+            all_codes_are_the_encoders(&trainer, 4),
+            lag > 0,
+            "lag {lag}"
+        );
+    }
+}
+
+#[test]
 fn a_restored_trainer_does_not_recode_before_it_is_due() {
     let mut config = config();
     (config.vae.recode_steps, config.vae.train_steps) = (2 * STEPS, 100 * STEPS);
