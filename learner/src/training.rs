@@ -197,9 +197,9 @@ impl Training<'_> {
             .retain(|version, _| needed.contains(&version.0));
     }
 
-    /// Orders the next epoch's episodes, if they are not ordered yet, with the newest snapshot. With
-    /// policy lag 1, also those of the epoch after it: they are flown with the present snapshot
-    /// while the next epoch is learned from.
+    /// Orders the next epoch's episodes, if they are not ordered yet, with the newest snapshot.
+    /// With policy lag 1, also those of the epoch after it: they are flown with the present
+    /// snapshot while the next epoch is learned from.
     fn order_ahead(&mut self) -> Result<(), TrainingError> {
         let end = self.progress.epochs + 1 + self.config.learning.policy_lag;
         let end = end.min(curriculum::epochs(self.config));

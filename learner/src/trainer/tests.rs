@@ -393,7 +393,7 @@ fn stored_codes_are_recomputed_as_often_as_configured_while_the_vae_is_trained()
 /// Steps, policy updates and VAE steps so far, exploration and data of the next orders.
 type Due = (u64, u64, u64, Exploration, KeptData);
 
-/// What is due before the first and after each of four epochs.
+/// Counts and choices before the first and after each of four epochs.
 fn due(config: &Config) -> Vec<Due> {
     let mut trainer = Trainer::new(config).unwrap();
     let now = |trainer: &Trainer| {

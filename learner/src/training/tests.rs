@@ -1,4 +1,4 @@
-//! What is due when between two epochs, and what is on disk after a stop.
+//! Work due between two epochs, and the files after a stop.
 
 use skein_protocol::transition::Outcome;
 use skein_run::LearnerLock;
