@@ -11,7 +11,7 @@ use skein_learner::replay::{Minibatch, Replay};
 use skein_protocol::config::{Config, Observation};
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, MAX_LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, MAX_LATENT, REWARD_TERMS};
 
 /// Transitions per minibatch.
 const BATCH: usize = 256;
@@ -79,7 +79,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedEpisode {
             .collect(),
         actions: (0..STEPS).map(|_| [draw(), draw()]).collect(),
         rewards: (0..STEPS).map(|_| draw()).collect(),
-        reward_terms: vec![[0.0; 4]; STEPS],
+        reward_terms: vec![[0.0; REWARD_TERMS]; STEPS],
         level_up: (0..STEPS).map(|step| step % STEPS_PER_WALL == 0).collect(),
         outcome: Some(Outcome::Collided),
         walls_passed: 0,

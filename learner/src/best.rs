@@ -77,6 +77,29 @@ mod tests {
     }
 
     #[test]
+    fn an_average_below_the_bests_is_near_enough_up_to_the_margin() {
+        let section = EvaluationSection {
+            candidate_margin: 0.25,
+            ..EvaluationSection::default()
+        };
+        let is = |mean| {
+            let best = best(2.0, 3.0);
+            is_candidate(&section, 200, Some(50), &window(mean, 50), Some(&best))
+        };
+        assert_eq!([1.5, 1.75, 1.875, 2.5].map(is), [false, true, true, true]);
+    }
+
+    #[test]
+    fn a_candidate_is_due_every_so_many_episodes_after_the_last() {
+        let section = EvaluationSection {
+            every_episodes: 30,
+            ..EvaluationSection::default()
+        };
+        let is = |episodes| is_candidate(&section, episodes, Some(50), &window(1.0, 50), None);
+        assert_eq!([79, 80, 81].map(is), [false, true, true]);
+    }
+
+    #[test]
     fn evaluation_episodes_decide_and_training_episodes_break_ties() {
         assert!(is_better(&best(1.0, 3.0), None));
         assert!(is_better(&best(1.0, 3.5), Some(&best(2.0, 3.0))));

@@ -8,7 +8,7 @@
 use skein_protocol::config::ObservationLayout;
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
+use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode, REWARD_TERMS};
 
 /// Observation and pose of the vehicle at the beginning of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -62,7 +62,7 @@ pub struct CommittedEpisode {
     /// Rewards, `[T]`.
     pub rewards: Vec<f32>,
     /// Terms of each reward: collision, level-up, destination, open view; `[T]`.
-    pub reward_terms: Vec<[f32; 4]>,
+    pub reward_terms: Vec<[f32; REWARD_TERMS]>,
     /// `true` where the step crossed a wall or reached the destination; `[T]`.
     pub level_up: Vec<bool>,
     /// Outcome of the episode; `None` for a segment whose episode continues.
@@ -258,7 +258,7 @@ pub(crate) mod samples {
                 .map(|step| [at(step) / 1e6, -at(step) / 1e6])
                 .collect(),
             rewards: (0..steps).map(|step| at(step) / 100.0).collect(),
-            reward_terms: vec![[0.0; 4]; steps],
+            reward_terms: vec![[0.0; REWARD_TERMS]; steps],
             level_up: vec![false; steps],
             outcome: Some(outcome),
             walls_passed: 0,

@@ -16,7 +16,7 @@ pub mod episode;
 pub mod episodes;
 mod error;
 mod evaluation;
-pub mod faults;
+mod faults;
 mod incarnations;
 pub mod metrics;
 mod mirror;

@@ -277,8 +277,8 @@ impl Trainer {
         let section = &self.config.vae;
         let counted = self.steps.min(section.train_steps as u64);
         let due = (counted as f64 * section.updates_per_step) as u64;
-        let mut rng = rng(&self.config, Purpose::VaeBatches, version);
-        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::VaeNoise, version.0));
+        let purposes = (Purpose::VaeBatches, Purpose::VaeNoise);
+        let (mut rng, mut noise) = draws(&self.config, purposes, version);
         let (mut images, mut last) = (Vec::new(), None);
         while vae.updates() < due {
             self.replay
@@ -354,12 +354,8 @@ impl Trainer {
         let learning = &self.config.learning;
         let counted = self.steps.saturating_sub(learning.warmup_steps as u64);
         let due = (counted as f64 * learning.updates_per_step) as u64;
-        let mut rng = rng(&self.config, Purpose::PolicyBatches, version);
-        let mut noise = Noise::new(derive(
-            self.config.run.seed,
-            Purpose::PolicyNoise,
-            version.0,
-        ));
+        let purposes = (Purpose::PolicyBatches, Purpose::PolicyNoise);
+        let (mut rng, mut noise) = draws(&self.config, purposes, version);
         let mut minibatch = Minibatch::default();
         while self.algorithm.updates() < due {
             self.replay
@@ -422,8 +418,18 @@ impl Trainer {
     }
 }
 
-fn rng(config: &Config, purpose: Purpose, version: PolicyVersion) -> Pcg64Mcg {
-    Pcg64Mcg::seed_from_u64(derive(config.run.seed, purpose, version.0))
+/// Returns what the updates that start from snapshot `version` draw their minibatches and their
+/// noise with.
+fn draws(
+    config: &Config,
+    (batches, noise): (Purpose, Purpose),
+    version: PolicyVersion,
+) -> (Pcg64Mcg, Noise) {
+    let seed = |purpose| derive(config.run.seed, purpose, version.0);
+    (
+        Pcg64Mcg::seed_from_u64(seed(batches)),
+        Noise::new(seed(noise)),
+    )
 }
 
 fn columns(minibatch: &Minibatch) -> Columns<'_> {

@@ -13,6 +13,8 @@ mod curves;
 mod error;
 mod saving;
 mod stop;
+#[cfg(test)]
+mod tests;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -66,6 +68,8 @@ struct Training<'a> {
     progress: TrainingProgress,
     /// Progress in the newest checkpoint.
     saved: TrainingProgress,
+    /// Snapshots in the newest checkpoint.
+    saved_snapshots: BTreeMap<PolicyVersion, Snapshot>,
     /// Number of earlier incarnations of the learner.
     resumes: u64,
     /// Epochs or segments that are ordered but not learned from.
@@ -129,9 +133,7 @@ impl Training<'_> {
         self.confirm_if_candidate()?;
         while self.progress.epochs < epochs {
             let epoch = self.progress.epochs;
-            // With policy lag 1, the next epoch is flown with the present snapshot while this one
-            // is learned from.
-            self.order_until(epochs.min(epoch + 1 + self.config.learning.policy_lag))?;
+            self.order_ahead()?;
             self.learn_from_flown()?;
             while self.open_episode.is_some() {
                 // The rest of the episode is flown with what its last segment taught.
@@ -158,12 +160,17 @@ impl Training<'_> {
         let before = self.trainer.all_updates();
         self.train_vae()?;
         self.train_policy()?;
-        // After a segment without updates, the present snapshot stays in use.
-        if self.open_episode.is_none() || self.trainer.all_updates() > before {
-            self.progress.version += 1;
-            self.publish()?;
+        self.publish_if_due(self.trainer.all_updates() > before)
+    }
+
+    /// Publishes the next version. After a segment without updates, the present snapshot stays in
+    /// use.
+    fn publish_if_due(&mut self, is_updated: bool) -> Result<(), TrainingError> {
+        if self.open_episode.is_some() && !is_updated {
+            return Ok(());
         }
-        Ok(())
+        self.progress.version += 1;
+        self.publish()
     }
 
     /// Publishes the present parameters.
@@ -190,9 +197,12 @@ impl Training<'_> {
             .retain(|version, _| needed.contains(&version.0));
     }
 
-    /// Orders the episodes of all epochs before `end` that are not ordered yet, with the newest
-    /// snapshot.
-    fn order_until(&mut self, end: u64) -> Result<(), TrainingError> {
+    /// Orders the next epoch's episodes, if they are not ordered yet, with the newest snapshot.
+    /// With policy lag 1, also those of the epoch after it: they are flown with the present
+    /// snapshot while the next epoch is learned from.
+    fn order_ahead(&mut self) -> Result<(), TrainingError> {
+        let end = self.progress.epochs + 1 + self.config.learning.policy_lag;
+        let end = end.min(curriculum::epochs(self.config));
         let first = self
             .in_flight
             .back()

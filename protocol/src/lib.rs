@@ -33,6 +33,12 @@ pub const IMAGE_PIXELS: usize = IMAGE_WIDTH * IMAGE_HEIGHT;
 pub const MAX_LATENT: usize = 64;
 /// Room for a latent code of any length. Values after a shorter code are zero.
 pub type LatentCode = [f32; MAX_LATENT];
+/// Names of the reward's terms, in the order of their sum: those of the simulator's
+/// `reward_terms!`, which `skein-rollout` holds equal to these when it is compiled. Curves are
+/// called `reward/NAME`.
+pub const REWARD_TERM_NAMES: [&str; 4] = ["collision", "level_up", "destination", "open_view"];
+/// Number of the reward's terms.
+pub const REWARD_TERMS: usize = REWARD_TERM_NAMES.len();
 /// Length of an action: lateral and vertical velocity, each in [-1, 1].
 pub const ACTION: usize = 2;
 /// Length of the simulator's ground truth, [`transition::TransitionRecord::ground_truth`].
@@ -45,15 +51,17 @@ pub const PRIVILEGED_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
 /// arXiv:1812.05905).
 pub const LOG_STD: (f32, f32) = (-20.0, 2.0);
 
-/// Returns the sizes of the records on the wire. Processes with equal sizes can read each other's
-/// records.
+/// Returns the sizes of the records on the wire, and the reward's terms. Processes in which all are
+/// equal can read each other's records.
 pub fn record_layout() -> String {
     format!(
-        "transition {} control {} segment {} status {} snapshot header {}",
+        "transition {} control {} segment {} status {} snapshot header {} \
+         reward {}",
         size_of::<transition::TransitionRecord>(),
         size_of::<ticket::ControlRecord>(),
         size_of::<segment::SegmentRecord>(),
         size_of::<status::StatusRecord>(),
         size_of::<snapshot::SnapshotHeader>(),
+        REWARD_TERM_NAMES.join("+"),
     )
 }

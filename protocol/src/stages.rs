@@ -93,7 +93,8 @@ stages! {
         SampleImages => "sample images",
         /// An update of the VAE. Updates.
         VaeStep => "VAE step",
-        /// Stored latent codes are recomputed by the trained VAE. Once.
+        /// Stored latent codes are recomputed with the present encoder: every `vae.recode_steps`
+        /// steps, and when the VAE is frozen. Times.
         Recode => "recode",
         /// A minibatch of transitions is gathered. Minibatches.
         Sample => "sample",

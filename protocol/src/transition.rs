@@ -10,11 +10,18 @@ use serde::{Deserialize, Serialize};
 
 use crate::ids::{ActorId, ActorIncarnation};
 use crate::ticket::Ticket;
-use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
+use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode, REWARD_TERMS};
 
-/// Largest magnitude in a valid record: the settings limit rewards to 4 · 10⁶ and corridors to 1
-/// km. The learner squares its inputs, and single precision ends at 3 · 10³⁸.
+/// Largest magnitude in a valid record: the settings limit each term of a reward to 10⁶ and
+/// corridors to 1 km. The learner squares its inputs, and single precision ends at 3 · 10³⁸.
 pub const MAX_MAGNITUDE: f32 = 1e7;
+
+/// Bytes between `hit_wall` and `ground_truth`, so that the image starts on a cache line.
+const RESERVED: usize = {
+    // 361: the header's other fields.
+    let used = size_of::<f32>() * REWARD_TERMS + 361;
+    used.next_multiple_of(64) - used
+};
 
 /// One step of an episode on the wire. Every bit pattern is a valid value of every field's type;
 /// [`TransitionRecord::check`] checks the meaning.
@@ -56,8 +63,8 @@ pub struct TransitionRecord {
     pub action: [f32; ACTION],
     /// Sum of `reward_terms`.
     pub reward: f32,
-    /// The paper's four terms: collision, level-up, destination, open view.
-    pub reward_terms: [f32; 4],
+    /// The terms of the reward: [`REWARD_TERM_NAMES`](crate::REWARD_TERM_NAMES).
+    pub reward_terms: [f32; REWARD_TERMS],
     /// 1 if a wall was crossed or the destination reached in this step.
     pub level_up: u8,
     /// 1 if the episode ended in this step in a state without a future (collision, destination).
@@ -69,7 +76,7 @@ pub struct TransitionRecord {
     /// The wall that was hit, from 1 in course order, in the closing record of an episode that
     /// collided; 0 for the corridor and in all other records.
     pub hit_wall: u8,
-    reserved: [u8; 7],
+    reserved: [u8; RESERVED],
     /// The simulator's ground truth at the time of the observation, which the camera does not see;
     /// see [`CriticInput::GroundTruth`](crate::config::CriticInput::GroundTruth).
     pub ground_truth: [f32; GROUND_TRUTH],
@@ -78,10 +85,12 @@ pub struct TransitionRecord {
     pub depth: [u8; IMAGE_PIXELS],
 }
 
-// The header is seven cache lines, so the image starts on a cache line in samples aligned to one
-// (see `services`). There is no padding, so the record is plain data.
-const _: () = assert!(std::mem::offset_of!(TransitionRecord, depth) == 448);
-const _: () = assert!(size_of::<TransitionRecord>() == 448 + IMAGE_PIXELS);
+// The header is whole cache lines (seven for four terms of the reward), so the image starts on a
+// cache line in samples aligned to one (see `services`). There is no padding, so the record is
+// plain data.
+const HEADER: usize = std::mem::offset_of!(TransitionRecord, depth);
+const _: () = assert!(HEADER.is_multiple_of(64));
+const _: () = assert!(size_of::<TransitionRecord>() == HEADER + IMAGE_PIXELS);
 const _: () = assert!(align_of::<TransitionRecord>() == 8);
 
 /// Role of a record within its episode.
@@ -262,9 +271,9 @@ impl TransitionRecord {
         finite("action", &self.action)?;
         finite("reward", &[self.reward])?;
         finite("reward_terms", &self.reward_terms)?;
-        let terms = self.reward_terms;
         // Summed in the actor's order, so that the sums are bit-equal.
-        if self.reward != terms[0] + terms[1] + terms[2] + terms[3] {
+        let sum = self.reward_terms.into_iter().reduce(|sum, term| sum + term);
+        if Some(self.reward) != sum {
             return Err(RecordFault::Contradiction {
                 what: "the reward is not the sum of its terms",
             });

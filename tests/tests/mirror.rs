@@ -7,7 +7,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_learner::episode::{CommittedEpisode, StepObservation};
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
-use skein_protocol::{ACTION, IMAGE_PIXELS, MAX_LATENT};
+use skein_protocol::{ACTION, IMAGE_PIXELS, MAX_LATENT, REWARD_TERMS};
 use skein_simulator::course::{
     Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout,
 };
@@ -94,7 +94,7 @@ fn fly(side: f32) -> CommittedEpisode {
         action_before: [0.0; ACTION],
         observations,
         rewards: vec![0.0; STEPS],
-        reward_terms: vec![[0.0; 4]; STEPS],
+        reward_terms: vec![[0.0; REWARD_TERMS]; STEPS],
         level_up: vec![false; STEPS],
         outcome: None,
         walls_passed: 0,

@@ -10,7 +10,6 @@ use std::ops::DerefMut;
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_protocol::ACTION;
 use skein_protocol::evaluation::EpisodeScore;
 use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::seeds::{Purpose, derive};
@@ -18,6 +17,7 @@ use skein_protocol::segment::Segment;
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
+use skein_protocol::{ACTION, REWARD_TERM_NAMES};
 use skein_simulator::course::{Course, NoSuchLevel};
 use skein_simulator::reward::{RewardSettings, RewardTerms};
 use skein_simulator::simulator::{
@@ -27,6 +27,11 @@ use skein_simulator::simulator::{
 use crate::agent::Agent;
 use crate::courses::{CourseChoiceError, Simulators};
 use skein_inference::Network;
+
+const _: () = assert!(
+    are_equal(RewardTerms::NAMES, &REWARD_TERM_NAMES),
+    "the terms of the simulator's reward are not REWARD_TERM_NAMES of skein-protocol: change these"
+);
 
 /// Flies tickets.
 pub struct EnvironmentLoop {
@@ -306,6 +311,23 @@ fn generator(ticket: &Ticket, purpose: Purpose, step: u32) -> Pcg64Mcg {
     Pcg64Mcg::seed_from_u64(derive(ticket.seed, purpose, step.into()))
 }
 
+/// `==`, when compiling.
+const fn are_equal(left: &[&str], right: &[&str]) -> bool {
+    let mut equal = left.len() == right.len();
+    let mut index = 0;
+    while equal && index < left.len() {
+        let (one, other) = (left[index].as_bytes(), right[index].as_bytes());
+        equal = one.len() == other.len();
+        let mut place = 0;
+        while equal && place < one.len() {
+            equal = one[place] == other[place];
+            place += 1;
+        }
+        index += 1;
+    }
+    equal
+}
+
 /// Writes an action and its consequences into the record of its observation.
 fn complete(
     record: &mut TransitionRecord,
@@ -316,12 +338,7 @@ fn complete(
     record.action = action;
     record.walls_passed = report.walls_passed;
     record.reward = reward.total();
-    record.reward_terms = [
-        reward.collision,
-        reward.level_up,
-        reward.destination,
-        reward.open_view,
-    ];
+    record.reward_terms = reward.values();
     let arrived = report.outcome == Some(EpisodeOutcome::ReachedEnd);
     record.level_up = u8::from(report.level_up == LevelUp::Yes || arrived);
     record.terminated = u8::from(arrived || report.outcome == Some(EpisodeOutcome::Collided));

@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use crate::courses::Courses;
 use crate::evaluation::{Evaluation, Keep, MAX_THREADS};
-use crate::recording::{COLUMNS, check_recordable, write_recording};
+use crate::recording::{COLUMNS, NAME_LISTS, check_recordable, write_recording};
 use anyhow::{Context, bail};
 use clap::{Args, Parser};
 use skein_kernels::Isa;
@@ -288,21 +288,18 @@ fn columns_help() -> String {
         let shape: Vec<_> = std::iter::once("n".to_owned())
             .chain(column.shape.iter().map(ToString::to_string))
             .collect();
-        format!(
-            "  {:<13} {:<4} {:<14} {}\n",
-            column.name,
-            column.kind,
-            format!("[{}]", shape.join(", ")),
-            column.meaning
-        )
+        let shape = format!("[{}]", shape.join(", "));
+        (column.name, column.kind, shape, column.meaning)
     });
+    let names = NAME_LISTS.iter();
+    let lists = names.map(|&(name, shape, meaning)| (name, "<U", shape.to_owned(), meaning));
+    let lines: Vec<_> = rows
+        .chain(lists)
+        .map(|(name, kind, shape, meaning)| format!("  {name:<17} {kind:<4} {shape:<14} {meaning}"))
+        .collect();
     format!(
         "Arrays in the file of --record, read by numpy.load(FILE); one row per observation, \
-        episodes and courses in order:\n{}  {:<13} {:<4} {:<14} {}",
-        rows.collect::<String>(),
-        "course_names",
-        "<U",
-        "[courses]",
-        "names of the courses"
+        episodes and courses in order:\n{}",
+        lines.join("\n")
     )
 }

@@ -10,7 +10,7 @@ use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use skein_protocol::transition::{RecordKind, TransitionRecord};
-use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_WIDTH};
+use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_WIDTH, REWARD_TERM_NAMES, REWARD_TERMS};
 use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
 
@@ -69,7 +69,7 @@ struct RecordingRow<'a> {
     record: &'a TransitionRecord,
 }
 
-/// All arrays with one row per observation. `course_names` is written in addition.
+/// All arrays with one row per observation. [`NAME_LISTS`] are written in addition.
 pub const COLUMNS: [Column; 15] = [
     Column::new(
         "course",
@@ -156,8 +156,8 @@ pub const COLUMNS: [Column; 15] = [
     Column::new(
         "reward_terms",
         "<f4",
-        &[Fixed(4)],
-        "collision, level-up, destination, action; for the action above",
+        &[Fixed(REWARD_TERMS)],
+        "terms of the reward for the action above: reward_term_names",
         |row, out| {
             put(out, &row.record.reward_terms);
         },
@@ -191,6 +191,16 @@ pub const COLUMNS: [Column; 15] = [
         |row, out| {
             out.push(row.record.truncated);
         },
+    ),
+];
+
+/// Arrays of names: name, shape, meaning.
+pub const NAME_LISTS: [(&str, &str, &str); 2] = [
+    ("course_names", "[courses]", "names of the courses"),
+    (
+        "reward_term_names",
+        "[terms]",
+        "names of the reward's terms",
     ),
 ];
 
@@ -293,21 +303,25 @@ fn write_npz(
             zip.write_all(&bytes)?;
         }
     }
-    // NumPy's strings have a fixed number of four-byte characters.
-    let longest = courses
-        .iter()
-        .map(|name| name.chars().count())
-        .max()
-        .unwrap_or(0)
-        .max(1);
-    start_array(
-        &mut zip,
-        "course_names",
-        &format!("<U{longest}"),
-        courses.len(),
-        &[],
-    )?;
-    for name in courses {
+    let [(course_names, ..), (reward_term_names, ..)] = NAME_LISTS;
+    write_names(&mut zip, course_names, courses)?;
+    write_names(&mut zip, reward_term_names, &REWARD_TERM_NAMES)?;
+    zip.finish()
+        .map_err(io::Error::from)?
+        .into_inner()?
+        .sync_all()
+}
+
+/// Writes an array of strings. NumPy's have a fixed number of four-byte characters.
+fn write_names(
+    zip: &mut ZipWriter<BufWriter<File>>,
+    array: &str,
+    names: &[&str],
+) -> io::Result<()> {
+    let lengths = names.iter().map(|name| name.chars().count());
+    let longest = lengths.max().unwrap_or(0).max(1);
+    start_array(zip, array, &format!("<U{longest}"), names.len(), &[])?;
+    for name in names {
         let letters = name
             .chars()
             .map(u32::from)
@@ -315,10 +329,7 @@ fn write_npz(
             .take(longest);
         zip.write_all(&letters.flat_map(u32::to_le_bytes).collect::<Vec<_>>())?;
     }
-    zip.finish()
-        .map_err(io::Error::from)?
-        .into_inner()?
-        .sync_all()
+    Ok(())
 }
 
 fn rows_of(
@@ -457,6 +468,16 @@ mod tests {
             "{header}"
         );
         assert_eq!(values::<u32>(&names)[9], 0xe4);
+        let (header, names) = array(&file, "reward_term_names");
+        assert!(
+            header.contains("'<U11'") && header.contains(&format!("({REWARD_TERMS},)")),
+            "{header}"
+        );
+        let letters: String = values::<u32>(&names)
+            .into_iter()
+            .filter_map(char::from_u32)
+            .collect();
+        assert!(letters.starts_with("collision\0\0level_up"), "{letters:?}");
     }
 
     #[test]

@@ -1,5 +1,7 @@
 //! The paper's reward: four terms, added up in every step.
 //!
+//! `reward_terms!` lists them: settings, records, curves and recordings follow from the list.
+//!
 //! | term | given when | value | default |
 //! |---|---|---|---|
 //! | `collision` | the step ends in a collision | the setting, a penalty | −1 |
@@ -27,30 +29,58 @@ const CENTRE_SIDE: usize = 16;
 /// Largest magnitude accepted for a setting.
 const MAX_REWARD: f32 = 1e6;
 
-/// Size of each reward term: section `[simulator.reward]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct RewardSettings {
-    /// Reward for a collision. Default −1.
-    pub collision: f32,
-    /// Reward for passing a wall. Default 1.
-    pub level_up: f32,
-    /// Reward for reaching the end wall. Default 1.
-    pub destination: f32,
-    /// Factor `k` of the reward for looking into open space, given in every step. Default 1; 0
-    /// rewards events only.
-    pub open_view: f32,
+/// Declares the terms: for each, its documentation, its name and the default of its setting. The
+/// order is that of their sum.
+macro_rules! reward_terms {
+    ($($(#[$doc:meta])* $name:ident = $default:literal),+ $(,)?) => {
+        /// Size of each reward term: section `[simulator.reward]`.
+        #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields, default)]
+        pub struct RewardSettings {
+            $($(#[$doc])* pub $name: f32),+
+        }
+
+        impl Default for RewardSettings {
+            fn default() -> Self {
+                Self { $($name: $default),+ }
+            }
+        }
+
+        impl RewardSettings {
+            fn by_key(&self) -> [(&'static str, f32); RewardTerms::NAMES.len()] {
+                [$((stringify!($name), self.$name)),+]
+            }
+        }
+
+        /// The reward of one step, term by term: 0 for what did not happen in it.
+        #[derive(Debug, Clone, Copy, Default, PartialEq)]
+        pub struct RewardTerms {
+            $($(#[$doc])* pub $name: f32),+
+        }
+
+        impl RewardTerms {
+            /// Names of all terms, in the order of their sum.
+            pub const NAMES: &[&str] = &[$(stringify!($name)),+];
+
+            /// Returns the values, in the order of [`RewardTerms::NAMES`].
+            pub fn values(&self) -> [f32; Self::NAMES.len()] {
+                [$(self.$name),+]
+            }
+        }
+    };
 }
 
-impl Default for RewardSettings {
-    fn default() -> Self {
-        Self {
-            collision: -1.0,
-            level_up: 1.0,
-            destination: 1.0,
-            open_view: 1.0,
-        }
-    }
+reward_terms! {
+    /// Given when the step ends in a collision. Default −1.
+    collision = -1.0,
+    /// Given when the drone passes a wall in the step. Default 1.
+    level_up = 1.0,
+    /// Given when the step reaches the end wall. Default 1.
+    destination = 1.0,
+    /// `k · (mean of the central 16 × 16 pixels − mean of the whole depth image)`, pixels scaled to
+    /// [0, 1], given in every step: between −k and k. The setting is the factor `k`. Default 1; 0
+    /// rewards events only.
+    open_view = 1.0,
 }
 
 impl RewardSettings {
@@ -59,12 +89,7 @@ impl RewardSettings {
     /// # Errors
     /// [`RewardSettingsError`] names the first key at fault.
     pub fn validate(&self) -> Result<(), RewardSettingsError> {
-        for (key, value) in [
-            ("collision", self.collision),
-            ("level_up", self.level_up),
-            ("destination", self.destination),
-            ("open_view", self.open_view),
-        ] {
+        for (key, value) in self.by_key() {
             if !(-MAX_REWARD..=MAX_REWARD).contains(&value) {
                 return Err(RewardSettingsError { key, value });
             }
@@ -84,20 +109,6 @@ pub struct RewardSettingsError {
     pub key: &'static str,
     /// Its value.
     pub value: f32,
-}
-
-/// The reward of one step, term by term.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct RewardTerms {
-    /// [`RewardSettings::collision`] if the step ended in a collision, else 0.
-    pub collision: f32,
-    /// [`RewardSettings::level_up`] if the drone passed a wall in the step, else 0.
-    pub level_up: f32,
-    /// [`RewardSettings::destination`] if the step reached the end wall, else 0.
-    pub destination: f32,
-    /// `k · (mean of the central 16 × 16 pixels − mean of the whole depth image)`, pixels scaled to
-    /// [0, 1]; `k` is [`RewardSettings::open_view`]. Between −k and k.
-    pub open_view: f32,
 }
 
 impl RewardTerms {
@@ -126,7 +137,8 @@ impl RewardTerms {
 
     /// Returns the sum of the terms: the reward the agent learns from.
     pub fn total(&self) -> f32 {
-        self.collision + self.level_up + self.destination + self.open_view
+        let [first, rest @ ..] = self.values();
+        rest.into_iter().fold(first, |sum, term| sum + term)
     }
 }
 
@@ -172,6 +184,21 @@ mod tests {
             );
         }
         assert_eq!(RewardSettings::default().validate(), Ok(()));
+    }
+
+    #[test]
+    fn every_term_is_a_setting_a_value_and_a_summand_under_one_name() {
+        let keys = RewardSettings::default().by_key().map(|(key, _)| key);
+        assert_eq!(keys, RewardTerms::NAMES);
+        let terms = RewardTerms {
+            collision: 1e8,
+            level_up: 1.0,
+            open_view: -1e8,
+            ..RewardTerms::default()
+        };
+        assert_eq!(terms.values()[..4], [1e8, 1.0, 0.0, -1e8]);
+        // In this order the 1 is lost, in others it is not.
+        assert_eq!(terms.total(), 0.0);
     }
 
     #[test]

@@ -32,6 +32,8 @@ pub(crate) enum Contact {
 /// The vehicle's body in the course.
 pub(crate) struct World {
     obstacles: TriMesh,
+    /// The walls one by one, in course order: parts of `obstacles`.
+    walls: Vec<TriMesh>,
     end_wall_m: f32,
     body_shape: Cuboid,
     nominal: BodyProperties,
@@ -47,15 +49,18 @@ impl World {
     /// physics step takes `dt_secs`.
     ///
     /// # Errors
-    /// parry's reason if the course's surfaces form no triangle mesh.
+    /// parry's reason if the course's surfaces, or those of one wall, form no triangle mesh. Such a
+    /// wall would be air.
     pub(crate) fn new(
         course: &Course,
         properties: BodyProperties,
         dt_secs: f32,
     ) -> Result<Self, TriMeshBuilderError> {
         let (physics, body) = pristine_physics(&properties, dt_secs, &Point3::origin());
+        let (obstacles, walls) = collision_meshes(&course.mesh(), course.walls().len())?;
         Ok(Self {
-            obstacles: triangles(&course.mesh(), |kind| kind != SurfaceKind::EndWall)?,
+            obstacles,
+            walls,
             end_wall_m: course.corridor().length_m,
             body_shape: Cuboid::new(glam(&properties.half_extents_m)),
             nominal: properties,
@@ -122,13 +127,9 @@ impl World {
         !self.physics.quarantine().is_empty()
     }
 
-    /// Returns the wall of `course` that the body touches, by its place in course order from 0.
-    pub(crate) fn touched_wall(&self, course: &Course) -> Option<usize> {
-        let mesh = course.mesh();
-        (0..course.walls().len()).find(|&place| {
-            triangles(&mesh, |kind| kind == SurfaceKind::Wall(place))
-                .is_ok_and(|wall| self.touches(&wall))
-        })
+    /// Returns the wall that the body touches, by its place in course order from 0.
+    pub(crate) fn touched_wall(&self) -> Option<usize> {
+        self.walls.iter().position(|wall| self.touches(wall))
     }
 
     /// Returns what the body touches.
@@ -151,8 +152,9 @@ impl World {
         let body_from_world = self.physics.bodies[self.body].position().inverse();
         DefaultQueryDispatcher
             .intersection_test(&body_from_world, &self.body_shape, surfaces)
-            // Never an error: parry's dispatcher supports a cuboid against a triangle mesh.
-            .is_ok_and(|test| test.intersecting)
+            // Fails for unsupported shapes alone. A failure must never mean "no contact".
+            .expect("parry tests a cuboid against a triangle mesh")
+            .intersecting
     }
 }
 
@@ -182,23 +184,28 @@ fn pristine_physics(
     (physics, body)
 }
 
-/// Returns the triangles of the surfaces whose kind is `wanted`.
-fn triangles(
+/// Returns the triangles of all obstacles, and those of each of the `walls` walls.
+fn collision_meshes(
     mesh: &Mesh,
-    wanted: impl Fn(SurfaceKind) -> bool,
-) -> Result<TriMesh, TriMeshBuilderError> {
-    let vertices = mesh
+    walls: usize,
+) -> Result<(TriMesh, Vec<TriMesh>), TriMeshBuilderError> {
+    let vertices: Vec<Vector> = mesh
         .vertices
         .iter()
         .map(|vertex| glam(&vertex.coords))
         .collect();
-    let triangles = mesh
-        .triangles()
-        .into_iter()
-        .filter(|&(_, surface)| wanted(mesh.surfaces[surface].kind))
-        .map(|(triangle, _)| triangle)
-        .collect();
-    TriMesh::new(vertices, triangles)
+    let triangles = mesh.triangles();
+    let of = |wanted: &dyn Fn(SurfaceKind) -> bool| {
+        let chosen = triangles
+            .iter()
+            .filter(|&&(_, surface)| wanted(mesh.surfaces[surface].kind))
+            .map(|&(triangle, _)| triangle)
+            .collect();
+        TriMesh::new(vertices.clone(), chosen)
+    };
+    let obstacles = of(&|kind| kind != SurfaceKind::EndWall)?;
+    let walls = (0..walls).map(|place| of(&|kind| kind == SurfaceKind::Wall(place)));
+    Ok((obstacles, walls.collect::<Result<_, _>>()?))
 }
 
 fn glam(v: &Vector3<f32>) -> Vector {
@@ -340,14 +347,24 @@ mod tests {
         let beside_m = y_m + wall.clearance_m();
         let beside = world_at(Point3::new(mid_wall_m, beside_m, z_m));
         assert_eq!(beside.contact(), Contact::Obstacle);
-        assert_eq!(beside.touched_wall(&course), Some(0));
+        assert_eq!(beside.touched_wall(), Some(0));
     }
 
     #[test]
     fn the_corridor_is_not_a_wall() {
         let on_the_floor = world_at(Point3::new(5.0, 0.0, 0.05));
         assert_eq!(on_the_floor.contact(), Contact::Obstacle);
-        assert_eq!(on_the_floor.touched_wall(&test_course()), None);
+        assert_eq!(on_the_floor.touched_wall(), None);
+    }
+
+    #[test]
+    fn a_course_with_a_wall_that_nothing_could_touch_is_refused() {
+        let course = test_course();
+        let (mut mesh, walls) = (course.mesh(), course.walls().len());
+        assert!(collision_meshes(&mesh, walls).is_ok());
+        let last = SurfaceKind::Wall(walls - 1);
+        mesh.surfaces.retain(|surface| surface.kind != last);
+        assert!(collision_meshes(&mesh, walls).is_err());
     }
 
     #[test]

@@ -1,10 +1,10 @@
 //! Checkpoints: everything that determines the rest of a run, in a directory of its own.
 //!
-//! A run resumed from a checkpoint continues bit for bit as if it had never stopped. So a
-//! checkpoint holds parameters and moments of every network, the replay buffer with the depth
-//! images still needed, snapshots that still fly or are the best, counters, averages, and the
-//! lengths of the metrics files. It holds no random generators: they are derived again for every
-//! epoch.
+//! On the type of processor that began it, a run resumed from a checkpoint continues bit for bit as
+//! if it had never stopped. So a checkpoint holds parameters and moments of every network, the
+//! replay buffer with the depth images still needed, snapshots that still fly or are the best,
+//! counters, averages, and the lengths of the metrics files. It holds no random generators: they
+//! are derived again for every epoch.
 //!
 //! `checkpoints/episode-<n>/` contains
 //! - `tensors.safetensors`: parameters, targets, moments, log α;

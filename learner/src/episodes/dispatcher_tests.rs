@@ -117,7 +117,7 @@ pub(super) fn records(
             let mut record = TransitionRecord::zeroed();
             record.begin(ticket, ActorId(actor), incarnation, step);
             record.reward = ticket.episode.0 as f32 + step as f32;
-            record.reward_terms = [record.reward, 0.0, 0.0, 0.0];
+            record.reward_terms[0] = record.reward;
             record.terminated = u8::from(step == steps - 1);
             if step == steps {
                 record.kind = RecordKind::Closing.code();

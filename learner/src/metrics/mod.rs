@@ -14,6 +14,7 @@ mod window;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use skein_protocol::{REWARD_TERM_NAMES, REWARD_TERMS};
 use skein_run::RunDirectory;
 
 use crate::disk::Disk;
@@ -171,33 +172,25 @@ impl Metrics {
         self.rows += 1;
         self.windows.total_reward.push(row.total_reward);
         self.windows.walls_passed.push(f32::from(row.walls_passed));
-        let term = |index: usize| {
-            episode
-                .reward_terms
-                .iter()
-                .map(|terms| f64::from(terms[index]))
-                .sum::<f64>()
-        };
-        self.scalars(
-            row.episode,
-            &[
-                (Scalar::Return, row.total_reward.into()),
-                (Scalar::WallsPassed, row.walls_passed.into()),
-                (Scalar::Steps, row.steps as f64),
-                (Scalar::RewardCollision, term(0)),
-                (Scalar::RewardLevelUp, term(1)),
-                (Scalar::RewardDestination, term(2)),
-                (Scalar::RewardOpenView, term(3)),
-                (
-                    Scalar::WindowReturn,
-                    self.windows.total_reward.mean().unwrap_or_default(),
-                ),
-                (
-                    Scalar::WindowWallsPassed,
-                    self.windows.walls_passed.mean().unwrap_or_default(),
-                ),
-            ],
-        )
+        let window = |average: &MovingAverage| average.mean().unwrap_or_default();
+        let terms = reward_parts(&episode.reward_terms);
+        let mut points = vec![
+            (Scalar::Return.tag(), row.total_reward.into()),
+            (Scalar::WallsPassed.tag(), row.walls_passed.into()),
+            (Scalar::Steps.tag(), row.steps as f64),
+        ];
+        points.extend(terms.iter().map(|(tag, part)| (tag.as_str(), *part)));
+        points.extend([
+            (
+                Scalar::WindowReturn.tag(),
+                window(&self.windows.total_reward),
+            ),
+            (
+                Scalar::WindowWallsPassed.tag(),
+                window(&self.windows.walls_passed),
+            ),
+        ]);
+        Ok(self.events.scalars(row.episode, &points)?)
     }
 
     /// Appends a point to some curves, at training episode `episode`.
@@ -226,6 +219,14 @@ impl Metrics {
     pub fn windows(&self) -> &EpisodeWindows {
         &self.windows
     }
+}
+
+/// Returns the part of each reward term in the return, with its curve's name.
+fn reward_parts(steps: &[[f32; REWARD_TERMS]]) -> [(String, f64); REWARD_TERMS] {
+    std::array::from_fn(|index| {
+        let part = steps.iter().map(|terms| f64::from(terms[index])).sum();
+        (format!("reward/{}", REWARD_TERM_NAMES[index]), part)
+    })
 }
 
 #[cfg(test)]
@@ -298,6 +299,26 @@ mod tests {
     }
 
     #[test]
+    fn every_reward_term_has_a_curve_of_its_part_in_the_return() {
+        let (_directory, run) = run();
+        let mut metrics = metrics(&run, new());
+        let mut episode = samples::episode(0, 2, Outcome::Collided);
+        let of_step = |step: f32| std::array::from_fn(|index| step * (index as f32 + 1.0));
+        episode.reward_terms = vec![of_step(1.0), of_step(-4.0)];
+        metrics.episode(&episode).unwrap();
+        metrics.flush().unwrap();
+        let parts = points(&run)
+            .into_iter()
+            .filter(|(tag, ..)| tag.starts_with("reward/"))
+            .map(|(tag, _, bits)| (tag, f32::from_bits(bits)));
+        let expected: std::collections::BTreeMap<_, _> = (1u8..)
+            .zip(REWARD_TERM_NAMES)
+            .map(|(number, name)| (format!("reward/{name}"), -3.0 * f32::from(number)))
+            .collect();
+        assert!(parts.eq(expected));
+    }
+
+    #[test]
     fn an_incarnation_killed_before_its_first_checkpoint_leaves_nothing() {
         let (_directory, run) = run();
         feed(&mut metrics(&run, new()), 0..7);
@@ -322,6 +343,6 @@ mod tests {
         let mut second = metrics(&run, state);
         feed(&mut second, 3..6);
         assert_eq!(second.files().len(), 2);
-        assert_eq!(points(&run).len(), 3 * 9);
+        assert_eq!(points(&run).len(), 3 * (5 + REWARD_TERMS));
     }
 }

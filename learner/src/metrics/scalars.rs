@@ -1,4 +1,7 @@
 //! The curves of a run: every logged scalar, with its meaning.
+//!
+//! The parts of the return, `reward/NAME`, are not listed here: there is one for each name of
+//! [`REWARD_TERM_NAMES`](skein_protocol::REWARD_TERM_NAMES).
 
 macro_rules! scalars {
     ($($(#[$doc:meta])* $name:ident => $tag:literal),* $(,)?) => {
@@ -26,14 +29,6 @@ scalars! {
     WallsPassed => "episode/walls_passed",
     /// Steps of an episode.
     Steps => "episode/steps",
-    /// Part of the return that comes from collisions.
-    RewardCollision => "reward/collision",
-    /// Part of the return that comes from level-ups.
-    RewardLevelUp => "reward/level_up",
-    /// Part of the return that comes from reaching the destination.
-    RewardDestination => "reward/destination",
-    /// Part of the return that comes from the open-view term, a reward for facing open space.
-    RewardOpenView => "reward/open_view",
     /// Return, averaged over the window.
     WindowReturn => "window/return",
     /// Walls passed, averaged over the window. The paper's Fig. 10.
@@ -112,5 +107,6 @@ mod tests {
         let listed = tags.len();
         tags.dedup();
         assert_eq!(tags.len(), listed);
+        assert!(tags.iter().all(|tag| !tag.starts_with("reward/")));
     }
 }

@@ -1,9 +1,10 @@
 //! One SAC update on the native kernels, forward and backward written out, in reading order.
 //!
 //! It computes the same update as [`super::TorchSac`], which stays as the reference: same
-//! parameters in the same order, same noise, same metrics. Every sum has a fixed order, so the bits
-//! depend neither on the processor nor on the number of threads. Buffers are allocated once per
-//! batch size and reused.
+//! parameters in the same order, same noise, same metrics. Every sum has a fixed order, so its bits
+//! depend neither on the instruction set nor on the number of threads. Equality across types of
+//! processor is not promised: a few functions are the C library's (docs/reliability.md). Buffers
+//! are allocated once per batch size and reused.
 //!
 //! Equation numbers and symbols are those of arXiv:1812.05905:
 //! - s and s': states before and after the replayed action;

@@ -1,5 +1,6 @@
 //! A trainer restored from a checkpoint continues bit for bit.
 
+use rand::RngExt;
 use skein_inference::{Network, Scratch};
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{AlgorithmName, DecoderName, EncoderTraining, Observation};
@@ -34,6 +35,11 @@ fn config() -> Config {
 /// One epoch, as the training loop does it. With a lag, `keep` was chosen when its episodes were
 /// ordered.
 fn learn(trainer: &mut Trainer, epoch: u64, keep: KeptData) {
+    take_in(trainer, epoch, keep);
+    update(trainer, PolicyVersion(epoch));
+}
+
+fn take_in(trainer: &mut Trainer, epoch: u64, keep: KeptData) {
     for number in epoch * EPISODES..(epoch + 1) * EPISODES {
         let mut flown = episode(number, STEPS / EPISODES as usize, Outcome::Collided);
         flown.level_up[4] = true;
@@ -47,22 +53,20 @@ fn learn(trainer: &mut Trainer, epoch: u64, keep: KeptData) {
         }
         trainer.take_in(flown).unwrap();
     }
+}
+
+fn update(trainer: &mut Trainer, version: PolicyVersion) {
     let (mut timer, before) = (
         LapTimer::start(),
         (trainer.vae_updates(), trainer.updates()),
     );
     trainer
-        .train_vae(PolicyVersion(epoch), &mut timer, |_| {
-            Ok::<_, UpdateError>(())
-        })
+        .train_vae(version, &mut timer, |_| Ok::<_, UpdateError>(()))
         .unwrap();
     trainer
-        .train_policy(
-            PolicyVersion(epoch),
-            &mut timer,
-            &mut MetricMeans::default(),
-            |_| Ok::<_, UpdateError>(()),
-        )
+        .train_policy(version, &mut timer, &mut MetricMeans::default(), |_| {
+            Ok::<_, UpdateError>(())
+        })
         .unwrap();
     let done = (
         trainer.vae_updates() - before.0,
@@ -356,7 +360,7 @@ fn episodes_are_stored_a_second_time_mirrored() {
         "images are of one shade, and look the same in a mirror"
     );
     let mut drawn = Minibatch::default();
-    let mut rng = rng(&trainer.config, Purpose::PolicyBatches, PolicyVersion(9));
+    let mut rng = Pcg64Mcg::seed_from_u64(9);
     trainer.replay().sample(&mut rng, 400, &mut drawn);
     let observations = drawn.observations.chunks(drawn.observations.len() / 400);
     let to_the_left = observations
@@ -386,6 +390,140 @@ fn stored_codes_are_recomputed_as_often_as_configured_while_the_vae_is_trained()
     assert_eq!(renewed, [false, true, true]);
 }
 
+/// Steps, policy updates and VAE steps so far, exploration and data of the next orders.
+type Due = (u64, u64, u64, Exploration, KeptData);
+
+/// Counts and choices before the first and after each of four epochs.
+fn due(config: &Config) -> Vec<Due> {
+    let mut trainer = Trainer::new(config).unwrap();
+    let now = |trainer: &Trainer| {
+        (
+            trainer.steps(),
+            trainer.updates(),
+            trainer.vae_updates(),
+            trainer.exploration(),
+            trainer.keep(),
+        )
+    };
+    let mut seen = vec![now(&trainer)];
+    for epoch in 0..4 {
+        let keep = trainer.keep();
+        learn(&mut trainer, epoch, keep);
+        seen.push(now(&trainer));
+    }
+    seen
+}
+
+#[test]
+fn updates_count_from_the_warm_up_and_vae_steps_to_the_freeze_to_the_step() {
+    use Exploration::{Sample, Uniform};
+    use KeptData::{Depth, Latents};
+    let mut config = config();
+    // Both limits lie within an epoch: a quarter of an update, a tenth of a VAE step each step.
+    (config.learning.warmup_steps, config.vae.train_steps) = (30, 50);
+    let within = [
+        (0, 0, 0, Uniform, Depth),
+        (20, 0, 2, Uniform, Depth),
+        (40, 2, 4, Sample, Depth),
+        (60, 7, 5, Sample, Latents),
+        (80, 12, 5, Sample, Latents),
+    ];
+    assert_eq!(due(&config), within);
+    // Both lie at an epoch's end, which is past them.
+    (config.learning.warmup_steps, config.vae.train_steps) = (STEPS, 2 * STEPS);
+    let at_the_end = [
+        (0, 0, 0, Uniform, Depth),
+        (20, 0, 2, Sample, Depth),
+        (40, 5, 4, Sample, Latents),
+        (60, 10, 4, Sample, Latents),
+        (80, 15, 4, Sample, Latents),
+    ];
+    assert_eq!(due(&config), at_the_end);
+}
+
+#[test]
+fn mirrored_transitions_make_no_update_due() {
+    let mut config = config();
+    config.replay.capacity = 1000;
+    config.learning.observation = Observation::LatentVelocityAction;
+    let plain = due(&config);
+    config.learning.mirror = true;
+    let counts = |due: &[Due]| {
+        let counts = due.iter();
+        counts
+            .map(|epoch| (epoch.0, epoch.1, epoch.2))
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(counts(&due(&config)), counts(&plain));
+}
+
+#[test]
+fn mirrored_or_not_an_episode_of_an_older_encoder_is_encoded_again() {
+    for lag in [0, 1] {
+        let mut config = config();
+        config.learning.mirror = true;
+        config.learning.observation = Observation::LatentVelocityAction;
+        config.learning.policy_lag = lag;
+        config.replay.capacity = 1000;
+        let mut trainer = Trainer::new(&config).unwrap();
+        // Frozen after the third epoch. With a lag, the fourth was flown before that; without one,
+        // its codes are the actors' and are believed.
+        (0..4).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
+        assert_eq!(
+            all_codes_are_the_encoders(&trainer, 4),
+            lag > 0,
+            "lag {lag}"
+        );
+    }
+}
+
+#[test]
+fn a_restored_trainer_does_not_recode_before_it_is_due() {
+    let mut config = config();
+    (config.vae.recode_steps, config.vae.train_steps) = (2 * STEPS, 100 * STEPS);
+    let mut trainer = Trainer::new(&config).unwrap();
+    (0..2).for_each(|epoch| learn(&mut trainer, epoch, KeptData::Depth));
+    let mut trainer = resumed(&mut trainer, 2);
+    learn(&mut trainer, 2, KeptData::Depth);
+    assert!(
+        !all_codes_are_the_encoders(&trainer, 3),
+        "due after four epochs"
+    );
+    learn(&mut trainer, 3, KeptData::Depth);
+    assert!(all_codes_are_the_encoders(&trainer, 4));
+    learn(&mut trainer, 4, KeptData::Depth);
+    assert!(
+        !all_codes_are_the_encoders(&trainer, 5),
+        "due after six epochs"
+    );
+}
+
+#[test]
+fn updates_from_another_snapshot_draw_other_minibatches_and_noise() {
+    let after = |versions: [u64; 2]| {
+        let mut trainer = Trainer::new(&config()).unwrap();
+        for (epoch, version) in (0..).zip(versions) {
+            take_in(&mut trainer, epoch, KeptData::Depth);
+            update(&mut trainer, PolicyVersion(version));
+        }
+        let vae = trainer.vae.as_mut().unwrap().named_tensors();
+        (vae, trainer.algorithm.named_tensors())
+    };
+    let (first, again, other) = (after([0, 1]), after([0, 1]), after([0, 2]));
+    assert!(first == again);
+    assert!(first.0 != other.0, "the VAE's");
+    assert!(first.1 != other.1, "the policy's");
+
+    let purposes = (Purpose::PolicyBatches, Purpose::PolicyNoise);
+    let drawn = |version| {
+        let (mut rng, mut noise) = draws(&config(), purposes, PolicyVersion(version));
+        let mut numbers = [0.0];
+        noise.fill_normal(&mut numbers);
+        (rng.random::<u64>(), numbers)
+    };
+    assert!(drawn(1).0 != drawn(2).0 && drawn(1).1 != drawn(2).1);
+}
+
 /// `true` if the stored codes of the first `epochs` are those that actors would compute with the
 /// present encoder.
 fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
@@ -401,7 +539,7 @@ fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
         .map(code)
         .collect();
     let mut drawn = Minibatch::default();
-    let mut rng = rng(&trainer.config, Purpose::PolicyBatches, PolicyVersion(9));
+    let mut rng = Pcg64Mcg::seed_from_u64(9);
     trainer.replay().sample(&mut rng, 200, &mut drawn);
     let mut rows = drawn.observations.chunks(drawn.observations.len() / 200);
     let latent = trainer.config.vae.latent;

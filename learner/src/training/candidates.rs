@@ -78,7 +78,7 @@ impl Training<'_> {
 
     /// Records the effort of training, the first time that `flown` reach the configured success
     /// rate.
-    fn note_trained(&mut self, flown: &[CommittedEpisode]) {
+    pub(super) fn note_trained(&mut self, flown: &[CommittedEpisode]) {
         let sum = |of: fn(&CommittedEpisode) -> u8| {
             flown
                 .iter()
@@ -106,7 +106,7 @@ impl Training<'_> {
         self.progress.trained = Some(trained);
     }
 
-    fn is_candidate(&self) -> bool {
+    pub(super) fn is_candidate(&self) -> bool {
         let progress = &self.progress;
         let last = progress.episodes == self.config.run.episodes
             && progress.latest_candidate != Some(progress.episodes);

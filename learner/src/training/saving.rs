@@ -104,12 +104,13 @@ impl<'a> Training<'a> {
             timer,
             progress: saved.clone(),
             saved,
+            saved_snapshots: snapshots.clone(),
             resumes,
             in_flight: VecDeque::new(),
             open_episode: None,
             snapshots,
         };
-        training.remove_results_after_checkpoint()?;
+        training.reset_results()?;
         training.restore_orders()?;
         Ok(training)
     }
@@ -139,9 +140,9 @@ impl<'a> Training<'a> {
         self.publish()
     }
 
-    /// Removes results that an earlier incarnation wrote after the checkpoint: they will be
-    /// computed again.
-    fn remove_results_after_checkpoint(&mut self) -> Result<(), TrainingError> {
+    /// Resets the result files to the checkpoint that the progress is that of: what was written
+    /// after it will be computed again.
+    fn reset_results(&mut self) -> Result<(), TrainingError> {
         let best = self
             .progress
             .best
@@ -205,14 +206,15 @@ impl<'a> Training<'a> {
         self.save_snapshot(self.progress.version(), &self.directory.latest_snapshot())?;
         self.timer.lap(Stage::Checkpoint, 0);
         let progress = self.full_progress();
+        let snapshots = self.snapshots.clone();
         let state = CheckpointState {
             progress: progress.clone(),
             tensors: self.trainer.tensors(),
             replay: self.trainer.replay().state(),
-            snapshots: self.snapshots.values().cloned().collect(),
+            snapshots: snapshots.values().cloned().collect(),
         };
         self.checkpoints.save(state, self.metrics.files())?;
-        self.saved = progress;
+        (self.saved, self.saved_snapshots) = (progress, snapshots);
         self.timer.lap(Stage::Checkpoint, 1);
         Ok(())
     }
@@ -262,6 +264,10 @@ impl<'a> Training<'a> {
         self.metrics.flush()?;
         self.metrics = resume_metrics(self.directory, &self.saved, &self.disk)?;
         self.metrics.flush()?;
+        // A better snapshot may have been found since.
+        self.progress = self.saved.clone();
+        self.snapshots = self.saved_snapshots.clone();
+        self.reset_results()?;
         Ok(self.saved.clone())
     }
 

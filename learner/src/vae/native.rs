@@ -3,8 +3,8 @@
 //! One step computes the loss of arXiv:1312.6114 with a squared reconstruction error, and its
 //! gradient, in the order of `step.rs`. Images are stored channels-last throughout, so that kernels
 //! read contiguous runs of memory in place. Gradients are written out by hand, layer by layer, and
-//! tested against autograd. All results are the same bits for any number of threads and on every
-//! processor.
+//! tested against autograd. All results are the same bits with every instruction set and for any
+//! number of threads; equality across types of processor is not promised (docs/reliability.md).
 
 mod batch;
 mod buffer;

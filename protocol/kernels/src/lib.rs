@@ -2,9 +2,9 @@
 //!
 //! Actors and learner compute the same layers, actors for one image at a time and the learner for
 //! whole minibatches, and both spend most of their time in matrix products. No library offers all
-//! that they need together: the same bits on every processor and for any number of threads, no
-//! memory allocation, little overhead for a small product, and convolutions that read images where
-//! they lie.
+//! that they need together: the same bits with every instruction set and for any number of threads,
+//! no memory allocation, little overhead for a small product, and convolutions that read images
+//! where they lie.
 //!
 //! **Every result is a function of its operands alone.** An element is the sum of its terms in one
 //! documented order, each added by a fused multiply-add. Instruction sets differ only in how many

@@ -200,8 +200,8 @@ impl Machine {
     }
 }
 
-/// Returns `true` if a folder is of this version: empty, or with a lock in it. Folders of version
-/// 0.1 hold no lock that would show whether their run is alive.
+/// Returns `true` if a folder is a run's: empty, or with a lock in it. A folder with content and
+/// without a lock could belong to a living process, and nothing would show it.
 fn is_ours(folder: &Path) -> io::Result<bool> {
     let has_lock = learner_lock(folder).exists() || supervisor_lock(folder).exists();
     Ok(has_lock || fs::read_dir(folder)?.next().is_none())
@@ -345,7 +345,7 @@ mod tests {
         for name in ["skein_00ab0000000000cd", "skein_report", "iox2_1"] {
             segment(machine, name);
         }
-        // A run of version 0.1 may be alive.
+        // Content without a lock: its owner may be alive.
         fs::create_dir_all(folders.join("skein-00000000000000dd/nodes")).unwrap();
         assert_eq!(machine.sweep(), SweepResult::default());
         assert_eq!(fs::read_dir(machine.segments).unwrap().count(), 3);

@@ -134,8 +134,8 @@ impl From<Device> for String {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Engine {
-    /// Skein's own kernels, on the processor: bit-identical results on every processor and for any
-    /// number of threads.
+    /// Skein's own kernels, on the processor: bit-identical results with every instruction set and
+    /// for any number of threads.
     Native,
     /// libtorch with automatic gradients: the reference, and the engine for CUDA devices.
     Libtorch,

@@ -192,7 +192,7 @@ fn each_record_holds_the_observation_and_the_reward_of_its_step() {
             hit: None,
         };
         let expected = RewardTerms::of(&RewardSettings::default(), &report, &pair[1].depth);
-        assert_eq!(pair[0].reward_terms[3], expected.open_view);
+        assert_eq!(pair[0].reward_terms, expected.values());
         assert_eq!(pair[0].reward, pair[0].reward_terms.iter().sum::<f32>());
     }
 }

@@ -296,7 +296,7 @@ impl Simulator {
 
     /// Returns the obstacle that the body touches. It must touch one.
     fn obstacle(&self) -> Obstacle {
-        match self.world.touched_wall(&self.course) {
+        match self.world.touched_wall() {
             // A course has at most `MAX_WALLS` walls.
             Some(place) => Obstacle::Wall(place as u8 + 1),
             None => Obstacle::Corridor,

@@ -65,7 +65,7 @@ impl Learned {
 }
 
 /// Squared norm of a gradient. It is not finite if an element is not, or if it overflows. Sixteen
-/// partial sums keep the order of addition equal on every processor.
+/// partial sums keep the order of addition equal with every instruction set.
 pub fn squared_norm(isa: Isa, gradient: &[f32]) -> f32 {
     isa.vectorised(
         #[inline(always)]

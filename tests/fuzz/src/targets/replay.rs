@@ -10,7 +10,7 @@ use skein_learner::replay::{Minibatch, Replay, ReplayState, RingState};
 use skein_protocol::config::{Config, EncoderTraining};
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, MAX_LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, MAX_LATENT, REWARD_TERMS};
 
 use super::{ReaderDecision, Target, USUAL};
 use crate::script::Script;
@@ -143,7 +143,7 @@ pub(super) fn episode() -> CommittedEpisode {
         observations: vec![seen; 3],
         actions: vec![[0.0; ACTION]; 2],
         rewards: vec![1.0; 2],
-        reward_terms: vec![[0.0; 4]; 2],
+        reward_terms: vec![[0.0; REWARD_TERMS]; 2],
         level_up: vec![false, true],
         outcome: Some(Outcome::Collided),
         walls_passed: 1,
