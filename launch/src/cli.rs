@@ -27,7 +27,7 @@ pub(crate) enum Command {
     Run(RunArguments),
     #[command(after_long_help = ATTACH_NOTES)]
     Attach(AttachArguments),
-    Evaluate(skein_rollout::evaluate::Arguments),
+    Evaluate(skein_evaluate::Arguments),
     #[command(after_long_help = EXPERIMENT_NOTES)]
     Experiment(ExperimentArguments),
     Report(ReportArguments),

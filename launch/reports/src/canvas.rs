@@ -111,9 +111,13 @@ impl Canvas {
         let aside = path.with_extension("png.partial");
         self.write(&aside)
             .and_then(|()| fs::rename(&aside, path))
-            .map_err(|source| ReportError::Write {
-                path: path.to_owned(),
-                source,
+            .map_err(|source| {
+                // A partial picture is useless. If there is none, removing it does nothing.
+                let _ = fs::remove_file(&aside);
+                ReportError::Write {
+                    path: path.to_owned(),
+                    source,
+                }
             })
     }
 
@@ -198,5 +202,15 @@ mod tests {
             "red up to the middle, white from there"
         );
         assert!(!path.with_extension("png.partial").exists());
+    }
+
+    #[test]
+    fn a_picture_that_cannot_be_written_is_named_and_leaves_nothing_behind() {
+        let directory = tempfile::tempdir().unwrap();
+        let taken = directory.path().join("taken.png");
+        fs::create_dir(&taken).unwrap();
+        let error = Canvas::new(4, 4).save(&taken).unwrap_err().to_string();
+        assert!(error.contains("taken.png"), "{error}");
+        assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 1);
     }
 }
