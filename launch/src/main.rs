@@ -135,7 +135,7 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     let plots = draw(run, config);
     report_failures(&plots.failures);
     if !plots.failures.is_empty() {
-        let root = shell_word(run);
+        let root = shell_word(&run.root().display().to_string());
         eprintln!("skein: the run is not affected; to draw again: skein report --run {root}");
     }
     let ended = outcome.map_err(|source| Unfinished {
@@ -194,17 +194,16 @@ fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
 
 /// Prints the command that resumes an incomplete run.
 fn print_resume_command(run: &RunDirectory) {
-    let root = shell_word(run);
+    let root = shell_word(&run.root().display().to_string());
     eprintln!("skein: to resume this run: launch/run_local.sh --resume {root}");
 }
 
-/// Returns the directory of a run as a word for a shell, quoted if necessary.
-fn shell_word(run: &RunDirectory) -> String {
-    let root = run.root().display().to_string();
+/// Returns `text` as one word of a shell command, quoted if necessary.
+fn shell_word(text: &str) -> String {
     let is_plain = |character: char| character.is_alphanumeric() || "/._-+=:,@".contains(character);
-    match root.chars().all(is_plain) {
-        true => root,
-        false => format!("'{}'", root.replace('\'', r"'\''")),
+    match !text.is_empty() && text.chars().all(is_plain) {
+        true => text.to_owned(),
+        false => format!("'{}'", text.replace('\'', r"'\''")),
     }
 }
 
