@@ -155,9 +155,15 @@ impl ExperimentArguments {
         let report = findings.write()?;
         println!("{}", report.text.trim_end());
         eprintln!("skein: report: {}", report.document.display());
+        for failure in &report.failures {
+            eprintln!("skein: a plot could not be drawn: {}", with_causes(failure));
+        }
         let Some(publication) = publication else {
             return Ok(());
         };
+        if !report.failures.is_empty() {
+            bail!("not published: a picture is missing; see above");
+        }
         if !findings.is_whole() {
             bail!(
                 "not published: only {} of {} runs are complete",

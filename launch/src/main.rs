@@ -136,7 +136,7 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     report_failures(&plots.failures);
     if !plots.failures.is_empty() {
         let root = shell_word(&run.root().display().to_string());
-        eprintln!("skein: the run is not affected; to draw again: skein report --run {root}");
+        eprintln!("skein: everything else is kept; to draw again: skein report --run {root}");
     }
     let ended = outcome.map_err(|source| Unfinished {
         run: run.clone(),

@@ -116,13 +116,11 @@ impl Findings<'_> {
         }
         for (number, [label, seeds]) in self.differences() {
             for entry in &flown.suite.entries {
-                let [completed, r] = [
-                    |course: &CourseEvaluation| course.completed,
-                    |course| course.r,
-                ]
-                .map(|value: fn(&CourseEvaluation) -> f64| {
+                let of_entry = |value: fn(&CourseEvaluation) -> f64| {
                     move |result: &RunResult| entry_of(result, &entry.name).map(value)
-                });
+                };
+                let completed = of_entry(|course| course.completed);
+                let r = of_entry(|course| course.r);
                 let mean = self.pairs(number, completed).and_then(|pairs| {
                     let (values, reference) = pairs;
                     Bootstrap::new(values.len(), RESAMPLES).difference_of_means(&values, &reference)
@@ -303,7 +301,9 @@ impl Findings<'_> {
         let cell = |of_run: &RunMeasure| {
             let difference = self.difference(arm, of_run);
             difference.map_or(NOTHING.to_owned(), |estimate| {
-                with_interval(estimate, |value| format!("{value:+.2}"))
+                with_interval(estimate, |value| {
+                    signed(value, &|size| format!("{size:.2}"))
+                })
             })
         };
         measures.iter().map(cell).collect()
@@ -481,19 +481,29 @@ fn percent(estimate: Estimate) -> String {
 
 /// Returns a difference of rates.
 fn rate_difference(estimate: Estimate) -> String {
-    with_interval(estimate, |value| format!("{value:+.3}"))
+    with_interval(estimate, |value| {
+        signed(value, &|size| format!("{size:.3}"))
+    })
 }
 
 /// Returns a difference of shares, in percentage points.
 fn points(estimate: Estimate) -> String {
-    let numbers = with_interval(estimate, |value| format!("{:+.1}", 100.0 * value));
+    let numbers = with_interval(estimate, |value| {
+        signed(value, &|size| format!("{:.1}", 100.0 * size))
+    });
     format!("{numbers} points")
 }
 
 /// Returns a difference with its sign; `show` shows its size.
 fn signed(value: f64, show: &dyn Fn(f64) -> String) -> String {
-    let sign = if value < 0.0 { '-' } else { '+' };
-    format!("{sign}{}", show(value.abs()))
+    let size = show(value.abs());
+    // What is shown as zero has no direction.
+    let sign = if value < 0.0 && size != show(0.0) {
+        '-'
+    } else {
+        '+'
+    };
+    format!("{sign}{size}")
 }
 
 fn share(value: f64) -> String {
@@ -555,6 +565,17 @@ mod tests {
             "| arm | seeds |              R |\n|-----|------:|---------------:|\n| one |     3 | \
              0.5 [0.4, 0.6] |"
         );
+    }
+
+    #[test]
+    fn a_difference_has_a_sign_unless_it_is_shown_as_zero() {
+        let show = |value: f64| signed(value, &|size| format!("{size:.1}"));
+        assert_eq!(
+            [0.26, -0.26, -1e-9, 0.0].map(show),
+            ["+0.3", "-0.3", "+0.0", "+0.0"]
+        );
+        let late = signed(-75.0, &|secs| Clock(secs).to_string());
+        assert_eq!(late, "-1:15");
     }
 
     #[test]

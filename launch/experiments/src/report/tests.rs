@@ -8,7 +8,7 @@ use skein_protocol::ids::PolicyVersion;
 use skein_protocol::transition::Outcome;
 
 use super::*;
-use crate::definition::{Axis, Measure, TableKind};
+use crate::definition::{Axis, CurveSpec, Measure, TableKind};
 use crate::plan::PlannedRun;
 use crate::results;
 
@@ -193,6 +193,40 @@ fn an_arm_is_compared_with_the_first_seed_by_seed() {
         "{}",
         suite[6]
     );
+}
+
+#[test]
+fn a_picture_that_cannot_be_drawn_costs_only_itself() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut experiment, plan) = two_runs(folder.path());
+    let curve = |over| CurveSpec {
+        measure: Measure::Return,
+        over,
+    };
+    experiment.curves = vec![curve(Axis::Steps), curve(Axis::Episodes)];
+    let rows = "steps,walls_passed,return\n4,2,1.0\n4,2,1.0\n4,2,1.0\n4,2,1.0\n";
+    for run in &plan.runs {
+        fs::write(run.directory.episodes_csv(), rows).unwrap();
+    }
+    let report = plan.root.join(crate::plan::REPORT);
+    // In the place of a picture.
+    fs::create_dir_all(report.join("return_over_steps.png")).unwrap();
+    let results = results::read(&plan).unwrap();
+    let written = findings(&experiment, &plan, &results).write().unwrap();
+    let files: Vec<_> = written
+        .pictures
+        .iter()
+        .map(|picture| &picture.file[..])
+        .collect();
+    assert_eq!(files, ["return_over_episodes.png"]);
+    let [failure] = &written.failures[..] else {
+        panic!("{:?}", written.failures)
+    };
+    assert!(
+        failure.to_string().contains("return_over_steps.png"),
+        "{failure}"
+    );
+    assert!(written.document.is_file() && report.join("runs.csv").is_file());
 }
 
 #[test]
