@@ -10,13 +10,11 @@ use super::canvas::{Area, font, px};
 use super::trajectories::{CORRIDOR, LEFT, RIGHT, Trajectory, WALL, WIDTH, colour_of, opacity_of};
 
 /// Largest width of a view.
-const MOST_WIDTH: f32 = 170.0;
+const MOST_WIDTH: f32 = 150.0;
 /// Largest height of a view.
-const MOST_HEIGHT: f32 = 150.0;
+const MOST_HEIGHT: f32 = 130.0;
 /// Least gap between two views in a row: their labels need it.
 const GAP: u32 = 24;
-/// Height of the line above the views.
-const HEADING: u32 = 26;
 /// Height of the label above each view.
 const LABEL: u32 = 22;
 /// Space below a row of views.
@@ -74,10 +72,10 @@ impl<'a> FrontViews<'a> {
         LABEL + (self.course.corridor().height_m * self.scale) as u32 + BELOW
     }
 
-    /// Returns the height of all views with their heading, saved pixels.
+    /// Returns the height of all views, saved pixels.
     pub(super) fn height(&self) -> u32 {
         let rows = self.places.last().map_or(0, |(_, row)| row + 1);
-        HEADING + rows * self.row_height()
+        rows * self.row_height()
     }
 
     /// Draws the views below `top`.
@@ -87,19 +85,13 @@ impl<'a> FrontViews<'a> {
         episodes: &[Trajectory],
         top: u32,
     ) -> Result<(), Box<dyn std::error::Error>> {
-        area.draw_text(
-            "Walls as the drone meets them. Dots: where its centre crossed; crosses: where it \
-             ended at the wall.",
-            &font(14),
-            (px(LEFT) as i32, px(top) as i32),
-        )?;
         for ((number, wall), &(left, row)) in (1..).zip(self.course.walls()).zip(&self.places) {
             let view = FrontView {
                 course: self.course,
                 wall,
                 scale: self.scale * px(1) as f32,
                 left: px(left) as f32,
-                top: px(top + HEADING + row * self.row_height() + LABEL) as f32,
+                top: px(top + row * self.row_height() + LABEL) as f32,
             };
             view.draw(area, number, episodes)?;
         }

@@ -23,7 +23,7 @@ const LONGEST_NAME: usize = 60;
 pub(super) const WIDTH: u32 = 1280;
 pub(super) const LEFT: u32 = 70;
 pub(super) const RIGHT: u32 = 20;
-const TOP: u32 = 52;
+const TOP: u32 = 72;
 const CAPTION: u32 = 34;
 /// Height of the line on courses that are not shown.
 const OMITTED: u32 = 34;
@@ -458,6 +458,12 @@ fn draw_legend(area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
         "Evaluation episodes",
         &font(22),
         (px(LEFT) as i32, y - px(11) as i32),
+    )?;
+    area.draw_text(
+        "Below each course: its walls as the drone meets them. A dot: the drone's centre crossed \
+         there. A cross: it ended at the wall.",
+        &font(15),
+        (px(LEFT) as i32, y + px(22) as i32),
     )?;
     let mut x = px(LEFT + 230) as i32;
     for (label, colour) in [
