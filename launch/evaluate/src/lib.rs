@@ -94,7 +94,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let Some(file) = &arguments.plot {
         check_plottable(file)?;
         for (option, other) in [("--json", &arguments.json), ("--record", &arguments.record)] {
-            if other.as_ref() == Some(file) {
+            if other.as_ref().is_some_and(|other| is_same(other, file)) {
                 bail!(
                     "--plot and {option} name the same file, {}: name two",
                     file.display()
@@ -158,6 +158,21 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         plot::draw(&courses, &evaluated.episodes, file)?;
     }
     Ok(())
+}
+
+/// `true` if two paths name one file, whether or not it exists.
+fn is_same(one: &Path, other: &Path) -> bool {
+    let resolved = |file: &Path| {
+        fs::canonicalize(file).ok().or_else(|| {
+            let folder = std::path::absolute(file)
+                .ok()?
+                .parent()?
+                .canonicalize()
+                .ok()?;
+            Some(folder.join(file.file_name()?))
+        })
+    };
+    one == other || resolved(one).is_some_and(|one| resolved(other) == Some(one))
 }
 
 /// Checks that a picture can be written to `file`. A picture replaces the file, so nothing but a
