@@ -173,9 +173,10 @@ impl FrontView<'_> {
         episodes: &[Trajectory],
     ) -> Result<(), Box<dyn std::error::Error>> {
         for episode in episodes {
-            let style = colour_of(episode.outcome).mix(opacity_of(episode.outcome));
+            let opacity = opacity_of(episode.outcome, episodes.len());
+            let style = colour_of(episode.outcome).mix(opacity);
             if let Some(point) = crossing(episode, self.wall).filter(|at| self.contains(*at)) {
-                area.draw(&Circle::new(self.at(point), px(2), style.filled()))?;
+                area.draw(&Circle::new(self.at(point), px(3), style.filled()))?;
             }
         }
         for episode in episodes {

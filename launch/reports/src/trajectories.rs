@@ -286,7 +286,7 @@ impl Panel<'_> {
             .iter()
             .partition(|episode| episode.outcome == Outcome::ReachedEnd);
         for episode in well.into_iter().chain(wrong) {
-            self.draw_episode(area, episode)?;
+            self.draw_episode(area, episode, opacity_of(episode.outcome, episodes.len()))?;
         }
         for wall in self.course.walls() {
             let x_m = (wall.x_m(), wall.x_m() + self.course.wall_thickness_m());
@@ -317,13 +317,14 @@ impl Panel<'_> {
         &self,
         area: &Area<'_>,
         episode: &Trajectory,
+        opacity: f64,
     ) -> Result<(), Box<dyn std::error::Error>> {
         let points: Vec<_> = episode
             .points_m
             .iter()
             .map(|&point| self.at(point[0], self.view.across_m(point)))
             .collect();
-        let (colour, opacity) = (colour_of(episode.outcome), opacity_of(episode.outcome));
+        let colour = colour_of(episode.outcome);
         area.draw(&PathElement::new(
             points.clone(),
             colour.mix(opacity).stroke_width(px(1)),
@@ -371,10 +372,11 @@ pub(super) fn colour_of(outcome: Outcome) -> RGBColor {
     }
 }
 
-/// Returns the opacity of an episode that ended like this. Failed episodes are few and looked for.
-pub(super) fn opacity_of(outcome: Outcome) -> f64 {
+/// Returns the opacity of one of `episodes` that ended like this. Failed episodes are few and
+/// looked for; of many that reached the end, each is pale.
+pub(super) fn opacity_of(outcome: Outcome, episodes: usize) -> f64 {
     match outcome {
-        Outcome::ReachedEnd => 0.3,
+        Outcome::ReachedEnd => (5.0 / episodes as f64).clamp(0.3, 0.9),
         Outcome::Collided | Outcome::TimedOut => 0.9,
     }
 }
