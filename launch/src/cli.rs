@@ -27,7 +27,7 @@ pub(crate) enum Command {
     Run(RunArguments),
     #[command(after_long_help = ATTACH_NOTES)]
     Attach(AttachArguments),
-    Evaluate(skein_rollout::evaluate::Arguments),
+    Evaluate(skein_evaluate::Arguments),
     #[command(after_long_help = EXPERIMENT_NOTES)]
     Experiment(ExperimentArguments),
     Report(ReportArguments),
@@ -122,8 +122,9 @@ Exit status: 0 the run ended, 1 failed, 2 wrong arguments, 130 interrupted.";
 /// trained again: a link leads there.
 #[derive(Args)]
 pub(crate) struct ExperimentArguments {
-    /// Name of the experiment, a file configs/experiments/NAME.toml.
-    #[arg(required_unless_present = "list")]
+    /// Name of the experiment, a file configs/experiments/NAME.toml, or the path of a file
+    /// elsewhere.
+    #[arg(required_unless_present = "list", value_name = "NAME|FILE")]
     pub(crate) name: Option<String>,
     /// Print the experiments, with the number of runs and the question of each.
     #[arg(long, conflicts_with = "name")]

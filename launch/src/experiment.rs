@@ -6,7 +6,7 @@ use std::thread;
 
 use anyhow::{Context, Result, bail, ensure};
 use skein_experiments::board::ExperimentDisplay;
-use skein_experiments::definition::{Experiment, names};
+use skein_experiments::definition::{Experiment, is_path, names};
 use skein_experiments::plan::{ExperimentPlan, RunState, root};
 use skein_experiments::report::{Findings, Publication};
 use skein_experiments::results;
@@ -16,6 +16,7 @@ use skein_launch::interrupts::{interrupts, runtime};
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
 
 use crate::cli::ExperimentArguments;
+use crate::shell_word;
 
 /// Carries out the command. The exit status shows whether every run is complete.
 pub(crate) fn carry_out(arguments: &ExperimentArguments) -> Result<ExitCode> {
@@ -64,6 +65,12 @@ impl ExperimentArguments {
                 "--publish needs the whole experiment: \
                      remove --publish, or --episodes and any --seeds below {}",
                 plural(experiment.seeds as usize, "seed")
+            );
+        }
+        if self.publish && is_path(name) {
+            bail!(
+                "--publish is for the experiments of configs/experiments, by name: \
+                     remove --publish, or put the file there and give its name"
             );
         }
         let publication = self
@@ -148,9 +155,15 @@ impl ExperimentArguments {
         let report = findings.write()?;
         println!("{}", report.text.trim_end());
         eprintln!("skein: report: {}", report.document.display());
+        for failure in &report.failures {
+            eprintln!("skein: a plot could not be drawn: {}", with_causes(failure));
+        }
         let Some(publication) = publication else {
             return Ok(());
         };
+        if !report.failures.is_empty() {
+            bail!("not published: a picture is missing; see above");
+        }
         if !findings.is_whole() {
             bail!(
                 "not published: only {} of {} runs are complete",
@@ -166,7 +179,8 @@ impl ExperimentArguments {
 
     /// Returns the command that repeats this one.
     fn command(&self, experiment: &Experiment, options: Options) -> String {
-        let mut command = format!("launch/experiment.sh {}", experiment.name);
+        let named = self.name.as_deref().unwrap_or(&experiment.name);
+        let mut command = format!("launch/experiment.sh {}", shell_word(named));
         let mut option = |name: &str, value: Option<String>| {
             if let Some(value) = value {
                 command.push_str(&format!(" {name} {value}"));
@@ -186,7 +200,9 @@ impl ExperimentArguments {
             option("--jobs", self.jobs.map(|jobs| jobs.to_string()));
             option(
                 "--runs",
-                self.runs.as_ref().map(|runs| runs.display().to_string()),
+                self.runs
+                    .as_ref()
+                    .map(|runs| shell_word(&runs.display().to_string())),
             );
             option("--publish", self.publish.then(String::new));
         }

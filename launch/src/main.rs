@@ -50,9 +50,7 @@ fn main() -> ExitCode {
     let outcome = match Cli::parse().command {
         Command::Run(arguments) => run(&arguments).map(status),
         Command::Attach(arguments) => attach(&arguments).map(status),
-        Command::Evaluate(arguments) => {
-            skein_rollout::evaluate::run(&arguments).map(|()| ExitCode::SUCCESS)
-        }
+        Command::Evaluate(arguments) => skein_evaluate::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Experiment(arguments) => experiment::carry_out(&arguments),
         Command::Report(arguments) => report(&arguments),
     };
@@ -134,8 +132,11 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
 
     // Plots are optional: a run that failed may still have left something to draw, and a run that
     // succeeded is a success without them.
-    if let Err(error) = draw(run, config) {
-        eprintln!("skein: some plots could not be drawn: {error}");
+    let plots = draw(run, config);
+    report_failures(&plots.failures);
+    if !plots.failures.is_empty() {
+        let root = shell_word(&run.root().display().to_string());
+        eprintln!("skein: everything else is kept; to draw again: skein report --run {root}");
     }
     let ended = outcome.map_err(|source| Unfinished {
         run: run.clone(),
@@ -193,13 +194,17 @@ fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
 
 /// Prints the command that resumes an incomplete run.
 fn print_resume_command(run: &RunDirectory) {
-    let root = run.root().display().to_string();
-    let is_plain = |character: char| character.is_alphanumeric() || "/._-+=:,@".contains(character);
-    let root = match root.chars().all(is_plain) {
-        true => root,
-        false => format!("'{}'", root.replace('\'', r"'\''")),
-    };
+    let root = shell_word(&run.root().display().to_string());
     eprintln!("skein: to resume this run: launch/run_local.sh --resume {root}");
+}
+
+/// Returns `text` as one word of a shell command, quoted if necessary.
+fn shell_word(text: &str) -> String {
+    let is_plain = |character: char| character.is_alphanumeric() || "/._-+=:,@".contains(character);
+    match !text.is_empty() && text.chars().all(is_plain) {
+        true => text.to_owned(),
+        false => format!("'{}'", text.replace('\'', r"'\''")),
+    }
 }
 
 fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
@@ -248,18 +253,54 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
 fn report(arguments: &ReportArguments) -> anyhow::Result<ExitCode> {
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
-    for picture in draw(&run, &config)? {
+    let plots = draw(&run, &config);
+    for picture in &plots.pictures {
         println!("{}", picture.display());
+    }
+    report_failures(&plots.failures);
+    if !plots.failures.is_empty() {
+        return Ok(ExitCode::FAILURE);
+    }
+    if plots.pictures.is_empty() {
+        eprintln!(
+            "skein: {} holds nothing to draw yet: no episode has ended",
+            run.root().display()
+        );
     }
     Ok(ExitCode::SUCCESS)
 }
 
-/// Draws every plot that the run left the files for.
-fn draw(run: &RunDirectory, config: &Config) -> anyhow::Result<Vec<PathBuf>> {
-    let courses = load_courses(config)?;
+/// Plots of a run, and a message for each that could not be drawn.
+struct Plots {
+    pictures: Vec<PathBuf>,
+    failures: Vec<String>,
+}
+
+/// Draws every plot that the run left the files for. A course that cannot be read costs only what
+/// needs it.
+fn draw(run: &RunDirectory, config: &Config) -> Plots {
+    let mut failures = Vec::new();
+    let courses = load_courses(config).unwrap_or_else(|error| {
+        failures.push(with_causes(&error));
+        Vec::new()
+    });
+    let ideal = ideal_walls_passed(config)
+        .map_err(|error| failures.push(with_causes(&error)))
+        .ok();
+    failures.dedup();
     let window = config.evaluation.window_episodes as usize;
-    let ideal = ideal_walls_passed(config)?;
-    Ok(skein_reports::draw_all(run, &courses, window, ideal)?)
+    let drawn = skein_reports::draw_all(run, &courses, window, ideal);
+    failures.extend(drawn.failures.iter().map(|error| with_causes(error)));
+    Plots {
+        pictures: drawn.pictures,
+        failures,
+    }
+}
+
+fn report_failures(failures: &[String]) {
+    for failure in failures {
+        eprintln!("skein: a plot could not be drawn: {failure}");
+    }
 }
 
 /// Removes the remains of this user's runs whose processes were all killed.

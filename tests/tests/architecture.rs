@@ -108,6 +108,18 @@ fn every_package_has_only_its_allowed_dependencies() {
                 "skein-inference",
                 "skein-kernels",
                 "skein-protocol",
+                "skein-simulator",
+            ],
+            &[torch, transport, tokio],
+        ),
+        (
+            "skein-evaluate",
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-reports",
+                "skein-rollout",
                 "skein-run",
                 "skein-simulator",
             ],
@@ -168,6 +180,7 @@ fn every_package_has_only_its_allowed_dependencies() {
         (
             "skein-launch",
             &[
+                "skein-evaluate",
                 "skein-experiments",
                 "skein-inference",
                 "skein-kernels",

@@ -49,7 +49,9 @@ pub struct Evaluation<'a> {
 pub enum Keep {
     /// Scores only.
     Scores,
-    /// Every record, 9.3 KiB per step.
+    /// Also the positions in the first so many episodes of each entry, 12 bytes per step.
+    Positions(u64),
+    /// Every record and position, 9.3 KiB per step.
     Records,
 }
 
@@ -69,6 +71,8 @@ pub struct EvaluatedEpisode {
     pub score: EpisodeScore,
     /// Walls of the course.
     pub walls: usize,
+    /// Positions of the drone at each step and at the end, world frame, metres, if they are kept.
+    pub positions_m: Vec<[f32; 3]>,
     /// Its steps and its closing record, if they are kept.
     pub records: Vec<Box<TransitionRecord>>,
 }
@@ -236,8 +240,12 @@ impl Evaluation<'_> {
             segment: None,
         };
         let mut memory = MemoryLink {
-            keep: self.keep,
+            keep: match self.keep {
+                Keep::Positions(first) if episode >= first => Keep::Scores,
+                keep => keep,
+            },
             walls: 0,
+            positions_m: Vec::new(),
             spare: Vec::new(),
             sent: Vec::new(),
         };
@@ -245,6 +253,7 @@ impl Evaluation<'_> {
             Ok(Some(score)) => Ok(EvaluatedEpisode {
                 score,
                 walls: memory.walls,
+                positions_m: memory.positions_m,
                 records: memory.sent,
             }),
             Err(EpisodeError::Fault(fault)) => {
@@ -268,6 +277,7 @@ struct MemoryLink {
     keep: Keep,
     /// Walls of the course, from the closing record.
     walls: usize,
+    positions_m: Vec<[f32; 3]>,
     spare: Vec<Box<TransitionRecord>>,
     sent: Vec<Box<TransitionRecord>>,
 }
@@ -285,8 +295,11 @@ impl RecordLink for MemoryLink {
 
     fn send(&mut self, record: Box<TransitionRecord>) -> Result<(), Infallible> {
         self.walls = record.course_walls.into();
+        if self.keep != Keep::Scores {
+            self.positions_m.push(record.position_m);
+        }
         match self.keep {
-            Keep::Scores => self.spare.push(record),
+            Keep::Scores | Keep::Positions(_) => self.spare.push(record),
             Keep::Records => self.sent.push(record),
         }
         Ok(())
@@ -384,6 +397,16 @@ mod tests {
                 .flatten()
                 .all(|episode| episode.records.is_empty())
         );
+        let positions = evaluated(2, Keep::Positions(3));
+        assert_eq!(positions.report, records.report);
+        for (some, all) in positions.episodes.iter().zip(&records.episodes) {
+            for (number, (some, all)) in some.iter().zip(all).enumerate() {
+                let recorded: Vec<_> = all.records.iter().map(|at| at.position_m).collect();
+                assert_eq!(all.positions_m, recorded);
+                let kept = if number < 3 { recorded } else { Vec::new() };
+                assert_eq!((&some.positions_m, some.records.len()), (&kept, 0));
+            }
+        }
         let starts: Vec<_> = records.episodes[0]
             .iter()
             .map(|episode| episode.records[0].position_m)

@@ -8,7 +8,6 @@
 pub mod agent;
 pub mod courses;
 pub mod environment_loop;
-pub mod evaluate;
 pub mod evaluation;
 pub mod recording;
 #[cfg(test)]

@@ -404,6 +404,7 @@ mod tests {
         EvaluatedEpisode {
             score,
             walls: 5,
+            positions_m: Vec::new(),
             records: (first..first + records).map(record).collect(),
         }
     }

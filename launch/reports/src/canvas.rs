@@ -6,7 +6,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Once;
 
 use plotters::coord::Shift;
@@ -103,17 +103,23 @@ impl Canvas {
         }
     }
 
-    /// Writes the picture as PNG. An existing picture is replaced atomically.
+    /// Writes the picture as PNG. An existing picture is replaced atomically; if a link names it,
+    /// the link stays.
     ///
     /// # Errors
     /// [`ReportError::Write`] names the file.
     pub(super) fn save(&self, path: &Path) -> Result<(), ReportError> {
-        let aside = path.with_extension("png.partial");
+        let target = linked(path);
+        let aside = target.with_extension("png.partial");
         self.write(&aside)
-            .and_then(|()| fs::rename(&aside, path))
-            .map_err(|source| ReportError::Write {
-                path: path.to_owned(),
-                source,
+            .and_then(|()| fs::rename(&aside, &target))
+            .map_err(|source| {
+                // A partial picture is useless. If there is none, removing it does nothing.
+                let _ = fs::remove_file(&aside);
+                ReportError::Write {
+                    path: path.to_owned(),
+                    source,
+                }
             })
     }
 
@@ -149,6 +155,16 @@ impl Canvas {
         }
         small
     }
+}
+
+/// Returns the file to which `path` leads if it is a link, which may not exist yet.
+fn linked(path: &Path) -> PathBuf {
+    let there = fs::read_link(path).map(|target| match path.parent() {
+        Some(folder) => folder.join(target),
+        None => target,
+    });
+    let existing = fs::canonicalize(path).ok();
+    existing.or(there.ok()).unwrap_or_else(|| path.to_owned())
 }
 
 fn register_plot_font() {
@@ -198,5 +214,26 @@ mod tests {
             "red up to the middle, white from there"
         );
         assert!(!path.with_extension("png.partial").exists());
+    }
+
+    #[test]
+    fn a_link_to_a_picture_stays_a_link() {
+        let directory = tempfile::tempdir().unwrap();
+        let at = |name: &str| directory.path().join(name);
+        std::os::unix::fs::symlink("picture.png", at("link.png")).unwrap();
+        for _ in ["the picture is new", "and replaced"] {
+            Canvas::new(4, 4).save(&at("link.png")).unwrap();
+            assert!(at("link.png").is_symlink() && at("picture.png").is_file());
+        }
+    }
+
+    #[test]
+    fn a_picture_that_cannot_be_written_is_named_and_leaves_nothing_behind() {
+        let directory = tempfile::tempdir().unwrap();
+        let taken = directory.path().join("taken.png");
+        fs::create_dir(&taken).unwrap();
+        let error = Canvas::new(4, 4).save(&taken).unwrap_err().to_string();
+        assert!(error.contains("taken.png"), "{error}");
+        assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 1);
     }
 }

@@ -81,14 +81,15 @@ pub(super) fn draw_return(
 }
 
 /// Draws the walls passed, averaged over `window` episodes (paper, figure 10). `ideal` is the
-/// average of an agent that passes every wall: episodes start at each of the levels in turn.
+/// average of an agent that passes every wall: episodes start at each of the levels in turn. The
+/// picture lacks this level if it is not known.
 ///
 /// # Errors
 /// Returns [`ReportError`] if the picture cannot be drawn or written.
 pub(super) fn draw_walls_passed(
     episodes: &[EpisodeRow],
     window: usize,
-    ideal: f64,
+    ideal: Option<f64>,
     path: &Path,
 ) -> Result<(), ReportError> {
     let values: Vec<f64> = episodes
@@ -98,25 +99,28 @@ pub(super) fn draw_walls_passed(
     EpisodeCurve {
         title: format!("Walls passed, average over {window} episodes"),
         y_label: "walls passed",
-        range: (0.0, ideal * 1.15),
+        range: (
+            0.0,
+            ideal.map_or_else(|| padded_range(&values).1, |ideal| ideal * 1.15),
+        ),
         values,
         window,
         raw: RawValues::Hidden,
-        level: Some((ideal, format!("all walls passed: {ideal}"))),
+        level: ideal.map(|ideal| (ideal, format!("all walls passed: {ideal}"))),
     }
     .save(path)
 }
 
 /// Returns the mean over the last `window` values at each position, or over fewer at the beginning.
+///
+/// Each sum is computed again, oldest value first. A running sum would drift: after a huge value
+/// has left the window, its rounding error would stay.
 pub fn trailing_mean(values: &[f64], window: usize) -> Vec<f64> {
-    let mut sum = 0.0;
-    (0..values.len())
-        .map(|i| {
-            sum += values[i];
-            if i >= window {
-                sum -= values[i - window];
-            }
-            sum / (i + 1).min(window) as f64
+    let window = window.max(1);
+    (1..=values.len())
+        .map(|end| {
+            let latest = &values[end.saturating_sub(window)..end];
+            latest.iter().sum::<f64>() / latest.len() as f64
         })
         .collect()
 }
@@ -267,6 +271,13 @@ mod tests {
         );
         assert_eq!(trailing_mean(&[2.0, 4.0], 50), [2.0, 3.0]);
         assert!(trailing_mean(&[], 50).is_empty());
+        assert_eq!(trailing_mean(&[2.0, 4.0], 0), [2.0, 4.0]);
+    }
+
+    #[test]
+    fn a_huge_value_leaves_no_trace_after_it_has_left_the_window() {
+        let values = [1e30, 0.125, 0.25, 0.5];
+        assert_eq!(trailing_mean(&values, 2)[2..], [0.1875, 0.375]);
     }
 
     #[test]

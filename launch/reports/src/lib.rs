@@ -7,17 +7,19 @@ mod clock;
 pub mod comparison;
 mod courses;
 pub mod curves;
+mod front_views;
 pub mod growth;
 mod reconstructions;
 mod trajectories;
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use skein_run::RunDirectory;
 
 pub use clock::Clock;
 pub use courses::{NamedCourse, ideal_walls_passed, load_courses};
+pub use trajectories::{FlownCourse, MOST_DRAWN, Trajectory, draw_trajectories};
 
 /// Reason why a plot could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -54,79 +56,104 @@ pub enum ReportError {
 }
 
 /// Contents of the files to be drawn. A run that ended early has fewer.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct RunMaterial {
     episodes: Option<Vec<curves::EpisodeRow>>,
     reconstructions: Option<reconstructions::Pairs>,
-    paths: Option<trajectories::TrajectoriesByCourse>,
+    trajectories: Option<trajectories::TrajectoriesByCourse>,
 }
 
 impl RunMaterial {
-    /// Reads all files before anything is drawn.
-    ///
-    /// # Errors
-    /// [`ReportError`] names the invalid file.
-    pub fn read(run: &RunDirectory) -> Result<Self, ReportError> {
-        Ok(Self {
-            episodes: existing(run.episodes_csv())
-                .map(|path| curves::read_episodes(&path))
-                .transpose()?,
-            reconstructions: existing(run.reconstructions())
-                .map(|path| reconstructions::Pairs::read(&path))
-                .transpose()?,
-            paths: existing(run.evaluation_trajectories_csv())
-                .map(|path| trajectories::read_trajectories(&path))
-                .transpose()?,
-        })
+    /// Reads all files before anything is drawn. Also returns a [`ReportError`] for each file that
+    /// is invalid; the others are read nevertheless.
+    pub fn read(run: &RunDirectory) -> (Self, Vec<ReportError>) {
+        let mut failures = Vec::new();
+        let material = Self {
+            episodes: existing(run.episodes_csv(), curves::read_episodes, &mut failures),
+            reconstructions: existing(
+                run.reconstructions(),
+                reconstructions::Pairs::read,
+                &mut failures,
+            ),
+            trajectories: existing(
+                run.evaluation_trajectories_csv(),
+                trajectories::read_trajectories,
+                &mut failures,
+            ),
+        };
+        (material, failures)
     }
 }
 
-/// Draws every plot whose input exists, and returns the pictures. A run that ended early has fewer.
+/// Plots of a run.
+#[derive(Debug, Default)]
+pub struct DrawnPlots {
+    /// The pictures.
+    pub pictures: Vec<PathBuf>,
+    /// A [`ReportError`] for each file that is invalid and each picture that cannot be written.
+    pub failures: Vec<ReportError>,
+}
+
+/// Draws every plot whose input exists. A run that ended early has fewer. A plot that fails leaves
+/// the others alone.
 ///
-/// `courses` are those of the final evaluation. `window` is the number of episodes to average over,
-/// and `ideal_walls_passed` the average of a perfect agent.
-///
-/// # Errors
-/// [`ReportError`] names the invalid file, or the picture that cannot be written.
+/// `courses` are those of the final evaluation; without them, trajectories are not drawn. `window`
+/// is the number of episodes to average over, and `ideal_walls_passed` the average of a perfect
+/// agent, if it is known.
 pub fn draw_all(
     run: &RunDirectory,
     courses: &[NamedCourse],
     window: usize,
-    ideal_walls_passed: f64,
-) -> Result<Vec<PathBuf>, ReportError> {
-    let material = RunMaterial::read(run)?;
-    let mut pictures = Vec::new();
-    let mut picture = |name: &str| {
-        let path = run.plots().join(name);
-        pictures.push(path.clone());
-        path
+    ideal_walls_passed: Option<f64>,
+) -> DrawnPlots {
+    let (material, failures) = RunMaterial::read(run);
+    let mut plots = DrawnPlots {
+        pictures: Vec::new(),
+        failures,
     };
-    if let Some(episodes) = &material.episodes {
-        curves::draw_return(episodes, window, &picture("return.png"))?;
-        curves::draw_walls_passed(
-            episodes,
-            window,
-            ideal_walls_passed,
-            &picture("walls_passed.png"),
-        )?;
+    let mut picture = |name: &str, draw: &dyn Fn(&Path) -> Result<(), ReportError>| {
+        let path = run.plots().join(name);
+        match draw(&path) {
+            Ok(()) => plots.pictures.push(path),
+            Err(error) => plots.failures.push(error),
+        }
+    };
+    if let Some(episodes) = material.episodes.filter(|episodes| !episodes.is_empty()) {
+        picture("return.png", &|path| {
+            curves::draw_return(&episodes, window, path)
+        });
+        picture("walls_passed.png", &|path| {
+            curves::draw_walls_passed(&episodes, window, ideal_walls_passed, path)
+        });
     }
     if let Some(pairs) = &material.reconstructions {
-        reconstructions::draw(pairs, &picture("reconstructions.png"))?;
+        picture("reconstructions.png", &|path| {
+            reconstructions::draw(pairs, path)
+        });
     }
-    if let Some(paths) = &material.paths {
-        trajectories::draw(courses, paths, &picture("trajectories.png"))?;
+    let trajectories = material.trajectories.unwrap_or_default();
+    let flown = trajectories::flown(courses, &trajectories);
+    if !flown.is_empty() {
+        picture("trajectories.png", &|path| draw_trajectories(&flown, path));
     }
-    Ok(pictures)
+    plots
 }
 
-fn existing(path: PathBuf) -> Option<PathBuf> {
-    path.exists().then_some(path)
+/// Reads a file if it exists and is valid.
+fn existing<T>(
+    path: PathBuf,
+    read: impl FnOnce(&Path) -> Result<T, ReportError>,
+    failures: &mut Vec<ReportError>,
+) -> Option<T> {
+    if !path.exists() {
+        return None;
+    }
+    read(&path).map_err(|error| failures.push(error)).ok()
 }
 
 #[cfg(test)]
 mod tests {
     use std::fs;
-    use std::path::Path;
 
     use safetensors::Dtype;
     use safetensors::tensor::TensorView;
@@ -168,9 +195,9 @@ mod tests {
         )
         .unwrap();
 
-        let pictures = draw_all(&run, &[training()], 50, 3.0).unwrap();
-        assert_eq!(pictures.len(), 4);
-        for picture in pictures {
+        let plots = draw_all(&run, &[training()], 50, Some(3.0));
+        assert_eq!((plots.pictures.len(), plots.failures.len()), (4, 0));
+        for picture in plots.pictures {
             let bytes = fs::read(&picture).unwrap();
             assert!(
                 bytes.starts_with(b"\x89PNG") && bytes.ends_with(b"IEND\xaeB`\x82"),
@@ -184,8 +211,66 @@ mod tests {
     fn a_run_that_ended_early_has_the_pictures_of_its_files() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
-        assert!(draw_all(&run, &[training()], 50, 3.0).unwrap().is_empty());
+        let drawn = || {
+            let plots = draw_all(&run, &[training()], 50, Some(3.0));
+            assert!(plots.failures.is_empty(), "{:?}", plots.failures);
+            plots.pictures.len()
+        };
+        assert_eq!(drawn(), 0);
         write_episodes(&run);
-        assert_eq!(draw_all(&run, &[training()], 50, 3.0).unwrap().len(), 2);
+        assert_eq!(drawn(), 2);
+    }
+
+    #[test]
+    fn a_plot_that_cannot_be_drawn_is_named_and_leaves_the_others_alone() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        write_episodes(&run);
+        fs::write(run.evaluation_trajectories_csv(), b"course\n\xff").unwrap();
+        fs::write(run.reconstructions(), b"{").unwrap();
+        // In the place of a picture.
+        fs::create_dir_all(run.plots().join("return.png")).unwrap();
+        // Without courses and the level of a perfect agent: their files are damaged.
+        let plots = draw_all(&run, &[], 50, None);
+        assert_eq!(plots.pictures, [run.plots().join("walls_passed.png")]);
+        let failures: Vec<_> = plots.failures.iter().map(ToString::to_string).collect();
+        for name in [
+            "reconstructions.safetensors",
+            "evaluation_trajectories.csv",
+            "return.png",
+        ] {
+            assert!(
+                failures.iter().any(|failure| failure.contains(name)),
+                "{name} is not named: {failures:?}"
+            );
+        }
+        assert_eq!(failures.len(), 3);
+    }
+
+    #[test]
+    fn damaged_and_short_files_are_drawn_or_named() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let header = "steps,walls_passed,return\n";
+        for (rows, pictures) in [
+            (String::new(), 0),
+            (header.to_owned(), 0),
+            (format!("{header}4,2,1.0\n"), 2),
+            (format!("{header}4,2,1e11\n4,4294967295,-1e11\n"), 2),
+        ] {
+            fs::write(run.episodes_csv(), &rows).unwrap();
+            let plots = draw_all(&run, &[training()], 50, Some(3.0));
+            assert_eq!(plots.pictures.len(), pictures, "{rows}");
+            assert!(plots.failures.is_empty(), "{rows}");
+        }
+        for rows in ["4,2\n", "4,2,inf\n", "4,-1,1\n", "4,2,1.0\n4,2,", "\0\0\0"] {
+            fs::write(run.episodes_csv(), format!("{header}{rows}")).unwrap();
+            let plots = draw_all(&run, &[training()], 50, Some(3.0));
+            let [failure] = &plots.failures[..] else {
+                panic!("{rows:?} is drawn");
+            };
+            assert!(failure.to_string().contains("episodes.csv"), "{failure}");
+            assert!(failure.to_string().contains("line"), "{failure}");
+        }
     }
 }

@@ -1,4 +1,4 @@
-//! Trajectories of evaluation episodes from above and from the side, with walls and openings.
+//! Trajectories of evaluation episodes from above and from the side, and each wall from the front.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -10,28 +10,52 @@ use skein_simulator::course::{Course, Wall};
 
 use super::ReportError;
 use super::canvas::{Area, Canvas, INK, REFERENCE, STRONG, font, px};
+use super::front_views::FrontViews;
 use crate::NamedCourse;
 
-const WIDTH: u32 = 1280;
-const LEFT: u32 = 70;
-const RIGHT: u32 = 20;
-const TOP: u32 = 52;
+/// Most trajectories drawn of one course: more would only cover each other.
+pub const MOST_DRAWN: usize = 500;
+/// Most courses in one picture, which is held in memory.
+const MOST_COURSES: usize = 12;
+/// Most characters of a course's name in its caption.
+const LONGEST_NAME: usize = 60;
+
+pub(super) const WIDTH: u32 = 1280;
+pub(super) const LEFT: u32 = 70;
+pub(super) const RIGHT: u32 = 20;
+const TOP: u32 = 72;
 const CAPTION: u32 = 34;
+/// Height of the line on courses that are not shown.
+const OMITTED: u32 = 34;
 const PANEL_GAP: u32 = 20;
 const AXIS: u32 = 44;
 const HIGHEST_PANEL: u32 = 600;
 
-const CORRIDOR: RGBColor = RGBColor(0xf3, 0xf5, 0xf8);
-const WALL: RGBColor = RGBColor(0x4a, 0x50, 0x5a);
+pub(super) const CORRIDOR: RGBColor = RGBColor(0xf3, 0xf5, 0xf8);
+pub(super) const WALL: RGBColor = RGBColor(0x4a, 0x50, 0x5a);
+/// Part of a wall that is open, but not in the cut through the opening's middle.
+const PARTLY_OPEN: RGBColor = RGBColor(0xb4, 0xb8, 0xc0);
 const TIMED_OUT: RGBColor = RGBColor(0x8a, 0x5f, 0xb5);
 
 /// Trajectory of one evaluation episode.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Trajectory {
-    /// Position of the vehicle's centre at each step, world frame, metres.
-    points_m: Vec<[f32; 3]>,
+pub struct Trajectory {
+    /// Position of the vehicle's centre at each step, world frame, metres. Without positions, the
+    /// episode is counted but not drawn.
+    pub points_m: Vec<[f32; 3]>,
     /// End of the episode.
-    outcome: Outcome,
+    pub outcome: Outcome,
+}
+
+/// Evaluation episodes on one course.
+#[derive(Debug, Clone, Copy)]
+pub struct FlownCourse<'a> {
+    /// Name in the caption.
+    pub name: &'a str,
+    /// The course.
+    pub course: &'a Course,
+    /// Its episodes.
+    pub episodes: &'a [Trajectory],
 }
 
 /// Trajectories by the name of their course.
@@ -90,32 +114,41 @@ pub(super) fn read_trajectories(path: &Path) -> Result<TrajectoriesByCourse, Rep
     Ok(courses)
 }
 
-/// Draws the episodes of each course from above and from the side. Courses without episodes are
-/// left out.
+/// Returns the episodes of each course of a run. Courses without episodes are left out.
+pub(super) fn flown<'a>(
+    courses: &'a [NamedCourse],
+    trajectories: &'a TrajectoriesByCourse,
+) -> Vec<FlownCourse<'a>> {
+    let flown = |NamedCourse { name, course }: &'a NamedCourse| {
+        Some(FlownCourse {
+            name,
+            course,
+            episodes: trajectories.get(name)?,
+        })
+    };
+    courses.iter().filter_map(flown).collect()
+}
+
+/// Draws the episodes of each course from above and from the side, and its walls from the front,
+/// as a PNG file. Of many courses, the first are drawn, and the number of the others is stated.
 ///
 /// # Errors
 /// Returns [`ReportError`] if the picture cannot be drawn or written.
-pub(super) fn draw(
-    courses: &[NamedCourse],
-    paths: &TrajectoriesByCourse,
-    path: &Path,
-) -> Result<(), ReportError> {
-    let flown: Vec<_> = courses
-        .iter()
-        .filter_map(|NamedCourse { name, course }| Some((name, course, paths.get(name)?)))
-        .collect();
-    let height = TOP
-        + flown
-            .iter()
-            .map(|(_, course, _)| block_height(course))
-            .sum::<u32>();
-    let mut canvas = Canvas::new(WIDTH, height);
+pub fn draw_trajectories(courses: &[FlownCourse<'_>], path: &Path) -> Result<(), ReportError> {
+    let (shown, others) = courses.split_at(courses.len().min(MOST_COURSES));
+    let blocks: u32 = shown.iter().map(|flown| block_height(flown.course)).sum();
+    let omitted = if others.is_empty() { 0 } else { OMITTED };
+    let mut canvas = Canvas::new(WIDTH, TOP + blocks + omitted);
     canvas.draw(|area| {
         draw_legend(area)?;
         let mut top = TOP;
-        for (name, course, episodes) in &flown {
-            draw_course(area, name, course, episodes, top)?;
-            top += block_height(course);
+        for flown in shown {
+            draw_course(area, flown, top)?;
+            top += block_height(flown.course);
+        }
+        if !others.is_empty() {
+            let text = format!("Not shown: {} more", plural(others.len(), "course"));
+            area.draw_text(&text, &font(18), (px(LEFT) as i32, px(top) as i32))?;
         }
         Ok(())
     })?;
@@ -142,6 +175,7 @@ fn block_height(course: &Course) -> u32 {
         + PANEL_GAP
         + panel_height(course, Projection::Side)
         + AXIS
+        + FrontViews::of(course, pixels_per_metre(course)).height()
 }
 
 /// Projection of the corridor.
@@ -169,11 +203,38 @@ impl Projection {
         }
     }
 
-    fn opening_m(self, wall: &Wall) -> (f32, f32) {
-        let axis = match self {
+    /// Index of the axis across the corridor in a point `[y, z]` of a wall.
+    fn axis(self) -> usize {
+        match self {
             Self::Above => 0,
             Self::Side => 1,
-        };
+        }
+    }
+
+    /// Returns the parts of a wall that are open in a cut through the safe point of its opening:
+    /// a horizontal cut for the view from above, a vertical one for the view from the side.
+    fn open_in_cut_m(self, wall: &Wall) -> Vec<(f32, f32)> {
+        let (across, along) = (self.axis(), 1 - self.axis());
+        let cut_m = wall.safe_point()[along];
+        let outline = wall.outline();
+        let mut ends: Vec<f32> = outline
+            .iter()
+            .zip(outline.iter().cycle().skip(1))
+            .filter(|(from, to)| (from[along] > cut_m) != (to[along] > cut_m))
+            .map(|(from, to)| {
+                let share = (cut_m - from[along]) / (to[along] - from[along]);
+                from[across] + share * (to[across] - from[across])
+            })
+            .collect();
+        ends.sort_by(f32::total_cmp);
+        ends.chunks_exact(2)
+            .map(|pair| (pair[0], pair[1]))
+            .collect()
+    }
+
+    /// Returns the range over which a wall is open in any cut.
+    fn opening_m(self, wall: &Wall) -> (f32, f32) {
+        let axis = self.axis();
         wall.outline()
             .iter()
             .fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), point| {
@@ -225,15 +286,22 @@ impl Panel<'_> {
             .iter()
             .partition(|episode| episode.outcome == Outcome::ReachedEnd);
         for episode in well.into_iter().chain(wrong) {
-            self.draw_episode(area, episode)?;
+            self.draw_episode(area, episode, opacity_of(episode.outcome, episodes.len()))?;
         }
         for wall in self.course.walls() {
             let x_m = (wall.x_m(), wall.x_m() + self.course.wall_thickness_m());
             let (open_low, open_high) = self.view.opening_m(wall);
-            for across_m in [(low, open_low), (open_high, high)] {
+            let mut parts = vec![(low, open_low, WALL), (open_high, high, WALL)];
+            let mut closed_from = open_low;
+            for (from, to) in self.view.open_in_cut_m(wall) {
+                parts.push((closed_from, from, PARTLY_OPEN));
+                closed_from = to;
+            }
+            parts.push((closed_from, open_high, PARTLY_OPEN));
+            for (from, to, colour) in parts.into_iter().filter(|part| part.0 < part.1) {
                 area.draw(&Rectangle::new(
-                    self.rectangle(x_m, across_m),
-                    WALL.filled(),
+                    self.rectangle(x_m, (from, to)),
+                    colour.filled(),
                 ))?;
             }
         }
@@ -249,17 +317,14 @@ impl Panel<'_> {
         &self,
         area: &Area<'_>,
         episode: &Trajectory,
+        opacity: f64,
     ) -> Result<(), Box<dyn std::error::Error>> {
         let points: Vec<_> = episode
             .points_m
             .iter()
             .map(|&point| self.at(point[0], self.view.across_m(point)))
             .collect();
-        let (colour, opacity) = match episode.outcome {
-            Outcome::ReachedEnd => (STRONG, 0.3),
-            Outcome::Collided => (REFERENCE, 0.9),
-            Outcome::TimedOut => (TIMED_OUT, 0.9),
-        };
+        let colour = colour_of(episode.outcome);
         area.draw(&PathElement::new(
             points.clone(),
             colour.mix(opacity).stroke_width(px(1)),
@@ -298,28 +363,76 @@ impl Panel<'_> {
     }
 }
 
-fn draw_course(
-    area: &Area<'_>,
-    name: &str,
-    course: &Course,
-    episodes: &[Trajectory],
-    top: u32,
-) -> Result<(), Box<dyn std::error::Error>> {
-    use plotters::style::text_anchor::{HPos, Pos, VPos};
+/// Returns the colour of an episode that ended like this.
+pub(super) fn colour_of(outcome: Outcome) -> RGBColor {
+    match outcome {
+        Outcome::ReachedEnd => STRONG,
+        Outcome::Collided => REFERENCE,
+        Outcome::TimedOut => TIMED_OUT,
+    }
+}
+
+/// Returns the opacity of one of `episodes` that ended like this. Failed episodes are few and
+/// looked for; of many that reached the end, each is pale.
+pub(super) fn opacity_of(outcome: Outcome, episodes: usize) -> f64 {
+    match outcome {
+        Outcome::ReachedEnd => (5.0 / episodes as f64).clamp(0.3, 0.9),
+        Outcome::Collided | Outcome::TimedOut => 0.9,
+    }
+}
+
+fn plural(count: usize, what: &str) -> String {
+    match count {
+        1 => format!("1 {what}"),
+        count => format!("{count} {what}s"),
+    }
+}
+
+/// Returns the caption of a course: its name, and how its episodes ended.
+fn caption(flown: &FlownCourse<'_>) -> String {
+    let printable = |character: char| match character.is_control() {
+        true => ' ',
+        false => character,
+    };
+    let mut name: String = flown.name.chars().map(printable).collect();
+    if let Some((end, _)) = name.char_indices().nth(LONGEST_NAME) {
+        name.truncate(end);
+        name.push('…');
+    }
     let count = |outcome| {
+        let episodes = flown.episodes.iter();
         episodes
-            .iter()
             .filter(|episode| episode.outcome == outcome)
             .count()
     };
-    let caption = format!(
-        "{name}: {} episodes, {} reached the end, {} collided, {} timed out",
-        episodes.len(),
+    let mut caption = format!(
+        "{name}: {}, {} reached the end, {} collided, {} timed out",
+        plural(flown.episodes.len(), "episode"),
         count(Outcome::ReachedEnd),
         count(Outcome::Collided),
         count(Outcome::TimedOut)
     );
-    area.draw_text(&caption, &font(18), (px(LEFT) as i32, px(top + 8) as i32))?;
+    if flown.episodes.len() > MOST_DRAWN {
+        caption.push_str(&format!("; the first {MOST_DRAWN} are drawn"));
+    }
+    caption
+}
+
+fn draw_course(
+    area: &Area<'_>,
+    flown: &FlownCourse<'_>,
+    top: u32,
+) -> Result<(), Box<dyn std::error::Error>> {
+    use plotters::style::text_anchor::{HPos, Pos, VPos};
+    let FlownCourse {
+        course, episodes, ..
+    } = *flown;
+    let episodes = &episodes[..episodes.len().min(MOST_DRAWN)];
+    area.draw_text(
+        &caption(flown),
+        &font(18),
+        (px(LEFT) as i32, px(top + 8) as i32),
+    )?;
     let above = Panel {
         course,
         view: Projection::Above,
@@ -337,7 +450,8 @@ fn draw_course(
         let (x, y) = side.at(x_m as f32, 0.0);
         area.draw_text(&format!("{x_m} m"), &centred, (x, y + px(5) as i32))?;
     }
-    Ok(())
+    let below = side.top + panel_height(course, Projection::Side) + AXIS;
+    FrontViews::of(course, pixels_per_metre(course)).draw(area, episodes, below)
 }
 
 fn draw_legend(area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
@@ -347,12 +461,19 @@ fn draw_legend(area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
         &font(22),
         (px(LEFT) as i32, y - px(11) as i32),
     )?;
+    area.draw_text(
+        "Below each course: its walls as the drone meets them. A dot: the drone's centre crossed \
+         there. A cross: it ended at the wall.",
+        &font(15),
+        (px(LEFT) as i32, y + px(22) as i32),
+    )?;
     let mut x = px(LEFT + 230) as i32;
     for (label, colour) in [
         ("reached the end", STRONG),
         ("collided", REFERENCE),
         ("timed out", TIMED_OUT),
-        ("walls and their openings", WALL),
+        ("walls", WALL),
+        ("partly open: see the wall's front", PARTLY_OPEN),
     ] {
         area.draw(&PathElement::new(
             [(x, y), (x + px(26) as i32, y)],

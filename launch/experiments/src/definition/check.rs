@@ -6,7 +6,7 @@ use std::path::Path;
 use skein_protocol::config::Config;
 use skein_simulator::suite::MOST_EPISODES;
 
-use super::file::{ArmFile, ExperimentFile, as_overrides};
+use super::file::{ArmFile, ExperimentFile, as_overrides, names_folder};
 use super::{Arm, DefinitionError, Experiment, FlownSuite, MOST_ARMS, Measure, TableKind};
 use crate::plan::{ACTORS, REPORT};
 use skein_prepare::PrepareError;
@@ -223,14 +223,7 @@ fn check_values(file: &ExperimentFile, path: &Path) -> Result<(), DefinitionErro
     }
     let (mut names, mut labels) = (BTreeSet::new(), BTreeSet::new());
     for arm in &file.arms {
-        let is_plain =
-            |character: char| character.is_ascii_alphanumeric() || "-_.".contains(character);
-        if !arm
-            .name
-            .starts_with(|first: char| first.is_ascii_alphanumeric())
-            || !arm.name.chars().all(is_plain)
-            || arm.name == REPORT
-        {
+        if !names_folder(&arm.name) || arm.name == REPORT {
             let problem = format!(
                 "cannot name a folder: begin with a letter or digit, \
                       use only letters, digits, -, _ and ., and not {REPORT}"

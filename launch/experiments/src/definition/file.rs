@@ -71,8 +71,35 @@ pub fn names(folder: &Path) -> Result<Vec<String>, DefinitionError> {
     Ok(names)
 }
 
-/// Returns the path of the experiment called `name`.
-pub(super) fn find(folder: &Path, name: &str) -> Result<PathBuf, DefinitionError> {
+/// Returns `true` if `named` is the path of an experiment's file and not the name of an experiment:
+/// it holds a slash or ends in `.toml`.
+pub fn is_path(named: &str) -> bool {
+    named.contains('/') || named.ends_with(".toml")
+}
+
+/// Returns the path and the name of the experiment `named`: the path of its file, or its name in
+/// `folder`.
+pub(super) fn find(folder: &Path, named: &str) -> Result<(PathBuf, String), DefinitionError> {
+    let path = match is_path(named) {
+        true => PathBuf::from(named),
+        false => known(folder, named)?,
+    };
+    // Its runs get a folder of this name.
+    let name = path.file_stem().unwrap_or_default().to_string_lossy();
+    match names_folder(&name) {
+        true => Ok((path.clone(), name.into_owned())),
+        false => Err(DefinitionError::FileName { path }),
+    }
+}
+
+/// Returns `true` if a folder of runs can be called `name` on every system and in every command.
+pub(super) fn names_folder(name: &str) -> bool {
+    let is_plain = |character: char| character.is_ascii_alphanumeric() || "-_.".contains(character);
+    name.starts_with(|first: char| first.is_ascii_alphanumeric()) && name.chars().all(is_plain)
+}
+
+/// Returns the path of the experiment called `name` in `folder`.
+fn known(folder: &Path, name: &str) -> Result<PathBuf, DefinitionError> {
     let names = names(folder)?;
     if names.iter().any(|known| known == name) {
         return Ok(folder.join(format!("{name}.toml")));

@@ -15,7 +15,7 @@ use skein_protocol::config::Config;
 
 use skein_prepare::PrepareError;
 
-pub use file::names;
+pub use file::{is_path, names};
 pub use suite::FlownSuite;
 
 /// Largest number of arms whose lines can be distinguished in one picture.
@@ -158,7 +158,11 @@ pub enum DefinitionError {
         source: std::io::Error,
     },
     /// No experiment has this name.
-    #[error("no experiment is called {name}: {} holds {known}", folder.display())]
+    #[error(
+        "no experiment is called {name}: {} holds {known}; give one of these names, \
+         or the path of a file, FOLDER/NAME.toml",
+        folder.display()
+    )]
     Unknown {
         /// The name.
         name: String,
@@ -166,6 +170,16 @@ pub enum DefinitionError {
         folder: PathBuf,
         /// Names of the experiments in it.
         known: String,
+    },
+    /// The name of its file cannot name the folder of its runs.
+    #[error(
+        "{}: the runs lie in a folder of the same name: rename the file so that it begins with \
+         a letter or digit and has only letters, digits, -, _ and .",
+        path.display()
+    )]
+    FileName {
+        /// The file.
+        path: PathBuf,
     },
     /// The file is not TOML, or has unknown keys or types.
     #[error("{} is not an experiment: {source}", path.display())]
@@ -212,14 +226,18 @@ pub enum DefinitionError {
 }
 
 impl Experiment {
-    /// Reads the experiment called `name` in `folder`, and checks that each of its arms can run.
-    /// `episodes` shortens all runs to this number of episodes.
+    /// Reads the experiment `named`, a name in `folder` or the path of a file, and checks that each
+    /// of its arms can run. `episodes` shortens all runs to this number of episodes.
     ///
     /// # Errors
     /// [`DefinitionError`] names file, arm, key, value and remedy.
-    pub fn load(folder: &Path, name: &str, episodes: Option<u64>) -> Result<Self, DefinitionError> {
-        let path = file::find(folder, name)?;
-        check::resolve(file::read(&path)?, &path, name, episodes)
+    pub fn load(
+        folder: &Path,
+        named: &str,
+        episodes: Option<u64>,
+    ) -> Result<Self, DefinitionError> {
+        let (path, name) = file::find(folder, named)?;
+        check::resolve(file::read(&path)?, &path, &name, episodes)
     }
 
     /// Compares the shortest arm with the paper's run, or with the base configuration; `None` if it

@@ -53,6 +53,45 @@ fn every_shipped_experiment_can_run() {
 }
 
 #[test]
+fn an_experiment_is_found_by_its_name_or_by_its_path() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = format!("{}{ARM}", head());
+    let at = |name: &str| folder.path().join(name).display().to_string();
+    for name in [
+        "plain.toml",
+        "strange name.toml",
+        "zi\u{119}ba\n.toml",
+        ".toml",
+    ] {
+        fs::write(at(name), &text).unwrap();
+    }
+    let load = |named: &str| {
+        // The catalogue does not exist: a path needs none.
+        Experiment::load(Path::new("/proc/none"), named, None).map_err(|error| error.to_string())
+    };
+    assert_eq!(load(&at("plain.toml")).unwrap().name, "plain");
+    let by_name = Experiment::load(folder.path(), "plain", None).unwrap();
+    assert_eq!(by_name, load(&at("plain.toml")).unwrap());
+    for name in ["strange name.toml", "zi\u{119}ba\n.toml", ".toml"] {
+        let error = load(&at(name)).unwrap_err();
+        assert!(
+            error.contains(name) && error.contains("rename the file"),
+            "{error}"
+        );
+    }
+    for missing in ["none.toml", "no/such", "/"] {
+        assert!(load(missing).unwrap_err().contains(missing));
+    }
+    let unknown = Experiment::load(folder.path(), "other", None)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        unknown.contains("plain") && unknown.contains("path of a file"),
+        "{unknown}"
+    );
+}
+
+#[test]
 fn an_arm_combines_the_base_the_common_settings_and_its_own() {
     let text = format!(
         "{}[settings]\nrun.episodes = 90\nreplay = {{ success_share = 0.5, success = \"approach\" \

@@ -15,24 +15,37 @@ const PLACES: usize = 400;
 const RESAMPLES: usize = 2000;
 
 impl Findings<'_> {
-    /// Draws every picture of the experiment into `folder`. A picture without lines, because the
-    /// runs are shorter than the averaging window, is left out.
-    pub(super) fn draw(&self, folder: &Path) -> Result<Vec<Picture>, ExperimentReportError> {
-        let mut pictures = Vec::new();
+    /// Draws every picture of the experiment into `folder`, and returns the reasons why others
+    /// could not be drawn. A picture without lines, because the runs are shorter than the averaging
+    /// window, is left out.
+    pub(super) fn draw(&self, folder: &Path) -> (Vec<Picture>, Vec<ExperimentReportError>) {
+        let (mut pictures, mut failures) = (Vec::new(), Vec::new());
         for &curve in &self.experiment.curves {
-            let file = format!(
-                "{}_over_{}.png",
-                measure_name(curve.measure),
-                axis_name(curve.over)
-            );
-            let comparison = self.comparison(curve)?;
-            if comparison.draw(&folder.join(&file))? {
-                let what = measure_title(curve.measure);
-                let caption = format!("{what} per training episode over {}", comparison.x);
-                pictures.push(Picture { file, caption });
+            match self.picture(curve, folder) {
+                Ok(picture) => pictures.extend(picture),
+                Err(error) => failures.push(error),
             }
         }
-        Ok(pictures)
+        (pictures, failures)
+    }
+
+    fn picture(
+        &self,
+        curve: CurveSpec,
+        folder: &Path,
+    ) -> Result<Option<Picture>, ExperimentReportError> {
+        let file = format!(
+            "{}_over_{}.png",
+            measure_name(curve.measure),
+            axis_name(curve.over)
+        );
+        let comparison = self.comparison(curve)?;
+        if !comparison.draw(&folder.join(&file))? {
+            return Ok(None);
+        }
+        let what = measure_title(curve.measure);
+        let caption = format!("{what} per training episode over {}", comparison.x);
+        Ok(Some(Picture { file, caption }))
     }
 
     fn comparison(&self, curve: CurveSpec) -> Result<Comparison<'_>, ExperimentReportError> {

@@ -20,7 +20,10 @@ impl Findings<'_> {
             push(&mut text, &note);
         }
         push(&mut text, &self.sample());
-        if let Some(note) = self.several_builds() {
+        for note in [self.several_builds(), self.how_differences_are_meant()]
+            .into_iter()
+            .flatten()
+        {
             push(&mut text, &note);
         }
         for &kind in &self.experiment.tables {
@@ -122,6 +125,18 @@ impl Findings<'_> {
              builds. To train runs again with one build, move their directories away."
                 .to_owned()
         })
+    }
+
+    fn how_differences_are_meant(&self) -> Option<String> {
+        let [first, _, ..] = &self.experiment.arms[..] else {
+            return None;
+        };
+        Some(format!(
+            "A row \"difference to {0}\" is the arm's figure minus that of {0}, over the seeds that \
+             both have completed. Its 95 % interval compares seed by seed: where it leaves out 0, \
+             the arms differ.",
+            first.label
+        ))
     }
 
     /// Returns the versions that trained the runs, each once.

@@ -82,10 +82,13 @@ pub struct WrittenReport {
     pub text: String,
     /// Pictures, in the document's folder.
     pub pictures: Vec<Picture>,
+    /// Reasons why other pictures are missing.
+    pub failures: Vec<ExperimentReportError>,
 }
 
 impl Findings<'_> {
-    /// Writes the report with its pictures into the experiment's folder.
+    /// Writes the report with its pictures into the experiment's folder. A picture that cannot be
+    /// drawn costs only itself.
     ///
     /// # Errors
     /// [`ExperimentReportError`] names the file.
@@ -99,7 +102,7 @@ impl Findings<'_> {
             move |source| ExperimentReportError::Write { path, source }
         };
         fs::create_dir_all(&folder).map_err(write(&folder))?;
-        let pictures = self.draw(&folder)?;
+        let (pictures, failures) = self.draw(&folder);
         let runs = folder.join(RUNS);
         self.write_runs(&runs).map_err(write(&runs))?;
         let text = format!(
@@ -114,6 +117,7 @@ impl Findings<'_> {
             document,
             text,
             pictures,
+            failures,
         })
     }
 

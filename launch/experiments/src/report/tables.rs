@@ -10,7 +10,7 @@ use super::Findings;
 use super::outcomes::entry_of;
 use crate::definition::{Arm, TableKind};
 use crate::results::RunResult;
-use crate::statistics::{Estimate, RESAMPLES, interquartile_mean};
+use crate::statistics::{Bootstrap, Estimate, RESAMPLES, interquartile_mean};
 use skein_reports::Clock;
 
 /// Content of a cell without a value.
@@ -46,20 +46,21 @@ impl Findings<'_> {
                     "R, the share of walls passed, of the best snapshot in {episodes} episodes a \
                      course without exploration"
                 ),
-                table: self.by_course(|course| course.r, rate),
+                table: self.by_course(|course| course.r, rate, rate_difference),
             },
             TitledTable {
                 title: format!("Share of these {episodes} episodes that completed the course"),
-                table: self.by_course(|course| course.completed, percent),
+                table: self.by_course(|course| course.completed, percent, points),
             },
         ]
     }
 
-    /// Returns a table with a row per arm and a column per course.
+    /// Returns a table with a row per arm and per difference, and a column per course.
     fn by_course(
         &self,
         value: impl Fn(&CourseEvaluation) -> f64,
         show: impl Fn(Estimate) -> String,
+        show_difference: impl Fn(Estimate) -> String,
     ) -> String {
         let courses = self.courses();
         let mut rows = Vec::new();
@@ -72,13 +73,22 @@ impl Findings<'_> {
             }));
             rows.push(row);
         }
+        for (number, head) in self.differences() {
+            let mut row = head.to_vec();
+            row.extend(courses.iter().map(|name| {
+                let of_course = |result: &RunResult| course_of(result, name).map(&value);
+                self.difference(number, of_course)
+                    .map_or(NOTHING.to_owned(), &show_difference)
+            }));
+            rows.push(row);
+        }
         let header = ["arm".to_owned(), "seeds".to_owned()]
             .into_iter()
             .chain(courses);
         grid(header.collect(), rows, 1)
     }
 
-    /// Returns a table with a row per arm and suite entry.
+    /// Returns a table with a row per arm and suite entry, and per difference and suite entry.
     fn suite(&self) -> Option<TitledTable> {
         let flown = self.experiment.suite.as_ref()?;
         let mut rows = Vec::new();
@@ -101,6 +111,30 @@ impl Findings<'_> {
                     mean.map_or(NOTHING.to_owned(), percent),
                     estimate(|course| course.completed).map_or(NOTHING.to_owned(), percent),
                     estimate(|course| course.r).map_or(NOTHING.to_owned(), rate),
+                ]);
+            }
+        }
+        for (number, [label, seeds]) in self.differences() {
+            for entry in &flown.suite.entries {
+                let of_entry = |value: fn(&CourseEvaluation) -> f64| {
+                    move |result: &RunResult| entry_of(result, &entry.name).map(value)
+                };
+                let completed = of_entry(|course| course.completed);
+                let r = of_entry(|course| course.r);
+                let mean = self.pairs(number, completed).and_then(|pairs| {
+                    let (values, reference) = pairs;
+                    Bootstrap::new(values.len(), RESAMPLES).difference_of_means(&values, &reference)
+                });
+                rows.push(vec![
+                    label.clone(),
+                    entry.name.clone(),
+                    seeds.clone(),
+                    entry.episodes.to_string(),
+                    mean.map_or(NOTHING.to_owned(), points),
+                    self.difference(number, completed)
+                        .map_or(NOTHING.to_owned(), points),
+                    self.difference(number, r)
+                        .map_or(NOTHING.to_owned(), rate_difference),
                 ]);
             }
         }
@@ -169,6 +203,27 @@ impl Findings<'_> {
             row.extend(self.measured(number, &measures));
             rows.push(row);
         }
+        for (number, head) in self.differences() {
+            let mut row = head.to_vec();
+            let later = |reached: &dyn Fn(&RunResult) -> Option<f64>,
+                         show: &dyn Fn(f64) -> String| {
+                let difference = self.difference(number, reached);
+                difference.map_or(NOTHING.to_owned(), |estimate| {
+                    with_interval(estimate, |value| signed(value, show))
+                })
+            };
+            let trained = |at: fn(&Trained) -> f64| {
+                move |run: &RunResult| run.summary.trained.as_ref().map(at)
+            };
+            row.push(later(&RunResult::one_wall_after, &count));
+            row.push(NOTHING.to_owned());
+            row.push(later(&trained(|at| at.episodes as f64), &count));
+            row.push(later(&trained(|at| at.steps as f64), &count));
+            row.push(later(&trained(|at| at.updates as f64), &count));
+            row.push(later(&trained(|at| at.wall_secs), &time));
+            row.extend(self.measured_differences(number, &measures));
+            rows.push(row);
+        }
         let mut header = vec![
             "arm".to_owned(),
             "seeds".to_owned(),
@@ -197,18 +252,21 @@ impl Findings<'_> {
     }
 
     fn steadiness(&self) -> TitledTable {
+        let measures: [RunMeasure; 4] = [
+            RunResult::level,
+            RunResult::volatility,
+            RunResult::dispersion_across_time,
+            RunResult::largest_drawdown,
+        ];
         let mut rows = Vec::new();
         for (number, arm) in self.experiment.arms.iter().enumerate() {
             let mut row = self.head(number, arm).to_vec();
-            row.extend(self.measured(
-                number,
-                &[
-                    RunResult::level,
-                    RunResult::volatility,
-                    RunResult::dispersion_across_time,
-                    RunResult::largest_drawdown,
-                ],
-            ));
+            row.extend(self.measured(number, &measures));
+            rows.push(row);
+        }
+        for (number, head) in self.differences() {
+            let mut row = head.to_vec();
+            row.extend(self.measured_differences(number, &measures));
             rows.push(row);
         }
         let header = [
@@ -233,6 +291,19 @@ impl Findings<'_> {
             let estimate = self.estimate(arm, of_run);
             estimate.map_or(NOTHING.to_owned(), |estimate| {
                 with_interval(estimate, |value| format!("{value:.2}"))
+            })
+        };
+        measures.iter().map(cell).collect()
+    }
+
+    /// Returns the cells of the differences in `measures` between an arm and the first.
+    fn measured_differences(&self, arm: usize, measures: &[RunMeasure]) -> Vec<String> {
+        let cell = |of_run: &RunMeasure| {
+            let difference = self.difference(arm, of_run);
+            difference.map_or(NOTHING.to_owned(), |estimate| {
+                with_interval(estimate, |value| {
+                    signed(value, &|size| format!("{size:.2}"))
+                })
             })
         };
         measures.iter().map(cell).collect()
@@ -320,6 +391,56 @@ impl Findings<'_> {
         [arm.label.clone(), seeds]
     }
 
+    /// Returns each arm but the first, with the first cells of the row of its difference to it:
+    /// what is compared, and the number of seeds that both have completed.
+    fn differences(&self) -> Vec<(usize, [String; 2])> {
+        let Some(first) = self.experiment.arms.first() else {
+            return Vec::new();
+        };
+        let arms = self.experiment.arms.iter().enumerate().skip(1);
+        arms.map(|(number, arm)| {
+            let label = format!("{}, difference to {}", arm.label, first.label);
+            let (pairs, planned) = (self.paired_runs(number).count() as u64, self.plan.seeds);
+            let seeds = match pairs == planned {
+                true => planned.to_string(),
+                false => format!("{pairs} of {planned}"),
+            };
+            (number, [label, seeds])
+        })
+        .collect()
+    }
+
+    /// Returns the complete runs of an arm, each with the first arm's run of the same seed.
+    fn paired_runs(&self, arm: usize) -> impl Iterator<Item = (&RunResult, &RunResult)> {
+        self.of_arm(arm).filter_map(|run| {
+            let reference = self.of_arm(0).find(|other| other.seed == run.seed)?;
+            Some((run, reference))
+        })
+    }
+
+    /// Returns the values of `of_run` for the paired runs of an arm, and those of the first arm;
+    /// `None` if a run has no value.
+    fn pairs(
+        &self,
+        arm: usize,
+        of_run: impl Fn(&RunResult) -> Option<f64>,
+    ) -> Option<(Vec<f64>, Vec<f64>)> {
+        self.paired_runs(arm)
+            .map(|(run, reference)| Some((of_run(run)?, of_run(reference)?)))
+            .collect()
+    }
+
+    /// Returns the estimate of `of_run` for an arm minus that for the first arm, seed by seed;
+    /// `None` if a run has no value.
+    fn difference(
+        &self,
+        arm: usize,
+        of_run: impl Fn(&RunResult) -> Option<f64>,
+    ) -> Option<Estimate> {
+        let (values, reference) = self.pairs(arm, of_run)?;
+        Bootstrap::new(values.len(), RESAMPLES).difference(&values, &reference)
+    }
+
     /// Returns the estimate of `of_run` over the complete runs of an arm; `None` if a run has no
     /// value.
     fn estimate(&self, arm: usize, of_run: impl Fn(&RunResult) -> Option<f64>) -> Option<Estimate> {
@@ -356,6 +477,33 @@ fn rate(estimate: Estimate) -> String {
 
 fn percent(estimate: Estimate) -> String {
     with_interval(estimate, share)
+}
+
+/// Returns a difference of rates.
+fn rate_difference(estimate: Estimate) -> String {
+    with_interval(estimate, |value| {
+        signed(value, &|size| format!("{size:.3}"))
+    })
+}
+
+/// Returns a difference of shares, in percentage points.
+fn points(estimate: Estimate) -> String {
+    let numbers = with_interval(estimate, |value| {
+        signed(value, &|size| format!("{:.1}", 100.0 * size))
+    });
+    format!("{numbers} points")
+}
+
+/// Returns a difference with its sign; `show` shows its size.
+fn signed(value: f64, show: &dyn Fn(f64) -> String) -> String {
+    let size = show(value.abs());
+    // What is shown as zero has no direction.
+    let sign = if value < 0.0 && size != show(0.0) {
+        '-'
+    } else {
+        '+'
+    };
+    format!("{sign}{size}")
 }
 
 fn share(value: f64) -> String {
@@ -417,6 +565,17 @@ mod tests {
             "| arm | seeds |              R |\n|-----|------:|---------------:|\n| one |     3 | \
              0.5 [0.4, 0.6] |"
         );
+    }
+
+    #[test]
+    fn a_difference_has_a_sign_unless_it_is_shown_as_zero() {
+        let show = |value: f64| signed(value, &|size| format!("{size:.1}"));
+        assert_eq!(
+            [0.26, -0.26, -1e-9, 0.0].map(show),
+            ["+0.3", "-0.3", "+0.0", "+0.0"]
+        );
+        let late = signed(-75.0, &|secs| Clock(secs).to_string());
+        assert_eq!(late, "-1:15");
     }
 
     #[test]

@@ -8,7 +8,7 @@ use skein_protocol::ids::PolicyVersion;
 use skein_protocol::transition::Outcome;
 
 use super::*;
-use crate::definition::{Axis, Measure, TableKind};
+use crate::definition::{Axis, CurveSpec, Measure, TableKind};
 use crate::plan::PlannedRun;
 use crate::results;
 
@@ -58,6 +58,12 @@ fn leave(run: &PlannedRun, suite: &[CourseEvaluation]) {
 /// Creates an experiment in `folder` with one arm and two complete runs: the first completed half
 /// of its calm episodes, the second all.
 fn two_runs(folder: &Path) -> (Experiment, ExperimentPlan) {
+    runs(folder, "", &[2, 4])
+}
+
+/// Creates an experiment in `folder` with arm A and `more_arms`, two seeds each, and complete runs
+/// in the plan's order. Of four calm episodes, run i completed `calm[i]`.
+fn runs(folder: &Path, more_arms: &str, calm: &[usize]) -> (Experiment, ExperimentPlan) {
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
     let (base, course) = (
         configs.join("smoke.toml"),
@@ -74,12 +80,12 @@ fn two_runs(folder: &Path) -> (Experiment, ExperimentPlan) {
         "question = \"?\"\nbase = {base:?}\nseeds = 2\nsuite = \"few.toml\"\ntables = \
          [\"suite\"]\npaper_episodes = 4000\ncurves = []\n[settings]\nevaluation.window_episodes \
          = 2\nlearning.warmup_steps = 20\nsac.batch_size = 16\n[[arm]]\nname = \"a\"\nlabel = \
-         \"A\"\n"
+         \"A\"\n{more_arms}"
     );
     fs::write(folder.join("test.toml"), experiment).unwrap();
     let experiment = Experiment::load(folder, "test", None).unwrap();
     let mut plan = ExperimentPlan::new(&experiment, &folder.join("runs"), 2).unwrap();
-    for (run, calm) in plan.runs.iter_mut().zip([2, 4]) {
+    for (run, &calm) in plan.runs.iter_mut().zip(calm) {
         leave(run, &[entry_result("calm", calm), entry_result("windy", 1)]);
         run.state = RunState::Complete;
     }
@@ -141,6 +147,86 @@ fn a_suite_has_a_row_per_entry_over_the_seeds() {
         error.contains(&result.display().to_string()) && error.contains("move this file away"),
         "{error}"
     );
+}
+
+/// Arm B completes one calm episode more than arm A with either seed. The arms' intervals overlap.
+#[test]
+fn an_arm_is_compared_with_the_first_seed_by_seed() {
+    let folder = tempfile::tempdir().unwrap();
+    let b = "[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.replay.success_share = 0.25\n";
+    let (experiment, mut plan) = runs(folder.path(), b, &[1, 2, 3, 4]);
+    let compact = |line: &str| line.split_whitespace().collect::<Vec<_>>().join(" ");
+    let lines = |plan: &ExperimentPlan, kind| {
+        let results = results::read(plan).unwrap();
+        let tables = findings(&experiment, plan, &results).tables(kind);
+        let lines: Vec<_> = tables[0].table.lines().map(compact).collect();
+        lines
+    };
+    let suite = lines(&plan, TableKind::Suite);
+    assert_eq!(
+        suite[6],
+        "| B, difference to A | calm | 2 | 4 | +25.0 [+25.0, +25.0] points \
+         | +25.0 [+25.0, +25.0] points | +0.250 [+0.250, +0.250] |"
+    );
+    assert!(
+        suite[7].contains("| +0.000 [+0.000, +0.000] |"),
+        "{}",
+        suite[7]
+    );
+    for kind in [TableKind::Learning, TableKind::Steadiness] {
+        let lines = lines(&plan, kind);
+        assert_eq!(lines.len(), 5, "{lines:?}");
+        assert!(
+            lines[4].starts_with("| B, difference to A | 2 |"),
+            "{}",
+            lines[4]
+        );
+    }
+    let results = results::read(&plan).unwrap();
+    let body = findings(&experiment, &plan, &results).body(&[], "runs.csv");
+    assert!(body.contains("A row \"difference to A\""), "{body}");
+    // Without B's second run only the first seed is compared: no evidence about other seeds.
+    plan.runs[3].state = RunState::Begun;
+    let suite = lines(&plan, TableKind::Suite);
+    assert!(
+        suite[6].starts_with("| B, difference to A | calm | 1 of 2 | 4 | +25.0 points |"),
+        "{}",
+        suite[6]
+    );
+}
+
+#[test]
+fn a_picture_that_cannot_be_drawn_costs_only_itself() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut experiment, plan) = two_runs(folder.path());
+    let curve = |over| CurveSpec {
+        measure: Measure::Return,
+        over,
+    };
+    experiment.curves = vec![curve(Axis::Steps), curve(Axis::Episodes)];
+    let rows = "steps,walls_passed,return\n4,2,1.0\n4,2,1.0\n4,2,1.0\n4,2,1.0\n";
+    for run in &plan.runs {
+        fs::write(run.directory.episodes_csv(), rows).unwrap();
+    }
+    let report = plan.root.join(crate::plan::REPORT);
+    // In the place of a picture.
+    fs::create_dir_all(report.join("return_over_steps.png")).unwrap();
+    let results = results::read(&plan).unwrap();
+    let written = findings(&experiment, &plan, &results).write().unwrap();
+    let files: Vec<_> = written
+        .pictures
+        .iter()
+        .map(|picture| &picture.file[..])
+        .collect();
+    assert_eq!(files, ["return_over_episodes.png"]);
+    let [failure] = &written.failures[..] else {
+        panic!("{:?}", written.failures)
+    };
+    assert!(
+        failure.to_string().contains("return_over_steps.png"),
+        "{failure}"
+    );
+    assert!(written.document.is_file() && report.join("runs.csv").is_file());
 }
 
 #[test]

@@ -21,9 +21,9 @@ pub(super) const FILES: Target = Target {
     weight: USUAL / 2,
     samples,
     run: |bytes| {
-        with_run(bytes, |run| match RunMaterial::read(run) {
-            Ok(_) => ReaderDecision::Accepted,
-            Err(error) => {
+        with_run(bytes, |run| match RunMaterial::read(run).1.first() {
+            None => ReaderDecision::Accepted,
+            Some(error) => {
                 let folder = run.root().display().to_string();
                 assert!(error.to_string().contains(&folder), "{error}");
                 ReaderDecision::Refused
@@ -108,9 +108,9 @@ pub(super) const PICTURES: Target = Target {
         let mut courses = vec![TRAINING.clone()];
         courses.extend(fuzzed_course(course));
         with_run(files, |run| {
-            let pictures = draw_all(run, &courses, 50, 3.0).ok();
-            assert!(pictures.iter().flatten().all(|picture| picture.exists()));
-            ReaderDecision::of(pictures)
+            let plots = draw_all(run, &courses, 50, Some(3.0));
+            assert!(plots.pictures.iter().all(|picture| picture.exists()));
+            ReaderDecision::of(plots.failures.is_empty().then_some(()))
         })
     },
 };

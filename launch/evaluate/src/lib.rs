@@ -2,19 +2,22 @@
 //!
 //! `skein-evaluate` and `skein evaluate` share this module.
 
+mod plot;
+
 use std::fs::{self, File, OpenOptions};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::courses::Courses;
-use crate::evaluation::{Evaluation, Keep, MAX_THREADS};
-use crate::recording::{COLUMNS, NAME_LISTS, check_recordable, write_recording};
 use anyhow::{Context, bail};
 use clap::{Args, Parser};
 use skein_kernels::Isa;
 use skein_protocol::config::Config;
 use skein_protocol::snapshot::Snapshot;
+use skein_reports::MOST_DRAWN;
+use skein_rollout::courses::Courses;
+use skein_rollout::evaluation::{Evaluation, Keep, MAX_THREADS};
+use skein_rollout::recording::{COLUMNS, NAME_LISTS, check_recordable, write_recording};
 use skein_run::RunDirectory;
 use skein_run::tables::evaluation_table;
 use skein_simulator::camera::InstructionSet;
@@ -54,6 +57,10 @@ pub struct Arguments {
     /// step, about 1 MiB per whole episode.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// Also draw the trajectories to this file, as PNG: each course from above and from the side,
+    /// and its walls from the front. Of an entry with several courses, the first is drawn.
+    #[arg(long, value_name = "FILE")]
+    plot: Option<PathBuf>,
     // Not a doc comment, which cannot contain the constant.
     #[arg(long, value_name = "N", help = threads_help())]
     threads: Option<NonZeroUsize>,
@@ -84,6 +91,17 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         check_folder(file)?;
         check_recordable(file)?;
     }
+    if let Some(file) = &arguments.plot {
+        check_plottable(file)?;
+        for (option, other) in [("--json", &arguments.json), ("--record", &arguments.record)] {
+            if other.as_ref().is_some_and(|other| is_same(other, file)) {
+                bail!(
+                    "--plot and {option} name the same file, {}: name two",
+                    file.display()
+                );
+            }
+        }
+    }
     let path = snapshot_path(&arguments.subject)?;
     let (snapshot, config) = Snapshot::load(&path)?;
     let courses = Arc::new(courses(arguments, &config, &path)?);
@@ -91,10 +109,10 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .threads
         .map_or_else(std::thread::available_parallelism, Ok)
         .unwrap_or(NonZeroUsize::MIN);
-    let keep = if arguments.record.is_some() {
-        Keep::Records
-    } else {
-        Keep::Scores
+    let keep = match (&arguments.record, &arguments.plot) {
+        (Some(_), _) => Keep::Records,
+        (None, Some(_)) => Keep::Positions(MOST_DRAWN as u64),
+        (None, None) => Keep::Scores,
     };
     let evaluation = Evaluation {
         snapshot: &snapshot,
@@ -136,7 +154,38 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
             .collect();
         write_recording(file, &names, config.vae.latent, &evaluated.episodes)?;
     }
+    if let Some(file) = &arguments.plot {
+        plot::draw(&courses, &evaluated.episodes, file)?;
+    }
     Ok(())
+}
+
+/// `true` if two paths name one file, whether or not it exists.
+fn is_same(one: &Path, other: &Path) -> bool {
+    let resolved = |file: &Path| {
+        fs::canonicalize(file).ok().or_else(|| {
+            let folder = std::path::absolute(file)
+                .ok()?
+                .parent()?
+                .canonicalize()
+                .ok()?;
+            Some(folder.join(file.file_name()?))
+        })
+    };
+    one == other || resolved(one).is_some_and(|one| resolved(other) == Some(one))
+}
+
+/// Checks that a picture can be written to `file`. A picture replaces the file, so nothing but a
+/// regular file may be there.
+fn check_plottable(file: &Path) -> anyhow::Result<()> {
+    if fs::metadata(file).is_ok_and(|there| !there.is_file()) {
+        bail!(
+            "cannot write {}: it is not a regular file, so a picture cannot replace it; \
+             name another",
+            file.display()
+        );
+    }
+    check_writable(file)
 }
 
 /// Checks that `file` can be written, so that a long evaluation is not lost. Leaves no file behind

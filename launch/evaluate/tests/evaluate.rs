@@ -132,6 +132,59 @@ fn a_snapshot_file_alone_is_flown_and_recorded() {
 }
 
 #[test]
+fn an_evaluation_is_drawn_whatever_is_flown() {
+    let folder = run_folder();
+    let at = folder.path();
+    // Names as users may have them.
+    let strange = at.join("courses/zig zag\n\u{17c}\u{f3}\u{142}w.toml");
+    std::fs::copy(shipped("non_rectangular.toml"), &strange).unwrap();
+    let suite = "name = \"s\"\nepisodes = 2\n[[entry]]\nname = \"orders\"\norders_of = \
+                 \"courses/training.toml\"\n[[entry]]\nname = \"new\"\n[entry.generated]\nshapes \
+                 = [\"circle\"]\nclearance_m = [1.0, 1.0]\n";
+    std::fs::write(at.join("suite.toml"), suite).unwrap();
+    for (name, subject) in [
+        ("own.png", &["--episodes", "1"][..]),
+        (
+            "no extension",
+            &["--episodes", "2", "--course", strange.to_str().unwrap()],
+        ),
+        ("suite.png", &["--suite", "suite.toml"]),
+        ("recorded.png", &["--episodes", "1", "--record", "r.npz"]),
+    ] {
+        let plot = [&["--run", ".", "--json", "r.json", "--plot", name], subject].concat();
+        let output = evaluate(at, &plot);
+        assert!(output.status.success(), "{name}: {output:?}");
+        let picture = std::fs::read(at.join(name)).unwrap();
+        assert!(picture.starts_with(b"\x89PNG"), "{name}");
+        let partial = std::fs::read_dir(at).unwrap().filter(|entry| {
+            let name = entry.as_ref().unwrap().file_name();
+            name.to_string_lossy().contains("partial")
+        });
+        assert_eq!(partial.count(), 0, "{name}");
+    }
+}
+
+#[test]
+fn a_picture_replaces_no_device_and_no_other_result() {
+    let folder = run_folder();
+    let at = folder.path();
+    let refused = |more: &[&str]| error_of(at, &[&["--run", "."], more].concat());
+    let device = refused(&["--plot", "/dev/null"]);
+    assert!(
+        device.contains("/dev/null: it is not a regular file"),
+        "{device}"
+    );
+    for option in ["--json", "--record"] {
+        let same = refused(&["--plot", "one", option, "courses/../one"]);
+        assert!(
+            same.contains(&format!("--plot and {option} name the same file, one")),
+            "{same}"
+        );
+    }
+    assert!(!at.join("one").exists());
+}
+
+#[test]
 fn a_suite_has_the_same_result_on_any_number_of_threads() {
     let folder = run_folder();
     let text = r#"
@@ -250,7 +303,7 @@ fn a_suite_that_cannot_be_flown_is_refused_by_file_and_entry() {
 fn files_that_cannot_be_written_are_refused_before_anything_is_flown() {
     let folder = run_folder();
     let at = folder.path();
-    for option in ["--json", "--record"] {
+    for option in ["--json", "--record", "--plot"] {
         for file in ["/proc/result", "none/result", "courses"] {
             let error = error_of(at, &["--run", ".", option, file]);
             assert!(error.contains(&format!("{file}: ")), "{error}");

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
-use skein_rollout::evaluate::{Arguments, run};
+use skein_evaluate::{Arguments, run};
 use skein_run::failure::with_causes;
 
 fn main() -> ExitCode {
