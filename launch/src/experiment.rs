@@ -14,6 +14,8 @@ use skein_experiments::runner::{self, RunnerOptions, SessionOutcome};
 use skein_launch::display::bar_on_terminal;
 use skein_launch::interrupts::{interrupts, runtime};
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
+use skein_run::terminal::quoted;
+use skein_run::{note, show};
 
 use crate::cli::ExperimentArguments;
 
@@ -38,7 +40,7 @@ fn list(folder: &Path) -> Result<()> {
         match Experiment::load(folder, name, None) {
             Ok(experiment) => {
                 let runs = format!("{} × {}", experiment.arms.len(), experiment.seeds);
-                println!("{name:width$}  {runs:>7} runs  {}", experiment.question);
+                show!("{name:width$}  {runs:>7} runs  {}", experiment.question);
             }
             Err(error) => unusable.push(with_causes(&error)),
         }
@@ -75,14 +77,14 @@ impl ExperimentArguments {
         if !self.report {
             let session = self.run(&experiment, &root, seeds)?;
             if session.interruptions > 0 {
-                eprintln!(
+                note!(
                     "skein: to resume this experiment: {}",
                     self.command(&experiment, Options::All)
                 );
                 return Ok(ExitCode::from(EXIT_INTERRUPTED));
             }
             if !session.failed.is_empty() {
-                eprintln!(
+                note!(
                     "skein: {} failed: {}; \
                          the same command tries them again and leaves complete runs alone",
                     plural(session.failed.len(), "run"),
@@ -100,7 +102,7 @@ impl ExperimentArguments {
         let mut plan = ExperimentPlan::new(experiment, root, seeds)?;
         plan.check_idle()?;
         for (run, other) in plan.link_trained_runs()? {
-            eprintln!(
+            note!(
                 "skein: {run} is trained already: linked to {}",
                 other.display()
             );
@@ -146,8 +148,8 @@ impl ExperimentArguments {
             command: self.command(experiment, Options::OfTheResult),
         };
         let report = findings.write()?;
-        println!("{}", report.text.trim_end());
-        eprintln!("skein: report: {}", report.document.display());
+        show!("{}", report.text.trim_end());
+        note!("skein: report: {}", report.document.display());
         let Some(publication) = publication else {
             return Ok(());
         };
@@ -159,7 +161,7 @@ impl ExperimentArguments {
             );
         }
         for file in publication.publish(&findings, &report)? {
-            eprintln!("skein: published {}", file.display());
+            note!("skein: published {}", file.display());
         }
         Ok(())
     }
@@ -184,10 +186,7 @@ impl ExperimentArguments {
         );
         if options == Options::All {
             option("--jobs", self.jobs.map(|jobs| jobs.to_string()));
-            option(
-                "--runs",
-                self.runs.as_ref().map(|runs| runs.display().to_string()),
-            );
+            option("--runs", self.runs.as_deref().map(quoted));
             option("--publish", self.publish.then(String::new));
         }
         command.trim_end().to_owned()
@@ -203,7 +202,7 @@ enum Options {
 }
 
 fn announce(experiment: &Experiment, plan: &ExperimentPlan, jobs: usize) {
-    eprintln!("skein: {}", experiment.question);
+    note!("skein: {}", experiment.question);
     let there = [
         (RunState::Complete, "complete"),
         (RunState::Trained, "trained"),
@@ -214,7 +213,7 @@ fn announce(experiment: &Experiment, plan: &ExperimentPlan, jobs: usize) {
     .filter(|(count, _)| *count > 0)
     .map(|(count, what)| format!(", {count} {what} already"))
     .collect::<String>();
-    eprintln!(
+    note!(
         "skein: {} of {} with {} each{there}; {jobs} at a time, in {}",
         plural(plan.runs.len(), "run"),
         plural(experiment.arms.len(), "arm"),
@@ -222,14 +221,14 @@ fn announce(experiment: &Experiment, plan: &ExperimentPlan, jobs: usize) {
         plan.root.display()
     );
     if let Some(flown) = &experiment.suite {
-        eprintln!(
+        note!(
             "skein: the best snapshot of each then flies the suite {}: {}",
             flown.file_name(),
             plural(flown.episodes() as usize, "episode")
         );
     }
     if let Some(shortened) = experiment.shortened() {
-        eprintln!("skein: shortened: {shortened}");
+        note!("skein: shortened: {shortened}");
     }
 }
 

@@ -14,9 +14,12 @@ use anyhow::{Context, bail};
 use clap::{Args, Parser};
 use skein_kernels::Isa;
 use skein_protocol::config::Config;
+use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::snapshot::Snapshot;
 use skein_run::RunDirectory;
 use skein_run::tables::evaluation_table;
+use skein_run::terminal::stdout_columns;
+use skein_run::{note, show};
 use skein_simulator::camera::InstructionSet;
 use skein_simulator::suite::{EntryCourses, MOST_EPISODES, Suite, SuiteEntry};
 
@@ -103,7 +106,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threads,
         keep,
     };
-    eprintln!(
+    note!(
         "snapshot {} of {}: {}, {} threads",
         snapshot.version,
         path.display(),
@@ -113,30 +116,34 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ),
         evaluation.threads()
     );
-    eprintln!(
+    note!(
         "networks are computed with {}; images are drawn with {}",
         Isa::best(),
         InstructionSet::best()
     );
     for note in shapes_trained_on(&config, &courses) {
-        eprintln!("{note}");
+        note!("{note}");
     }
     let evaluated = evaluation.run()?;
 
-    println!("{}", evaluation_table(&evaluated.report));
-    if let Some(file) = &arguments.json {
-        let json = serde_json::to_string_pretty(&evaluated.report)
-            .context("cannot write the result as JSON")?;
-        fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))?;
-    }
-    if let Some(file) = &arguments.record {
+    // Files first: the terminal may be gone. A file that cannot be written costs no other result.
+    let json = arguments.json.as_deref();
+    let written = json.map_or(Ok(()), |file| write_json(file, &evaluated.report));
+    let recorded = arguments.record.as_ref().map_or(Ok(()), |file| {
         let names: Vec<_> = courses
             .evaluation()
             .map(|entry| entry.name.as_str())
             .collect();
-        write_recording(file, &names, config.vae.latent, &evaluated.episodes)?;
-    }
-    Ok(())
+        write_recording(file, &names, config.vae.latent, &evaluated.episodes)
+    });
+    show!("{}", evaluation_table(&evaluated.report, stdout_columns()));
+    written?;
+    Ok(recorded?)
+}
+
+fn write_json(file: &Path, report: &EvaluationReport) -> anyhow::Result<()> {
+    let json = serde_json::to_string_pretty(report).context("cannot write the result as JSON")?;
+    fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))
 }
 
 /// Checks that `file` can be written, so that a long evaluation is not lost. Leaves no file behind
