@@ -14,7 +14,8 @@ use skein_experiments::runner::{self, RunnerOptions, SessionOutcome};
 use skein_launch::display::bar_on_terminal;
 use skein_launch::interrupts::{interrupts, runtime};
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
-use skein_run::terminal::quoted;
+use skein_run::tables::fit_markdown;
+use skein_run::terminal::{quoted, stdout_columns};
 use skein_run::{note, show};
 
 use crate::cli::ExperimentArguments;
@@ -148,7 +149,8 @@ impl ExperimentArguments {
             command: self.command(experiment, Options::OfTheResult),
         };
         let report = findings.write()?;
-        show!("{}", report.text.trim_end());
+        let text = fit_markdown(report.text.trim_end(), stdout_columns());
+        show!("{text}");
         note!("skein: report: {}", report.document.display());
         let Some(publication) = publication else {
             return Ok(());

@@ -311,5 +311,5 @@ fn columns_help() -> String {
         "<U",
         "[courses]",
         "names of the courses"
-    )
+    ) + "\n\nExit status: 0 flown, 1 failed, 2 wrong arguments."
 }

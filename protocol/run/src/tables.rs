@@ -81,6 +81,43 @@ pub fn fit(mut table: Table, columns: usize) -> String {
     table.set_width(columns).to_string()
 }
 
+/// Returns `text` with those of its Markdown tables that are wider than `columns` broken to fit.
+pub fn fit_markdown(text: &str, columns: usize) -> String {
+    let mut shown = String::new();
+    let lines: Vec<&str> = text.lines().collect();
+    for block in lines.chunk_by(|one, next| one.starts_with('|') == next.starts_with('|')) {
+        let block = block.join("\n");
+        let fits = !block.starts_with('|') || width(&block) <= columns;
+        shown.push_str(&match fits {
+            true => block,
+            false => fit(from_markdown(&block), columns),
+        });
+        shown.push('\n');
+    }
+    shown.trim_end_matches('\n').to_owned()
+}
+
+/// Reads a Markdown table: a header, a rule that ends in a colon above columns aligned right, rows.
+fn from_markdown(text: &str) -> Table {
+    let mut rows = text.lines().map(|line| {
+        let cells = line.trim().trim_matches('|').split('|');
+        cells.map(str::trim).collect::<Vec<_>>()
+    });
+    let mut table = Table::new();
+    table.load_preset(UTF8_FULL_CONDENSED);
+    table.set_header(rows.next().unwrap_or_default());
+    let rule = rows.next().unwrap_or_default();
+    rows.for_each(|cells| {
+        table.add_row(cells);
+    });
+    for (column, dashes) in table.column_iter_mut().zip(rule) {
+        if dashes.ends_with(':') {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+    table
+}
+
 /// Returns the columns that `text` takes.
 fn width(text: &str) -> usize {
     let lines = text.lines().map(|line| line.chars().count());
@@ -216,6 +253,17 @@ mod tests {
             narrow.contains("100.0 %") || narrow.contains("0.0 %"),
             "{narrow}"
         );
+    }
+
+    #[test]
+    fn a_markdown_table_is_broken_only_where_it_is_too_wide() {
+        let text = "# Question\n\n| arm | R |\n|-----|--:|\n| one | 0.5 [0.4, 0.6] |\n\nEnd.";
+        assert_eq!(fit_markdown(text, 80), text);
+        let narrow = fit_markdown(text, 16);
+        assert!(width(&narrow) <= 16, "{narrow}");
+        for part in ["# Question\n\n", "one", "0.4,", "\n\nEnd."] {
+            assert!(narrow.contains(part), "{part:?} is missing in\n{narrow}");
+        }
     }
 
     #[test]
