@@ -298,12 +298,12 @@ fn a_lengthened_run_resumes_from_before_the_end_of_the_shorter_one() {
         "{passed_over:?}"
     );
     // A shorter run, or one that differs in anything else, refuses it.
-    for change in [
-        |config: &mut Config| config.run.episodes = 499,
-        |config| {
-            (config.run.episodes, config.run.seed) = (1000, 99);
-        },
-    ] {
+    let shorter = |config: &mut Config| config.run.episodes = 499;
+    let other_seed = |config: &mut Config| {
+        (config.run.episodes, config.run.seed) = (1000, 99);
+    };
+    let changes: [fn(&mut Config); 2] = [shorter, other_seed];
+    for change in changes {
         let mut other = config(2);
         other.learning.episodes_per_epoch = 10;
         change(&mut other);
