@@ -53,7 +53,10 @@ fn main() -> ExitCode {
         Command::Evaluate(arguments) => {
             skein_rollout::evaluate::run(&arguments).map(|()| ExitCode::SUCCESS)
         }
-        Command::Experiment(arguments) => experiment::carry_out(&arguments),
+        Command::Experiment(arguments) => {
+            warn_of_environment();
+            experiment::carry_out(&arguments)
+        }
         Command::Report(arguments) => report(&arguments),
     };
     match outcome {

@@ -215,10 +215,8 @@ impl<'a> LearnerProcess<'a> {
     /// Returns the reason why it is not restarted.
     pub(super) fn exited(&mut self, exit: &Exit) -> Result<String, SupervisorError> {
         let state = std::mem::replace(&mut self.state, LearnerState::Dead);
-        if !self.plan.run.logs().is_dir() {
-            return Err(SupervisorError::DirectoryGone(
-                self.plan.run.root().to_owned(),
-            ));
+        if self.is_directory_gone() {
+            return Err(self.failed(exit.to_string()));
         }
         if !exit.may_recover() {
             return Err(
@@ -281,8 +279,17 @@ impl<'a> LearnerProcess<'a> {
         }
     }
 
+    /// Returns `true` if the run's directory was removed or moved. A learner that was about to save
+    /// may have created part of it again.
+    pub(super) fn is_directory_gone(&self) -> bool {
+        !self.plan.run.logs().is_dir()
+    }
+
     /// Returns the error for its end, described by `how`.
     pub(super) fn failed(&self, how: String) -> SupervisorError {
+        if self.is_directory_gone() {
+            return SupervisorError::DirectoryGone(self.plan.run.root().to_owned());
+        }
         let log = self.plan.run.learner_log();
         SupervisorError::LearnerFailed {
             how,

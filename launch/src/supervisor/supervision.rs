@@ -248,9 +248,9 @@ impl<W: Watcher> Supervision<'_, W> {
             && !self.crew.is_alive()
             && let Some(reason) = self.crew.last_failure()
         {
-            self.failure = Some(match self.plan.run.logs().is_dir() {
-                true => SupervisorError::NoActors(reason.to_string()),
-                false => SupervisorError::DirectoryGone(self.plan.run.root().to_owned()),
+            self.failure = Some(match self.learner.is_directory_gone() {
+                true => SupervisorError::DirectoryGone(self.plan.run.root().to_owned()),
+                false => SupervisorError::NoActors(reason.to_string()),
             });
             self.stop = self.stop.interrupted(self.plan.deadlines.learner_stop);
             self.learner.order(ProcessOrder::Terminate);
