@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Adds actors to a run that is under way on this machine.
 set -euo pipefail
-source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
+# shellcheck source=common.sh
+source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/common.sh"
 
 help_if_asked skein attach -- "$@" <<END
 launch/attach_actor.sh OPTIONS builds Skein and runs "skein attach" with these options.

@@ -1,7 +1,9 @@
 # shellcheck shell=bash
 # Sourced by the other scripts: where things lie, and how they are built.
 
-repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
+# With it, cd may go elsewhere and prints where it went.
+unset CDPATH
+repository=$(cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/.." && pwd -P)
 readonly repository
 # Where the default courses are, for whoever writes a configuration elsewhere.
 export SKEIN_CONFIGS="$repository/configs"
@@ -66,14 +68,16 @@ cargo_build() {
 }
 
 # Copies cargo's messages, after a line that says what is built. Copies nothing if nothing is built.
+# A terminal or reader that is gone must not end the build.
 say_once() {
     local what=$1 line
+    trap '' PIPE
     while IFS= read -r line; do
         [[ $line != *Finished* ]] || continue
-        [[ -z $what ]] || printf '%s\n' "$what"
+        [[ -z $what ]] || printf '%s\n' "$what" || true
         what=
-        printf '%s\n' "$line"
-    done
+        printf '%s\n' "$line" || true
+    done 2>/dev/null
 }
 
 # Where cargo builds. Asked, not assumed: CARGO_TARGET_DIR or the user's own cargo configuration may put it elsewhere.

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Runs one of the experiments of configs/experiments/ with several seeds, and reports what it found.
 set -euo pipefail
-source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
+# shellcheck source=common.sh
+source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/common.sh"
 
 help_if_asked skein experiment -- "$@" <<END
 launch/experiment.sh NAME [OPTIONS] builds Skein and runs "skein experiment" with these options.

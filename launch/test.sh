@@ -2,7 +2,8 @@
 # Everything a change must pass: format, lints, the tests of all crates, among them whole runs with real processes, and that
 # benchmarks run.
 set -euo pipefail
-source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
+# shellcheck source=common.sh
+source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/common.sh"
 
 help_if_asked -- "$@" <<END
 launch/test.sh checks formatting and lints, builds everything, and runs all tests, in the release profile: what is tested is

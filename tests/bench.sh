@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Measures every stage of the data's way against its baseline, and prints one table.
 set -euo pipefail
-source "$(dirname "${BASH_SOURCE[0]}")/../launch/common.sh"
+# shellcheck source=../launch/common.sh
+source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/../launch/common.sh"
 
 help_if_asked -- "$@" <<END
 Usage: tests/bench.sh [--quick] [--only NAME ...] [--growth]

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Throws bytes at everything that reads bytes from outside, for as long as wanted, following what code they reach.
 set -euo pipefail
-source "$(dirname "${BASH_SOURCE[0]}")/../launch/common.sh"
+# shellcheck source=../launch/common.sh
+source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/../launch/common.sh"
 
 help_if_asked -- "$@" <<END
 Usage: tests/fuzz.sh [SECONDS | --executions N] [--target NAME ...] [--jobs N]
@@ -18,7 +19,7 @@ Options:
   --jobs N        targets driven at one time [default: one a core]
   -h, --help      this text
 
-Exit status: 0 nothing was found, 1 something was, or the targets could not be driven; 2 called wrongly.
+Exit status: 0 nothing was found, 1 something was, or the targets could not be driven; 2 wrong arguments.
 END
 
 fail() {

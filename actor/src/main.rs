@@ -17,6 +17,8 @@ use skein_rollout::environment_loop::EnvironmentLoop;
 use skein_run::allocation::return_large_blocks;
 use skein_run::failure::{EXIT_LEARNER_GONE, with_causes};
 use skein_run::logging::{LogFormat, log_to_file};
+use skein_run::note;
+use skein_run::signals::is_ignored;
 use skein_run::{Presence, RunDirectory};
 use skein_simulator::camera::InstructionSet;
 use tracing::{error, info};
@@ -44,7 +46,7 @@ fn main() -> ExitCode {
     match run(&Arguments::parse()) {
         Ok(ExitReason::Stopped | ExitReason::Signalled) => ExitCode::SUCCESS,
         Ok(ExitReason::LearnerSilent) => {
-            eprintln!(
+            note!(
                 "skein-actor: no learner of this run sent a heartbeat for \
                 transport.learner_silence_secs; exiting"
             );
@@ -53,7 +55,7 @@ fn main() -> ExitCode {
         Err(error) => {
             let error = with_causes(error.as_ref());
             error!(error, "actor failed");
-            eprintln!("skein-actor: {error}");
+            note!("skein-actor: {error}");
             ExitCode::FAILURE
         }
     }
@@ -89,10 +91,14 @@ fn run(arguments: &Arguments) -> anyhow::Result<ExitReason> {
     Ok(Service::new(&identity, &config, actor, &exit_requested).serve(&mut environment_loop)?)
 }
 
-/// Returns a flag that the first SIGTERM or SIGINT sets; a second one ends the process at once.
+/// Returns a flag that the first SIGTERM or SIGINT sets; a second one ends the process at once. One
+/// that was ignored when this process started stays ignored.
 fn end_on_signal() -> anyhow::Result<Arc<AtomicBool>> {
     let exit_requested = Arc::new(AtomicBool::new(false));
     for signal in [SIGTERM, SIGINT] {
+        if is_ignored(signal) {
+            continue;
+        }
         // In this order: the second signal finds the flag set by the first.
         signal_hook::flag::register_conditional_default(signal, Arc::clone(&exit_requested))
             .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&exit_requested)))

@@ -2,8 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::error::ErrorKind;
-use clap::{Args, CommandFactory, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand};
+use skein_run::failure::EXIT_WRONG_ARGUMENTS;
+use skein_run::note;
+use skein_run::terminal::quoted;
 
 /// Trains a drone to avoid obstacles from its depth camera.
 ///
@@ -47,8 +49,8 @@ pub(crate) struct RunArguments {
         required_unless_present = "resume"
     )]
     pub(crate) config: Option<PathBuf>,
-    /// Where everything goes; must be new or empty. launch/run_local.sh sets runs/<date>_<time> by
-    /// default.
+    /// Where everything goes; must be new or empty. launch/run_local.sh sets
+    /// runs/<date>_<time>_<process> by default.
     #[arg(
         long,
         value_name = "DIR",
@@ -62,6 +64,17 @@ pub(crate) struct RunArguments {
     /// of actors, and ends with the same result as if it had never stopped.
     #[arg(long, value_name = "DIR")]
     pub(crate) resume: Option<PathBuf>,
+    /// With --resume: lengthen the run, complete or not, to N training episodes in all.
+    ///
+    /// It ends with the same result as if it had been started with N. Its end so far, at which the
+    /// last snapshot was judged, is undone: it resumes from the checkpoint before.
+    #[arg(
+        long,
+        value_name = "N",
+        requires = "resume",
+        value_parser = clap::value_parser!(u64).range(1..)
+    )]
+    pub(crate) episodes: Option<u64>,
     /// Actors to start [default: number of cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) actors: Option<u32>,
@@ -174,8 +187,14 @@ pub(crate) struct ReportArguments {
 
 /// Task of `skein run`.
 pub(crate) enum Task<'a> {
-    New { config: &'a Path, run_dir: &'a Path },
-    Resume(&'a Path),
+    New {
+        config: &'a Path,
+        run_dir: &'a Path,
+    },
+    Resume {
+        directory: &'a Path,
+        episodes: Option<u64>,
+    },
 }
 
 impl RunArguments {
@@ -183,14 +202,44 @@ impl RunArguments {
     pub(crate) fn task(&self) -> Task<'_> {
         match (&self.resume, &self.config, &self.run_dir) {
             (None, Some(config), Some(run_dir)) => Task::New { config, run_dir },
-            (Some(directory), None, None) if self.overrides.is_empty() => Task::Resume(directory),
-            _ => Cli::command()
-                .error(
-                    ErrorKind::ArgumentConflict,
-                    "a run is resumed in its own directory, with the configuration it was started \
-                     with: --config, --run-dir and --set cannot be given with --resume",
-                )
-                .exit(),
+            (Some(directory), None, None) if self.overrides.is_empty() => Task::Resume {
+                directory,
+                episodes: self.episodes,
+            },
+            _ => {
+                note!("skein: {}", self.conflict());
+                std::process::exit(EXIT_WRONG_ARGUMENTS.into())
+            }
         }
+    }
+
+    /// Returns what contradicts --resume, and what to do.
+    fn conflict(&self) -> String {
+        let given = [
+            (self.config.is_some(), "--config"),
+            (self.run_dir.is_some(), "--run-dir"),
+            (!self.overrides.is_empty(), "--set"),
+        ];
+        let given: Vec<_> = given
+            .iter()
+            .filter(|(is, _)| *is)
+            .map(|(_, name)| *name)
+            .collect();
+        let directory = self.resume.as_deref().unwrap_or(Path::new("DIR"));
+        let resume = format!("launch/run_local.sh --resume {}", quoted(directory));
+        let lengthen = match self
+            .overrides
+            .iter()
+            .any(|text| text.starts_with("run.episodes"))
+        {
+            true => format!("; to lengthen it, give {resume} --episodes N"),
+            false => String::new(),
+        };
+        format!(
+            "{} cannot be given with --resume: a run is resumed in its own directory, with the \
+             configuration it was started with. To resume it, give {resume} alone{lengthen}; \
+             to train with other settings, start a new run without --resume",
+            given.join(" and ")
+        )
     }
 }

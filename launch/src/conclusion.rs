@@ -13,8 +13,9 @@ use skein_run::tables::{evaluation_table, stages_table};
 use skein_reports::Clock;
 
 /// Returns the evaluation table, a sentence on the run, the table of times per stage, and the paths
-/// of all files the run left, for standard output. Parts that the run did not write are left out.
-pub fn conclusion(run: &RunDirectory) -> String {
+/// of all files the run left, for standard output of `columns`. Parts that the run did not write are
+/// left out.
+pub fn conclusion(run: &RunDirectory, columns: usize) -> String {
     let mut text = String::new();
     if let Some(report) = read::<EvaluationReport>(&run.evaluation_json()) {
         push(
@@ -22,7 +23,7 @@ pub fn conclusion(run: &RunDirectory) -> String {
             &format!(
                 "Best snapshot (version {}), flown without exploration:\n{}\n",
                 report.policy_version,
-                evaluation_table(&report)
+                evaluation_table(&report, columns)
             ),
         );
     }
@@ -32,7 +33,10 @@ pub fn conclusion(run: &RunDirectory) -> String {
         }
         push(&mut text, &sentence(&summary));
         if summary.stages != StageTimes::default() {
-            push(&mut text, &format!("{}\n", stages_table(&summary.stages)));
+            push(
+                &mut text,
+                &format!("{}\n", stages_table(&summary.stages, columns)),
+            );
         }
     }
     push(&mut text, &format!("{}:", run.root().display()));
@@ -193,7 +197,7 @@ mod tests {
         )
         .unwrap();
         fs::write(run.summary_json(), serde_json::to_string(&summary).unwrap()).unwrap();
-        let text = conclusion(&run);
+        let text = conclusion(&run, usize::MAX);
         for part in [
             "version 42",
             "training",
@@ -215,7 +219,7 @@ mod tests {
     fn a_run_that_left_nothing_still_has_a_conclusion() {
         let directory = tempfile::tempdir().unwrap();
         assert!(
-            conclusion(&RunDirectory::new(directory.path()))
+            conclusion(&RunDirectory::new(directory.path()), 80)
                 .contains(&directory.path().display().to_string())
         );
     }

@@ -6,17 +6,20 @@
 
 use std::collections::VecDeque;
 use std::fmt;
-use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use skein_protocol::progress::{LearnerPhase, ProgressReport};
 use skein_reports::Clock;
+use skein_run::note;
+use skein_run::terminal::{can_redraw, stderr_columns, wrapped};
 
 use crate::supervisor::{Restarts, Watcher};
 
 /// Time between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
+/// Columns for the bar beside the first line of its text, with the space between.
+const LEAST_BAR: usize = 4;
 /// Time window for the pace from which the remaining time is estimated. A short window matters
 /// because the VAE's part of a run is slower than what follows.
 const PACE_SECS: f64 = 60.0;
@@ -34,13 +37,15 @@ enum Surface {
     },
 }
 
-/// Returns a progress bar if standard error is a terminal.
+/// Returns a progress bar if standard error is a terminal that can show one.
 pub fn bar_on_terminal() -> Option<ProgressBar> {
-    std::io::stderr().is_terminal().then(|| {
-        let style = ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}")
-            .expect("the template is well-formed");
-        ProgressBar::new(0).with_style(style.progress_chars("━━─"))
-    })
+    if !can_redraw() {
+        return None;
+    }
+    let style = ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}")
+        .expect("the template is well-formed");
+    let bar = ProgressBar::new(0).with_style(style.progress_chars("━━─"));
+    (!bar.is_hidden()).then_some(bar)
 }
 
 impl ProgressDisplay {
@@ -95,7 +100,9 @@ impl Watcher for ProgressDisplay {
                 };
                 bar.set_length(length);
                 bar.set_position(position);
-                bar.set_message(format!("{head}\n{}", wrapped(&figures, terminal_columns())));
+                let columns = stderr_columns();
+                let head = wrapped(&head, columns.saturating_sub(LEAST_BAR));
+                bar.set_message(format!("{head}\n{}", wrapped(&figures, columns)));
             }
             Surface::Plain { last } => {
                 let due = last.is_none_or(|(when, phase)| {
@@ -105,7 +112,10 @@ impl Watcher for ProgressDisplay {
                 });
                 if due {
                     *last = Some((Instant::now(), progress.phase));
-                    eprintln!("{head} · {figures}");
+                    note!(
+                        "{}",
+                        wrapped(&format!("{head} · {figures}"), stderr_columns())
+                    );
                 }
             }
         }
@@ -113,8 +123,8 @@ impl Watcher for ProgressDisplay {
 
     fn warn(&mut self, text: &str) {
         match &self.surface {
-            Surface::Terminal(bar) => bar.suspend(|| eprintln!("skein: {text}")),
-            Surface::Plain { .. } => eprintln!("skein: {text}"),
+            Surface::Terminal(bar) => bar.suspend(|| note!("skein: {text}")),
+            Surface::Plain { .. } => note!("skein: {text}"),
         }
     }
 }
@@ -200,30 +210,6 @@ impl fmt::Display for ProgressFigures<'_> {
         }
         Ok(())
     }
-}
-
-/// Returns `figures` broken into lines of at most `columns`, at the separators between figures. A
-/// terminal would break them anywhere, and the bar would not know how many lines to redraw.
-fn wrapped(figures: &str, columns: usize) -> String {
-    let mut lines: Vec<String> = Vec::new();
-    for figure in figures.split(" · ") {
-        match lines.last_mut() {
-            Some(line) if line.chars().count() + 3 + figure.chars().count() <= columns => {
-                line.push_str(" · ");
-                line.push_str(figure);
-            }
-            _ => lines.push(figure.to_owned()),
-        }
-    }
-    lines.join("\n")
-}
-
-/// Returns the width of the terminal on standard error, or that of a small terminal if unknown.
-fn terminal_columns() -> usize {
-    rustix::termios::tcgetwinsize(std::io::stderr()).map_or(80, |size| match size.ws_col {
-        0 => 80,
-        columns => columns.into(),
-    })
 }
 
 /// Pace of the training episodes over the last [`PACE_SECS`].
@@ -315,6 +301,18 @@ mod tests {
             },
         }
         .to_string();
+        let head = ProgressHead {
+            progress: &progress,
+            left_secs: Some(61.0),
+        }
+        .to_string();
+        for columns in 1..200 {
+            let lines = wrapped(&format!("{head} · {figures}"), columns);
+            assert!(
+                lines.lines().all(|line| line.chars().count() <= columns),
+                "{lines}"
+            );
+        }
         for columns in 30..200 {
             let lines = wrapped(&figures, columns);
             assert!(

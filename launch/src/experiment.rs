@@ -14,9 +14,11 @@ use skein_experiments::runner::{self, RunnerOptions, SessionOutcome};
 use skein_launch::display::bar_on_terminal;
 use skein_launch::interrupts::{interrupts, runtime};
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
+use skein_run::tables::fit_markdown;
+use skein_run::terminal::{quoted, stdout_columns};
+use skein_run::{note, show};
 
 use crate::cli::ExperimentArguments;
-use crate::shell_word;
 
 /// Carries out the command. The exit status shows whether every run is complete.
 pub(crate) fn carry_out(arguments: &ExperimentArguments) -> Result<ExitCode> {
@@ -39,7 +41,7 @@ fn list(folder: &Path) -> Result<()> {
         match Experiment::load(folder, name, None) {
             Ok(experiment) => {
                 let runs = format!("{} × {}", experiment.arms.len(), experiment.seeds);
-                println!("{name:width$}  {runs:>7} runs  {}", experiment.question);
+                show!("{name:width$}  {runs:>7} runs  {}", experiment.question);
             }
             Err(error) => unusable.push(with_causes(&error)),
         }
@@ -82,14 +84,14 @@ impl ExperimentArguments {
         if !self.report {
             let session = self.run(&experiment, &root, seeds)?;
             if session.interruptions > 0 {
-                eprintln!(
+                note!(
                     "skein: to resume this experiment: {}",
                     self.command(&experiment, Options::All)
                 );
                 return Ok(ExitCode::from(EXIT_INTERRUPTED));
             }
             if !session.failed.is_empty() {
-                eprintln!(
+                note!(
                     "skein: {} failed: {}; \
                          the same command tries them again and leaves complete runs alone",
                     plural(session.failed.len(), "run"),
@@ -107,7 +109,7 @@ impl ExperimentArguments {
         let mut plan = ExperimentPlan::new(experiment, root, seeds)?;
         plan.check_idle()?;
         for (run, other) in plan.link_trained_runs()? {
-            eprintln!(
+            note!(
                 "skein: {run} is trained already: linked to {}",
                 other.display()
             );
@@ -153,10 +155,11 @@ impl ExperimentArguments {
             command: self.command(experiment, Options::OfTheResult),
         };
         let report = findings.write()?;
-        println!("{}", report.text.trim_end());
-        eprintln!("skein: report: {}", report.document.display());
+        let text = fit_markdown(report.text.trim_end(), stdout_columns());
+        show!("{text}");
+        note!("skein: report: {}", report.document.display());
         for failure in &report.failures {
-            eprintln!("skein: a plot could not be drawn: {}", with_causes(failure));
+            note!("skein: a plot could not be drawn: {}", with_causes(failure));
         }
         let Some(publication) = publication else {
             return Ok(());
@@ -172,7 +175,7 @@ impl ExperimentArguments {
             );
         }
         for file in publication.publish(&findings, &report)? {
-            eprintln!("skein: published {}", file.display());
+            note!("skein: published {}", file.display());
         }
         Ok(())
     }
@@ -180,7 +183,7 @@ impl ExperimentArguments {
     /// Returns the command that repeats this one.
     fn command(&self, experiment: &Experiment, options: Options) -> String {
         let named = self.name.as_deref().unwrap_or(&experiment.name);
-        let mut command = format!("launch/experiment.sh {}", shell_word(named));
+        let mut command = format!("launch/experiment.sh {}", quoted(Path::new(named)));
         let mut option = |name: &str, value: Option<String>| {
             if let Some(value) = value {
                 command.push_str(&format!(" {name} {value}"));
@@ -198,12 +201,7 @@ impl ExperimentArguments {
         );
         if options == Options::All {
             option("--jobs", self.jobs.map(|jobs| jobs.to_string()));
-            option(
-                "--runs",
-                self.runs
-                    .as_ref()
-                    .map(|runs| shell_word(&runs.display().to_string())),
-            );
+            option("--runs", self.runs.as_deref().map(quoted));
             option("--publish", self.publish.then(String::new));
         }
         command.trim_end().to_owned()
@@ -219,7 +217,7 @@ enum Options {
 }
 
 fn announce(experiment: &Experiment, plan: &ExperimentPlan, jobs: usize) {
-    eprintln!("skein: {}", experiment.question);
+    note!("skein: {}", experiment.question);
     let there = [
         (RunState::Complete, "complete"),
         (RunState::Trained, "trained"),
@@ -230,7 +228,7 @@ fn announce(experiment: &Experiment, plan: &ExperimentPlan, jobs: usize) {
     .filter(|(count, _)| *count > 0)
     .map(|(count, what)| format!(", {count} {what} already"))
     .collect::<String>();
-    eprintln!(
+    note!(
         "skein: {} of {} with {} each{there}; {jobs} at a time, in {}",
         plural(plan.runs.len(), "run"),
         plural(experiment.arms.len(), "arm"),
@@ -238,14 +236,14 @@ fn announce(experiment: &Experiment, plan: &ExperimentPlan, jobs: usize) {
         plan.root.display()
     );
     if let Some(flown) = &experiment.suite {
-        eprintln!(
+        note!(
             "skein: the best snapshot of each then flies the suite {}: {}",
             flown.file_name(),
             plural(flown.episodes() as usize, "episode")
         );
     }
     if let Some(shortened) = experiment.shortened() {
-        eprintln!("skein: shortened: {shortened}");
+        note!("skein: shortened: {shortened}");
     }
 }
 

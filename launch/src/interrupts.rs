@@ -2,6 +2,7 @@
 
 use std::io;
 
+use skein_run::signals::is_ignored;
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
@@ -18,6 +19,8 @@ pub fn runtime() -> io::Result<Runtime> {
 }
 
 /// Returns a channel with one message per request (by the user or the system) to end this process.
+/// A signal that was ignored when it started, as SIGHUP is under `nohup`, stays ignored.
+///
 /// Must be called within a [`runtime`].
 ///
 /// # Errors
@@ -29,6 +32,9 @@ pub fn interrupts() -> io::Result<mpsc::Receiver<()>> {
         SignalKind::terminate(),
         SignalKind::hangup(),
     ] {
+        if is_ignored(kind.as_raw_value()) {
+            continue;
+        }
         let mut signal = signal(kind)?;
         let sender = sender.clone();
         tokio::spawn(async move {

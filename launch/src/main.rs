@@ -4,6 +4,7 @@
 mod cli;
 mod experiment;
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::thread;
@@ -20,14 +21,17 @@ use skein_launch::resume::resume;
 use skein_launch::supervisor::{
     self, Deadlines, Ended, Programs, SupervisionPlan, SupervisorError,
 };
-use skein_prepare::room::{check_shared_memory_for_more, scarce_disk};
-use skein_prepare::{Prepared, prepare};
+use skein_prepare::room::{check_shared_memory_for_more, raise_file_limit, scarce_disk};
+use skein_prepare::{NewDirectory, Prepared, prepare};
 use skein_protocol::config::{Config, CoursesSection};
 use skein_protocol::summary::RunEnding;
 use skein_reports::{ideal_walls_passed, load_courses};
 use skein_run::ActorClaim;
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
+use skein_run::logging::environment_faults;
+use skein_run::terminal::{quoted, stdout_columns};
 use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
+use skein_run::{note, show};
 
 use cli::{AttachArguments, Cli, Command, ReportArguments, RunArguments, Task};
 
@@ -37,32 +41,28 @@ const SIGNALS: &str = "cannot listen for signals";
 /// Time that an unsupervised learner has to end before its run is resumed.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// A run that failed, and its directory.
+/// A run that failed; the user has read why.
 #[derive(Debug, thiserror::Error)]
-#[error("{source}")]
-struct Unfinished {
-    run: RunDirectory,
-    #[source]
-    source: SupervisorError,
-}
+#[error("the run failed")]
+struct Unfinished;
 
 fn main() -> ExitCode {
     let outcome = match Cli::parse().command {
         Command::Run(arguments) => run(&arguments).map(status),
         Command::Attach(arguments) => attach(&arguments).map(status),
         Command::Evaluate(arguments) => skein_evaluate::run(&arguments).map(|()| ExitCode::SUCCESS),
-        Command::Experiment(arguments) => experiment::carry_out(&arguments),
+        Command::Experiment(arguments) => {
+            warn_of_environment();
+            experiment::carry_out(&arguments)
+        }
         Command::Report(arguments) => report(&arguments),
     };
     match outcome {
         Ok(status) => status,
         Err(error) => {
-            eprintln!("skein: {}", with_causes(error.as_ref()));
-            // A learner that cannot start cannot be resumed either.
-            if let Some(Unfinished { run, source }) = error.downcast_ref()
-                && !source.is_self_explanatory()
-            {
-                print_resume_command(run);
+            // What failed in a run has been printed already.
+            if !error.is::<Unfinished>() {
+                note!("skein: {}", with_causes(error.as_ref()));
             }
             ExitCode::FAILURE
         }
@@ -84,6 +84,8 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
         Some(actors) => actors as usize,
         None => thread::available_parallelism().map_or(1, Into::into),
     };
+    warn_of_environment();
+    raise_file_limit(actors)?;
     sweep();
     let (prepared, lock) = match arguments.task() {
         Task::New { config, run_dir } => {
@@ -91,14 +93,17 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
             let lock = SupervisorLock::take(&prepared.run, &prepared.identity)?;
             (prepared, lock)
         }
-        Task::Resume(directory) => resume(directory, actors, PATIENCE)?,
+        Task::Resume {
+            directory,
+            episodes,
+        } => resume(directory, episodes, actors, PATIENCE)?,
     };
     announce(&prepared, actors, arguments);
     let Prepared {
         run, config, new, ..
     } = &prepared;
     if let Some(warning) = scarce_disk(config, run.root()) {
-        eprintln!("skein: {warning}");
+        note!("skein: {warning}");
     }
 
     let claims = claim_actors(run, actors)?;
@@ -118,31 +123,12 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
     drop(lock);
     sweep();
 
-    let outcome = outcome?;
-    if let (Some(new), Err(error)) = (new, &outcome)
-        && error.is_self_explanatory()
-        && run.newest_checkpoint().is_none()
-    {
-        // The run never began: its directory would only block the next attempt.
-        if let Err(error) = new.take_back() {
-            eprintln!("skein: {} remains: {error}", run.root().display());
-        }
-        return Ok(outcome?);
-    }
-
-    // Plots are optional: a run that failed may still have left something to draw, and a run that
-    // succeeded is a success without them.
-    let plots = draw(run, config);
-    report_failures(&plots.failures);
-    if !plots.failures.is_empty() {
-        let root = shell_word(&run.root().display().to_string());
-        eprintln!("skein: everything else is kept; to draw again: skein report --run {root}");
-    }
-    let ended = outcome.map_err(|source| Unfinished {
-        run: run.clone(),
-        source,
-    })?;
-    print!("{}", conclusion(run));
+    let ended = match outcome? {
+        Ok(ended) => ended,
+        Err(error) => return Err(failed(run, config, new.as_ref(), &error).into()),
+    };
+    draw_if_possible(run, config);
+    show!("{}", conclusion(run, stdout_columns()).trim_end());
     // A user who stopped only the learner has interrupted the run as well. Conversely, a run may
     // complete before it acts on an interruption.
     let ended = match run.summary().map(|summary| summary.ending) {
@@ -156,17 +142,66 @@ fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
             let kept = newest.map_or("there is no checkpoint yet".to_owned(), |episodes| {
                 format!("the newest checkpoint was written after episode {episodes}")
             });
-            eprintln!("skein: stopped immediately: {kept}");
+            note!("skein: stopped immediately: {kept}");
         }
         print_resume_command(run);
     }
     Ok(ended)
 }
 
+/// Prints why a run failed and what can be done, before anything else can fail.
+fn failed(
+    run: &RunDirectory,
+    config: &Config,
+    new: Option<&NewDirectory>,
+    error: &SupervisorError,
+) -> Unfinished {
+    note!("skein: {}", with_causes(error));
+    if let SupervisorError::DirectoryGone(_) = error {
+        return Unfinished;
+    }
+    // A learner that cannot start cannot be resumed either.
+    if !error.is_self_explanatory() {
+        print_resume_command(run);
+    } else if let Some(new) = new
+        && run.newest_checkpoint().is_none()
+    {
+        // The run never began: its directory would only block the next attempt.
+        if let Err(error) = new.take_back() {
+            note!("skein: {} remains: {error}", run.root().display());
+        }
+        return Unfinished;
+    }
+    draw_if_possible(run, config);
+    Unfinished
+}
+
+/// Draws the plots. They are optional: a run that failed may still have left something to draw, and
+/// a run that succeeded is a success without them.
+fn draw_if_possible(run: &RunDirectory, config: &Config) {
+    let Ok(plots) = catch_unwind(AssertUnwindSafe(|| draw(run, config))) else {
+        note!("skein: some plots could not be drawn: the drawing panicked");
+        return;
+    };
+    report_failures(&plots.failures);
+    if !plots.failures.is_empty() {
+        let root = quoted(run.root());
+        note!("skein: everything else is kept; to draw again: skein report --run {root}");
+    }
+}
+
+/// Reports variables of the environment that the processes of a run cannot use: in their logs
+/// nobody would look for it.
+fn warn_of_environment() {
+    for fault in environment_faults() {
+        note!("skein: {fault}");
+    }
+}
+
 /// Prints what is about to start.
 fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
     let config = &prepared.config;
-    eprintln!(
+    note!(
         "skein: {actors} {}, {} training episodes, seed {}",
         if actors == 1 { "actor" } else { "actors" },
         config.run.episodes,
@@ -174,12 +209,12 @@ fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
     );
     let root = prepared.run.root().display();
     if arguments.resume.is_some() {
-        eprintln!("skein: resuming the run in {root}");
+        note!("skein: resuming the run in {root}");
         return;
     }
-    eprintln!("skein: run directory: {root}");
+    note!("skein: run directory: {root}");
     if !config.courses.evaluation.contains(&config.courses.training) {
-        eprintln!(
+        note!(
             "skein: note: the training course is not in courses.evaluation; \
                  the best snapshot is chosen on {}",
             prepared
@@ -194,29 +229,23 @@ fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
 
 /// Prints the command that resumes an incomplete run.
 fn print_resume_command(run: &RunDirectory) {
-    let root = shell_word(&run.root().display().to_string());
-    eprintln!("skein: to resume this run: launch/run_local.sh --resume {root}");
-}
-
-/// Returns `text` as one word of a shell command, quoted if necessary.
-fn shell_word(text: &str) -> String {
-    let is_plain = |character: char| character.is_alphanumeric() || "/._-+=:,@".contains(character);
-    match !text.is_empty() && text.chars().all(is_plain) {
-        true => text.to_owned(),
-        false => format!("'{}'", text.replace('\'', r"'\''")),
-    }
+    let root = quoted(run.root());
+    note!("skein: to resume this run: launch/run_local.sh --resume {root}");
 }
 
 fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
+    warn_of_environment();
+    raise_file_limit(arguments.count as usize)?;
     let programs = Programs::beside_this()?;
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
     // While the learner restarts, its supervisor keeps the run under way.
     if !run.is_running()? {
-        let root = run.root().display();
         bail!(
-            "the run in {root} is not under way on this machine; \
-              if it is incomplete, resume it with launch/run_local.sh --resume {root}"
+            "the run in {} is not under way on this machine; \
+              if it is incomplete, resume it with launch/run_local.sh --resume {}",
+            run.root().display(),
+            quoted(run.root())
         );
     }
     umask(Mode::RWXG | Mode::RWXO);
@@ -230,7 +259,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
         bail!("this run allows transport.max_actors = {most} actors: attach {too_many} fewer");
     }
     let names: Vec<_> = actors.iter().map(ToString::to_string).collect();
-    eprintln!(
+    note!(
         "skein: adding actor {} to {}; Ctrl-C removes them again",
         names.join(", "),
         run.root().display()
@@ -255,14 +284,14 @@ fn report(arguments: &ReportArguments) -> anyhow::Result<ExitCode> {
     let (_, config) = run.open()?;
     let plots = draw(&run, &config);
     for picture in &plots.pictures {
-        println!("{}", picture.display());
+        show!("{}", picture.display());
     }
     report_failures(&plots.failures);
     if !plots.failures.is_empty() {
         return Ok(ExitCode::FAILURE);
     }
     if plots.pictures.is_empty() {
-        eprintln!(
+        note!(
             "skein: {} holds nothing to draw yet: no episode has ended",
             run.root().display()
         );
@@ -299,14 +328,14 @@ fn draw(run: &RunDirectory, config: &Config) -> Plots {
 
 fn report_failures(failures: &[String]) {
     for failure in failures {
-        eprintln!("skein: a plot could not be drawn: {failure}");
+        note!("skein: a plot could not be drawn: {failure}");
     }
 }
 
 /// Removes the remains of this user's runs whose processes were all killed.
 fn sweep() {
     for failure in sweep_leftovers().failures {
-        eprintln!("skein: could not remove: {failure}");
+        note!("skein: could not remove: {failure}");
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use skein_protocol::summary::RunEnding;
+use skein_run::terminal::quoted;
 use skein_run::{LockError, PathError, RunDirectory, RunError, SupervisorLock};
 
 use skein_prepare::room::{check_folders, check_shared_memory};
@@ -32,12 +32,13 @@ pub enum ResumeError {
     /// All its training episodes are done.
     #[error(
         "the run in {} is complete (all {episodes} episodes), so it cannot be resumed; \
-             start a new run to train more. \
+             launch/run_local.sh --resume {} --episodes N lengthens it to N episodes in all, \
              target/release/skein report --run {} draws its plots again, \
              launch/evaluate.sh --run {} flies its best snapshot again",
         directory.display(),
-        directory.display(),
-        directory.display()
+        quoted(directory),
+        quoted(directory),
+        quoted(directory)
     )]
     Complete {
         /// The run directory.
@@ -50,7 +51,7 @@ pub enum ResumeError {
         "the run in {} is under way: add actors with launch/attach_actor.sh --run {}, \
              or stop it first",
         .0.display(),
-        .0.display()
+        quoted(.0)
     )]
     UnderWay(PathBuf),
     /// Another version made the run, it was changed, or this machine cannot start it.
@@ -75,12 +76,14 @@ pub enum ResumeError {
 }
 
 /// Checks that `actors` actors can resume the run in `directory`, and claims it. An unsupervised
-/// learner that is still running gets `patience` to end.
+/// learner that is still running gets `patience` to end. `episodes` lengthens the run to so many
+/// training episodes.
 ///
 /// # Errors
 /// Returns [`ResumeError`]; in this case nothing was changed.
 pub fn resume(
     directory: &Path,
+    episodes: Option<u64>,
     actors: usize,
     patience: Duration,
 ) -> Result<(Prepared, SupervisorLock), ResumeError> {
@@ -96,7 +99,11 @@ pub fn resume(
     if !run.identity().is_file() {
         return Err(not_a_run(Path::new("run.json")));
     }
-    let (identity, config) = run.open()?;
+    let (identity, config) = match episodes {
+        // A lengthening that was cut off is repeated below.
+        Some(_) => run.open_to_lengthen()?,
+        None => run.open()?,
+    };
     let under_way = || ResumeError::UnderWay(run.root().to_owned());
     // A process that only checks whether the lock is taken holds it for a moment.
     let lock = in_time(LOOK * 5, || match SupervisorLock::take(&run, &identity) {
@@ -112,8 +119,12 @@ pub fn resume(
         Ok::<_, PathError>((!identity.is_learner_alive()?).then_some(()))
     })?
     .ok_or_else(under_way)?;
+    let (identity, config) = match episodes {
+        Some(episodes) => run.lengthen(episodes)?,
+        None => (identity, config),
+    };
     if let Some(summary) = run.summary()
-        && summary.ending == RunEnding::Completed
+        && summary.is_of_whole(&config)
     {
         return Err(ResumeError::Complete {
             directory: run.root().to_owned(),
@@ -165,7 +176,7 @@ mod tests {
     }
 
     fn refusal(directory: &Path) -> String {
-        resume(directory, 1, Duration::ZERO)
+        resume(directory, None, 1, Duration::ZERO)
             .unwrap_err()
             .to_string()
     }
@@ -174,14 +185,14 @@ mod tests {
     fn an_unfinished_run_can_be_resumed_by_one_supervisor() {
         let directory = tempfile::tempdir().unwrap();
         let prepared = prepared_run(directory.path());
-        let (resumed, lock) = resume(prepared.run.root(), 3, Duration::ZERO).unwrap();
+        let (resumed, lock) = resume(prepared.run.root(), None, 3, Duration::ZERO).unwrap();
         assert_eq!(
             (&resumed.identity, &resumed.config),
             (&prepared.identity, &prepared.config)
         );
         assert!(refusal(prepared.run.root()).contains("is under way"));
         drop(lock);
-        assert!(resume(prepared.run.root(), 1, Duration::ZERO).is_ok());
+        assert!(resume(prepared.run.root(), None, 1, Duration::ZERO).is_ok());
     }
 
     #[test]
@@ -198,7 +209,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = prepared_run(directory.path()).run;
         let actors = Config::default().transport.max_actors + 1;
-        let error = resume(run.root(), actors, Duration::ZERO)
+        let error = resume(run.root(), None, actors, Duration::ZERO)
             .unwrap_err()
             .to_string();
         assert!(error.contains("max_actors"), "{error}");

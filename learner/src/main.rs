@@ -8,12 +8,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, Result};
 use clap::Parser;
 use skein_learner::training::{self, TrainingError};
-use skein_protocol::summary::RunEnding;
 use skein_run::allocation::keep_freed_memory;
 use skein_run::failure::{EXIT_RESTART, with_causes};
 use skein_run::logging::{LogFormat, log_to_file};
+use skein_run::note;
+use skein_run::signals::is_ignored;
 use skein_run::{LearnerLock, RunDirectory};
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
 /// The learner of a run: hands out tickets, trains on the episodes that come back, publishes
 /// snapshots. Started by run_local.sh.
@@ -37,7 +38,7 @@ fn main() -> ExitCode {
             let status = status_of(&error);
             let error = with_causes(error.as_ref());
             tracing::error!(error, "learner failed");
-            eprintln!("skein-learner: {error}");
+            note!("skein-learner: {error}");
             status
         }
     }
@@ -71,11 +72,11 @@ fn run(arguments: &Arguments) -> Result<()> {
     // An unreadable summary counts as missing: it is written again, from the last checkpoint.
     if directory
         .summary()
-        .is_some_and(|summary| summary.ending == RunEnding::Completed)
+        .is_some_and(|summary| summary.is_of_whole(&config))
     {
         let root = directory.root().display();
         tracing::info!("the run is complete: nothing left to do");
-        eprintln!("skein-learner: the run in {root} is complete: nothing left to do");
+        note!("skein-learner: the run in {root} is complete: nothing left to do");
         return Ok(());
     }
     let summary = training::run(&directory, &identity, lock.incarnation(), &config, &stop)?;
@@ -83,7 +84,7 @@ fn run(arguments: &Arguments) -> Result<()> {
     Ok(())
 }
 
-/// Returns a flag that SIGTERM and SIGINT set.
+/// Returns a flag that SIGTERM and SIGINT set, unless they were ignored when this process started.
 fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
@@ -93,8 +94,8 @@ fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
     let (mut terminate, mut interrupt) = {
         let _entered = runtime.enter();
         (
-            signal(SignalKind::terminate())?,
-            signal(SignalKind::interrupt())?,
+            listen(SignalKind::terminate())?,
+            listen(SignalKind::interrupt())?,
         )
     };
     std::thread::Builder::new()
@@ -102,12 +103,29 @@ fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
         .spawn(move || {
             runtime.block_on(async {
                 tokio::select! {
-                    _ = terminate.recv() => {}
-                    _ = interrupt.recv() => {}
+                    () = arrival(&mut terminate) => {}
+                    () = arrival(&mut interrupt) => {}
                 }
             });
             tracing::info!("stop requested");
             flag.store(true, Ordering::Relaxed);
         })?;
     Ok(stop)
+}
+
+/// Listens for a signal; `None` if it was ignored when this process started, and so stays ignored.
+fn listen(kind: SignalKind) -> std::io::Result<Option<Signal>> {
+    (!is_ignored(kind.as_raw_value()))
+        .then(|| signal(kind))
+        .transpose()
+}
+
+/// Waits for a signal, for ever if it is ignored.
+async fn arrival(signal: &mut Option<Signal>) {
+    match signal {
+        Some(signal) => {
+            signal.recv().await;
+        }
+        None => std::future::pending().await,
+    }
 }

@@ -5,6 +5,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
+use crate::config::Config;
 use crate::ids::{PolicyVersion, RunId};
 use crate::stages::StageTimes;
 
@@ -73,6 +74,12 @@ pub struct Summary {
 }
 
 impl Summary {
+    /// Returns `true` if the run completed all episodes of `config`. One that was lengthened
+    /// afterwards has more to fly.
+    pub fn is_of_whole(&self, config: &Config) -> bool {
+        self.ending == RunEnding::Completed && self.episodes >= config.run.episodes
+    }
+
     /// Reads the summary at `path`; returns `None` if there is none, or it cannot be read.
     pub fn load(path: &Path) -> Option<Self> {
         serde_json::from_slice(&std::fs::read(path).ok()?).ok()

@@ -12,6 +12,7 @@ use serde::de::DeserializeOwned;
 use skein_chaos::{ListedProcess, Role, compare, leftovers, processes_of};
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::summary::Summary;
+use skein_run::signals::heed;
 use skein_run::{RunDirectory, sweep_leftovers};
 use tempfile::TempDir;
 
@@ -140,6 +141,8 @@ fn skein_run(folder: &Path, actors: u32) -> Command {
         .stdin(Stdio::null())
         .stdout(File::create(folder.join("stdout")).unwrap())
         .stderr(File::create(folder.join("stderr")).unwrap());
+    // Tests interrupt it, and may themselves run in the background of a script, which ignores this.
+    heed(&mut command, Signal::INT);
     command
 }
 
@@ -314,13 +317,24 @@ impl RunningRun {
     /// # Panics
     /// Panics if it cannot be started.
     pub fn resume(&mut self, actors: u32) {
+        self.resume_with(actors, &[]);
+    }
+
+    /// As [`RunningRun::resume`], with more arguments.
+    ///
+    /// # Panics
+    /// Panics if it cannot be started.
+    pub fn resume_with(&mut self, actors: u32, arguments: &[&str]) {
         self.supervisor.wait().unwrap();
         let folder = self
             .folder
             .as_ref()
             .expect("the folder is taken only at the end");
         let mut command = skein_run(folder.path(), actors);
-        command.arg("--resume").arg(self.directory.root());
+        command
+            .arg("--resume")
+            .arg(self.directory.root())
+            .args(arguments);
         self.supervisor = command.spawn().unwrap();
         self.deadline = Instant::now() + LIMIT;
     }

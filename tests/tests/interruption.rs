@@ -5,12 +5,16 @@
     reason = "a test's helpers fail by panicking, as tests do"
 )]
 
+use std::fs::OpenOptions;
+use std::process::Command;
+use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use rustix::process::Signal;
+use rustix::process::{Pid, Signal, kill_process};
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::summary::RunEnding;
-use skein_tests::{RunRecipe, RunningRun, leftovers, processes_of};
+use skein_run::RunDirectory;
+use skein_tests::{RunRecipe, RunningRun, episodes, leftovers, processes_of, program, repository};
 
 /// Exit status that a shell reports for a program ended by Ctrl-C: 128 + SIGINT.
 const INTERRUPTED: i32 = 130;
@@ -152,4 +156,80 @@ fn a_run_between_two_incarnations_of_its_learner_stops_in_order() {
         "{last}"
     );
     ended.assert_nothing_is_left();
+}
+
+/// As `nohup skein run … >/dev/full 2>&1 &` in a script, whose terminal then closes.
+#[test]
+fn a_run_whose_terminal_is_lost_completes_and_ignored_signals_stay_ignored() {
+    let folder = tempfile::tempdir().unwrap();
+    let directory = RunDirectory::new(folder.path().canonicalize().unwrap().join("run"));
+    let full = || OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let mut supervisor = Command::new("sh")
+        .args(["-c", "trap '' HUP INT TERM; exec \"$@\"", "sh"])
+        .arg(program("skein"))
+        .args(["run", "--actors", "1", "--config"])
+        .arg(repository().join("tests/small.toml"))
+        .arg("--run-dir")
+        .arg(directory.root())
+        .stdout(full())
+        .stderr(full())
+        .spawn()
+        .unwrap();
+    let deadline = Instant::now() + Duration::from_secs(120);
+    while episodes(&directory).len() < 10 {
+        assert!(Instant::now() < deadline, "never ten episodes");
+        assert_eq!(supervisor.try_wait().unwrap(), None, "the run ended");
+        sleep(Duration::from_millis(20));
+    }
+    let pid = Pid::from_raw(supervisor.id().cast_signed()).unwrap();
+    for signal in [Signal::HUP, Signal::INT, Signal::TERM] {
+        kill_process(pid, signal).unwrap();
+    }
+    assert!(supervisor.wait().unwrap().success());
+    let summary = directory.summary().unwrap();
+    assert_eq!(summary.ending, RunEnding::Completed);
+    assert!(directory.evaluation_json().is_file());
+}
+
+/// As Ctrl-Z, and later fg. The processes of the run are not stopped: each leads its own group.
+#[test]
+fn a_supervisor_stopped_for_longer_than_its_deadlines_continues_where_it_was() {
+    let mut run = RunRecipe::small()
+        .set("run.episodes=1000000")
+        .set("transport.learner_silence_secs=6")
+        .start();
+    run.until_episodes(10);
+    run.signal(Signal::STOP);
+    // Longer than the 5 s after which it takes a silent learner for frozen.
+    sleep(Duration::from_secs(7));
+    run.signal(Signal::CONT);
+    let flown = episodes(run.directory()).len();
+    run.until_episodes(flown + 20);
+    run.signal(Signal::INT);
+    let ended = run.wait();
+    assert_eq!(ended.output.code, Some(INTERRUPTED));
+    for blame in ["killing it", "restarting", "found no learner"] {
+        assert!(
+            !ended.output.stderr.contains(blame),
+            "{}",
+            ended.output.stderr
+        );
+    }
+}
+
+#[test]
+fn a_run_whose_directory_is_removed_says_so() {
+    let run = long_run();
+    // Moved, not removed: that is done at once, whatever the processes create meanwhile.
+    let root = run.directory().root();
+    std::fs::rename(root, root.with_extension("moved")).unwrap();
+    let ended = run.wait();
+    ended
+        .output
+        .assert_refused(&["was removed", "start a new run"]);
+    assert!(
+        !ended.output.stderr.contains("--resume"),
+        "{}",
+        ended.output.stderr
+    );
 }

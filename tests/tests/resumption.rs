@@ -46,6 +46,26 @@ fn a_run_cut_off_and_resumed_with_other_numbers_of_actors_has_the_same_result() 
 }
 
 #[test]
+fn a_finished_run_that_is_lengthened_has_the_result_of_a_run_of_that_length() {
+    let calm = recipe().finish();
+
+    // 35 episodes end in the middle of an epoch.
+    let mut run = RunRecipe::small().set("run.episodes=35").start();
+    run.until_ended();
+    run.resume_with(1, &["--episodes", "80"]);
+    let ended = run.finish();
+    ended.assert_same_as(&calm);
+    assert!(
+        ended
+            .output
+            .stderr
+            .contains("end of the run of 35 episodes"),
+        "{}",
+        ended.output.stderr
+    );
+}
+
+#[test]
 fn a_run_whose_processes_die_one_after_another_has_the_same_result() {
     let calm = recipe().finish();
 

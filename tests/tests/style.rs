@@ -123,3 +123,22 @@ fn no_doc_comment_hides_its_noun() {
     }
     assert!(found.is_empty(), "{found:#?}");
 }
+
+#[test]
+fn no_program_prints_with_macros_that_panic_when_the_terminal_is_gone() {
+    let mut found = vec![];
+    for (place, line) in lines(&["rs"]) {
+        let is_program = place.contains("src/") && !place.contains("tests.rs");
+        let is_test = place.contains("/tests/mod.rs") || place.contains("tests/src/");
+        let prints = ["println!(", "eprintln!(", "print!(", "eprint!("]
+            .iter()
+            .any(|printing| line.trim_start().starts_with(printing));
+        if is_program && !is_test && prints {
+            found.push(place);
+        }
+    }
+    assert!(
+        found.is_empty(),
+        "use show! and note! of skein-run: {found:#?}"
+    );
+}

@@ -313,7 +313,7 @@ fn every_process_has_its_log(run: &EndedRun) {
 fn the_conclusion_shows_the_tables_and_the_paths(run: &EndedRun) {
     for part in [
         "non_rectangular",
-        &skein_run::tables::stages_table(&run.summary().stages),
+        &skein_run::tables::stages_table(&run.summary().stages, usize::MAX),
         "episodes.csv",
         "plots/walls_passed.png",
         "snapshots/best.safetensors",

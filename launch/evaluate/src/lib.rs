@@ -13,6 +13,7 @@ use anyhow::{Context, bail};
 use clap::{Args, Parser};
 use skein_kernels::Isa;
 use skein_protocol::config::Config;
+use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::snapshot::Snapshot;
 use skein_reports::MOST_DRAWN;
 use skein_rollout::courses::Courses;
@@ -20,6 +21,8 @@ use skein_rollout::evaluation::{Evaluation, Keep, MAX_THREADS};
 use skein_rollout::recording::{COLUMNS, NAME_LISTS, check_recordable, write_recording};
 use skein_run::RunDirectory;
 use skein_run::tables::evaluation_table;
+use skein_run::terminal::stdout_columns;
+use skein_run::{note, show};
 use skein_simulator::camera::InstructionSet;
 use skein_simulator::suite::{EntryCourses, MOST_EPISODES, Suite, SuiteEntry};
 
@@ -121,7 +124,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threads,
         keep,
     };
-    eprintln!(
+    note!(
         "snapshot {} of {}: {}, {} threads",
         snapshot.version,
         path.display(),
@@ -131,33 +134,38 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ),
         evaluation.threads()
     );
-    eprintln!(
+    note!(
         "networks are computed with {}; images are drawn with {}",
         Isa::best(),
         InstructionSet::best()
     );
     for note in shapes_trained_on(&config, &courses) {
-        eprintln!("{note}");
+        note!("{note}");
     }
     let evaluated = evaluation.run()?;
 
-    println!("{}", evaluation_table(&evaluated.report));
-    if let Some(file) = &arguments.json {
-        let json = serde_json::to_string_pretty(&evaluated.report)
-            .context("cannot write the result as JSON")?;
-        fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))?;
-    }
-    if let Some(file) = &arguments.record {
+    // Files first: the terminal may be gone. A file that cannot be written costs no other result.
+    let json = arguments.json.as_deref();
+    let written = json.map_or(Ok(()), |file| write_json(file, &evaluated.report));
+    let recorded = arguments.record.as_ref().map_or(Ok(()), |file| {
         let names: Vec<_> = courses
             .evaluation()
             .map(|entry| entry.name.as_str())
             .collect();
-        write_recording(file, &names, config.vae.latent, &evaluated.episodes)?;
-    }
-    if let Some(file) = &arguments.plot {
-        plot::draw(&courses, &evaluated.episodes, file)?;
-    }
-    Ok(())
+        write_recording(file, &names, config.vae.latent, &evaluated.episodes)
+    });
+    let drawn = arguments.plot.as_ref().map_or(Ok(()), |file| {
+        plot::draw(&courses, &evaluated.episodes, file)
+    });
+    show!("{}", evaluation_table(&evaluated.report, stdout_columns()));
+    written?;
+    recorded?;
+    Ok(drawn?)
+}
+
+fn write_json(file: &Path, report: &EvaluationReport) -> anyhow::Result<()> {
+    let json = serde_json::to_string_pretty(report).context("cannot write the result as JSON")?;
+    fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))
 }
 
 /// `true` if two paths name one file, whether or not it exists.
@@ -348,7 +356,8 @@ fn columns_help() -> String {
         .collect();
     format!(
         "Arrays in the file of --record, read by numpy.load(FILE); one row per observation, \
-        episodes and courses in order:\n{}",
+        episodes and courses in order:\n{}\n\n\
+        Exit status: 0 flown, 1 failed, 2 wrong arguments.",
         lines.join("\n")
     )
 }

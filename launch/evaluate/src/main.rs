@@ -5,12 +5,13 @@ use std::process::ExitCode;
 use clap::Parser;
 use skein_evaluate::{Arguments, run};
 use skein_run::failure::with_causes;
+use skein_run::note;
 
 fn main() -> ExitCode {
     match run(&Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("skein-evaluate: {}", with_causes(error.as_ref()));
+            note!("skein-evaluate: {}", with_causes(error.as_ref()));
             ExitCode::FAILURE
         }
     }

@@ -10,9 +10,13 @@ use std::time::{Duration, Instant};
 use indicatif::ProgressBar;
 
 use skein_reports::Clock;
+use skein_run::note;
+use skein_run::terminal::{cut, stderr_columns, wrapped};
 
 /// Time between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
+/// Columns for the bar beside the first line of its text, with the space between.
+const LEAST_BAR: usize = 4;
 
 /// Stages of a run, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -84,13 +88,16 @@ impl ExperimentDisplay {
             Surface::Terminal(bar) => {
                 bar.set_length(progress.total_episodes);
                 bar.set_position(progress.episodes);
-                bar.set_message(format!("{head}{}", lines(&progress.under_way)));
+                let columns = stderr_columns();
+                let head = wrapped(&head, columns.saturating_sub(LEAST_BAR));
+                bar.set_message(format!("{head}{}", lines(&progress.under_way, columns)));
             }
             Surface::Plain { last } => {
                 if last.is_none_or(|when| when.elapsed() >= LINE_INTERVAL) {
                     *last = Some(Instant::now());
                     let runs: Vec<_> = progress.under_way.iter().map(RunProgress::brief).collect();
-                    eprintln!("{}", [&[head], runs.as_slice()].concat().join(" · "));
+                    let line = [&[head], runs.as_slice()].concat().join(" · ");
+                    note!("{}", wrapped(&line, stderr_columns()));
                 }
             }
         }
@@ -99,8 +106,8 @@ impl ExperimentDisplay {
     /// Prints a line that stays visible.
     pub fn say(&self, text: &str) {
         match &self.surface {
-            Surface::Terminal(bar) => bar.suspend(|| eprintln!("skein: {text}")),
-            Surface::Plain { .. } => eprintln!("skein: {text}"),
+            Surface::Terminal(bar) => bar.suspend(|| note!("skein: {text}")),
+            Surface::Plain { .. } => note!("skein: {text}"),
         }
     }
 
@@ -132,14 +139,17 @@ fn head(progress: &ExperimentProgress, elapsed_secs: f64, first_episodes: u64) -
     text
 }
 
-/// Returns a line per run, for display below the bar.
-fn lines(under_way: &[RunProgress]) -> String {
+/// Returns a line of at most `columns` per run, for display below the bar.
+fn lines(under_way: &[RunProgress], columns: usize) -> String {
     let width = under_way
         .iter()
         .map(|run| run.name.chars().count())
         .max()
         .unwrap_or(0);
-    let line = |run: &RunProgress| format!("\n  {:width$}  {}", run.name, run.figures());
+    let line = |run: &RunProgress| {
+        let text = format!("  {:width$}  {}", run.name, run.figures());
+        format!("\n{}", cut(&text, columns))
+    };
     under_way.iter().map(line).collect()
 }
 
@@ -205,7 +215,7 @@ mod tests {
         );
         assert_eq!(head(&progress, 60.0, 600), "3 of 12 runs complete · 1:00");
         assert_eq!(
-            lines(&progress.under_way),
+            lines(&progress.under_way, 80),
             "\n  none/seed-2   episode 50/100, walls passed 1.23\n  half/seed-10  evaluating\n  \
              half/seed-9   flying the suite"
         );

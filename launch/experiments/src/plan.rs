@@ -8,6 +8,7 @@ use skein_protocol::config::Config;
 use skein_protocol::summary::RunEnding;
 use skein_run::RunDirectory;
 use skein_run::failure::with_causes;
+use skein_run::terminal::quoted;
 
 use super::definition::Experiment;
 
@@ -207,11 +208,12 @@ impl PlannedRun {
     /// Returns the reason why the run cannot belong to the experiment, with the remedy.
     pub fn look(&self) -> Result<RunState, String> {
         let root = self.directory.root().display();
+        let quoted = quoted(self.directory.root());
         if !self.directory.identity().is_file() {
             if self.directory.root().is_symlink() {
                 return Err(format!(
                     "  {root} is a link to a run that no longer exists: \
-                          restore that run, or remove the link: rm {root}"
+                          restore that run, or remove the link: rm {quoted}"
                 ));
             }
             let is_empty = fs::read_dir(self.directory.root())
@@ -223,7 +225,7 @@ impl PlannedRun {
                 )),
             };
         }
-        let aside = format!("to train it again, move it away: mv {root} {root}.old");
+        let aside = format!("to train it again, move it away: mv {quoted} {quoted}.old");
         let differences = differences(&self.directory, &self.config)
             .map_err(|problem| format!("  {root}: {problem}; {aside}"))?;
         if !differences.is_empty() {

@@ -29,6 +29,7 @@ use skein_reports::Clock;
 use skein_reports::curves::{EpisodeRow, trailing_mean};
 use skein_run::log_tail::log_tail;
 use skein_run::orphans::signal_when_orphaned;
+use skein_run::signals::heed;
 
 /// Time between two checks of the active runs.
 const LOOK: Duration = Duration::from_millis(200);
@@ -212,6 +213,7 @@ fn spawn(mut command: Command, options: &OpenOptions, run: &PlannedRun) -> io::R
         .stderr(log)
         .process_group(0);
     signal_when_orphaned(command.as_std_mut(), Signal::INT);
+    heed(command.as_std_mut(), Signal::INT);
     command.spawn()
 }
 

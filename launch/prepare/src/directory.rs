@@ -49,6 +49,13 @@ impl NewDirectory {
         if fs::read_dir(directory).map_err(io)?.next().is_some() {
             return Err(PrepareError::NotEmpty(directory.to_owned()));
         }
+        // Of two starts that found it empty, one makes this folder.
+        match fs::create_dir(RunDirectory::new(directory).courses()) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                return Err(PrepareError::NotEmpty(directory.to_owned()));
+            }
+            made => made.map_err(io)?,
+        }
         fs::set_permissions(directory, Permissions::from_mode(OWNER_ONLY)).map_err(io)?;
         let root = directory.canonicalize().map_err(io)?;
         Ok(Self { root, origin })
@@ -83,10 +90,6 @@ impl NewDirectory {
 /// copies, so that the run stays reproducible when the originals change.
 pub(super) fn copy_courses(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
     let folder = RunDirectory::new(root).courses();
-    fs::create_dir_all(&folder).map_err(|source| PrepareError::Io {
-        path: folder.clone(),
-        source,
-    })?;
     let mut copies: BTreeMap<OsString, PathBuf> = BTreeMap::new();
     for path in config.courses.paths_mut() {
         let stem = CoursesSection::name_of(path);

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use skein_protocol::config::ConfigError;
 use skein_run::RunError;
+use skein_run::terminal::quoted;
 use skein_simulator::course::{CourseError, RangesError};
 use skein_simulator::simulator::SimulatorError;
 
@@ -91,9 +92,10 @@ pub enum PrepareError {
     Folders(#[from] FoldersTooSmall),
     /// The run's directory is not empty.
     #[error(
-        "{folder} is not empty: choose another --run-dir, \
-         or resume the run in it with --resume {folder}",
-        folder = .0.display()
+        "{} is not empty: choose another --run-dir, \
+         or resume the run in it with --resume {}",
+        .0.display(),
+        quoted(.0)
     )]
     NotEmpty(PathBuf),
     /// A file or folder of the run cannot be written.

@@ -188,3 +188,20 @@ fn a_used_directory_is_refused_with_a_remedy() {
         "{error}"
     );
 }
+
+#[test]
+fn of_two_starts_in_one_empty_directory_one_is_refused() {
+    for _ in 0..50 {
+        let directory = tempfile::tempdir().unwrap();
+        let make = || NewDirectory::make(directory.path());
+        let made = std::thread::scope(|scope| {
+            let other = scope.spawn(make);
+            [make(), other.join().unwrap()]
+        });
+        let refused: Vec<_> = made.iter().filter_map(|made| made.as_ref().err()).collect();
+        assert!(
+            matches!(refused[..], [PrepareError::NotEmpty(_)]),
+            "{refused:?}"
+        );
+    }
+}

@@ -6,6 +6,7 @@ use tokio::time::{Duration, Instant, interval};
 
 use super::crew::{Crew, GivenUp};
 use super::dismissal::dismiss;
+use super::memory::MemoryWatch;
 use super::process::ProcessOrder;
 use super::{EVENTS, Ended, SupervisionPlan, SupervisorError, SupervisorEvent, Watcher};
 
@@ -25,7 +26,13 @@ pub async fn attach(
     watcher: &mut impl Watcher,
 ) -> Result<Ended, SupervisorError> {
     let (events, mut inbox) = mpsc::channel(EVENTS);
-    let mut crew = Crew::new(&plan.run, &plan.programs.actor, &plan.actors, events);
+    let mut crew = Crew::new(
+        &plan.run,
+        &plan.programs.actor,
+        &plan.actors,
+        events,
+        MemoryWatch::new(),
+    );
     if let Err(error) = crew.start() {
         dismiss(&mut crew, &mut inbox, interrupts).await;
         return Err(error);

@@ -11,12 +11,11 @@ use skein_run::RunDirectory;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep};
 
-use super::memory::memory_shortage;
+use super::memory::{MemoryShortage, MemoryWatch};
 use super::process::{Exit, Output, ProcessLaunch, ProcessOrder, reap};
 use super::restarts::{ActorDeaths, IncarnationUse, RestartDecision};
 use super::work::WorkDone;
 use super::{SupervisorError, SupervisorEvent};
-use skein_prepare::room::free_shared_memory;
 use skein_run::log_tail::log_tail;
 
 /// An incarnation that lasted this long started successfully, even if no reports prove it.
@@ -36,6 +35,7 @@ pub(super) struct Crew<'a> {
     restarts: u64,
     /// Warnings for the user, oldest first.
     warnings: VecDeque<String>,
+    memory: MemoryWatch,
 }
 
 /// One actor, across all its incarnations.
@@ -111,6 +111,7 @@ impl<'a> Crew<'a> {
         program: &'a Path,
         actors: &[ActorId],
         events: mpsc::Sender<SupervisorEvent>,
+        memory: MemoryWatch,
     ) -> Self {
         let member = |&id| Member {
             id,
@@ -129,6 +130,7 @@ impl<'a> Crew<'a> {
             last_failure: None,
             restarts: 0,
             warnings: VecDeque::new(),
+            memory,
         }
     }
 
@@ -258,24 +260,26 @@ impl<'a> Crew<'a> {
         if age >= GOOD_START {
             member.standing = ActorStanding::Proven;
         }
-        let shortage = memory_shortage(exit, free_shared_memory());
+        let shortage = self.memory.shortage(exit);
+        let is_excused = match &shortage {
+            Some(MemoryShortage::Shared(_)) => true,
+            // The next incarnation needs as much memory.
+            Some(MemoryShortage::Own(_)) => false,
+            None => exit.was_killed() && last_order == ProcessOrder::Run,
+        };
         let incarnation = match member.judge(work) {
             // A signal excuses the actor unless the supervisor sent it: it kills only frozen
             // processes.
-            IncarnationUse::Useless
-                if shortage.is_some() || exit.was_killed() && last_order == ProcessOrder::Run =>
-            {
-                IncarnationUse::Interrupted
-            }
+            IncarnationUse::Useless if is_excused => IncarnationUse::Interrupted,
             incarnation => incarnation,
         };
+        let how = format!(
+            "{exit}{}",
+            shortage.as_ref().map_or("", MemoryShortage::text)
+        );
         match member.deaths.died(Instant::now(), incarnation) {
-            RestartDecision::RestartAfter(pause) => self.rest(
-                number,
-                &format!("{exit}{}", shortage.unwrap_or_default()),
-                pause,
-            ),
-            RestartDecision::GiveUp => self.give_up(number, exit),
+            RestartDecision::RestartAfter(pause) => self.rest(number, &how, pause),
+            RestartDecision::GiveUp => self.give_up(number, &how),
         }
     }
 
@@ -296,13 +300,13 @@ impl<'a> Crew<'a> {
         });
     }
 
-    fn give_up(&mut self, number: usize, exit: &Exit) {
+    fn give_up(&mut self, number: usize, how: &str) {
         let member = &mut self.members[number];
         member.state = ActorState::Stranded;
         let log = self.run.actor_log(member.id);
         let failure = format!(
             "gave up on actor {}: it died {} times without doing useful work, the last time it \
-             {exit}; its log {} ends with\n{}",
+             {how}; its log {} ends with\n{}",
             member.id,
             ActorDeaths::MAX_USELESS,
             log.display(),

@@ -40,6 +40,13 @@ pub enum SupervisorError {
     /// The learner of a run to which actors were added has ended.
     #[error("the learner of the run in {} has ended", .0.display())]
     LearnerGone(PathBuf),
+    /// The run's directory is gone, or no run's any more.
+    #[error(
+        "{} was removed or moved while the run was under way, so nothing more can be saved: \
+         start a new run",
+        .0.display()
+    )]
+    DirectoryGone(PathBuf),
     /// No actor is left.
     #[error("no actor is left: {0}")]
     NoActors(String),
@@ -53,7 +60,8 @@ impl SupervisorError {
             Self::Missing(_)
             | Self::Setup(_)
             | Self::Start { .. }
-            | Self::LearnerCannotStart(_) => true,
+            | Self::LearnerCannotStart(_)
+            | Self::DirectoryGone(_) => true,
             Self::LearnerFailed { .. } | Self::LearnerGone(_) | Self::NoActors(_) => false,
         }
     }

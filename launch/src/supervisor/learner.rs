@@ -9,12 +9,11 @@ use tokio::process::ChildStdout;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep, timeout};
 
-use super::memory::memory_shortage;
+use super::memory::{MemoryShortage, MemoryWatch};
 use super::process::{Exit, Output, ProcessLaunch, ProcessOrder, reap};
 use super::restarts::{DeathCause, LearnerDeaths, RestartDecision};
 use super::work::WorkDone;
 use super::{SupervisionPlan, SupervisorError, SupervisorEvent};
-use skein_prepare::room::free_shared_memory;
 use skein_run::log_tail::{last_words, log_tail};
 
 /// Time to wait for the last output of a learner that ended. Another process may hold its pipe
@@ -28,6 +27,7 @@ pub(super) struct LearnerProcess<'a> {
     state: LearnerState,
     deaths: LearnerDeaths,
     restarts: u64,
+    memory: MemoryWatch,
 }
 
 enum LearnerState {
@@ -67,6 +67,7 @@ impl<'a> LearnerProcess<'a> {
     pub(super) fn start(
         plan: &'a SupervisionPlan,
         events: mpsc::Sender<SupervisorEvent>,
+        memory: MemoryWatch,
     ) -> Result<Self, SupervisorError> {
         let mut learner = Self {
             plan,
@@ -74,6 +75,7 @@ impl<'a> LearnerProcess<'a> {
             state: LearnerState::Dead,
             deaths: LearnerDeaths::new(plan.deadlines.learner_pause),
             restarts: 0,
+            memory,
         };
         learner.launch()?;
         Ok(learner)
@@ -213,6 +215,9 @@ impl<'a> LearnerProcess<'a> {
     /// Returns the reason why it is not restarted.
     pub(super) fn exited(&mut self, exit: &Exit) -> Result<String, SupervisorError> {
         let state = std::mem::replace(&mut self.state, LearnerState::Dead);
+        if self.is_directory_gone() {
+            return Err(self.failed(exit.to_string()));
+        }
         if !exit.may_recover() {
             return Err(
                 match last_words(&self.plan.run.learner_log(), &self.plan.programs.learner) {
@@ -224,16 +229,19 @@ impl<'a> LearnerProcess<'a> {
             );
         }
         // The supervisor kills only a frozen learner, so that counts as a failure.
-        let shortage = memory_shortage(exit, free_shared_memory());
-        let cause =
-            if shortage.is_some() || exit.was_killed() && !matches!(state, LearnerState::Killed) {
-                DeathCause::Outside
-            } else {
-                DeathCause::Failure
-            };
+        let shortage = self.memory.shortage(exit);
+        let killed_from_outside = exit.was_killed() && !matches!(state, LearnerState::Killed);
+        let cause = match &shortage {
+            // The next incarnation needs as much memory.
+            Some(MemoryShortage::Own(_)) => DeathCause::Failure,
+            Some(MemoryShortage::Shared(_)) => DeathCause::Outside,
+            None if killed_from_outside => DeathCause::Outside,
+            None => DeathCause::Failure,
+        };
+        let shortage = shortage.as_ref().map_or("", MemoryShortage::text);
         match self.deaths.died(cause) {
             RestartDecision::GiveUp => Err(self.failed(format!(
-                "died {} times without making progress, the last time it {exit}",
+                "died {} times without making progress, the last time it {exit}{shortage}",
                 LearnerDeaths::MAX_WITHOUT_PROGRESS
             ))),
             RestartDecision::RestartAfter(pause) => {
@@ -247,9 +255,8 @@ impl<'a> LearnerProcess<'a> {
                     pause => format!("in {} s", pause.as_secs()),
                 };
                 Ok(format!(
-                    "the learner {exit}{}{}; restarting it {when}, {}",
+                    "the learner {exit}{}{shortage}; restarting it {when}, {}",
                     self.reason_given(exit),
-                    shortage.unwrap_or_default(),
                     self.restart_point()
                 ))
             }
@@ -272,8 +279,17 @@ impl<'a> LearnerProcess<'a> {
         }
     }
 
+    /// Returns `true` if the run's directory was removed or moved. A learner that was about to save
+    /// may have created part of it again.
+    pub(super) fn is_directory_gone(&self) -> bool {
+        !self.plan.run.logs().is_dir()
+    }
+
     /// Returns the error for its end, described by `how`.
     pub(super) fn failed(&self, how: String) -> SupervisorError {
+        if self.is_directory_gone() {
+            return SupervisorError::DirectoryGone(self.plan.run.root().to_owned());
+        }
         let log = self.plan.run.learner_log();
         SupervisorError::LearnerFailed {
             how,

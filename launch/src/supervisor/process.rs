@@ -14,6 +14,7 @@ use tokio::process::{Child, Command};
 use tokio::sync::watch;
 
 use skein_run::orphans::signal_when_orphaned;
+use skein_run::signals::heed;
 
 /// Exit status of a Rust program that panicked.
 const PANICKED: i32 = 101;
@@ -141,6 +142,7 @@ impl ProcessLaunch<'_> {
             .process_group(0)
             .kill_on_drop(true);
         signal_when_orphaned(command.as_std_mut(), Signal::KILL);
+        heed(command.as_std_mut(), Signal::TERM);
         command.spawn()
     }
 }

@@ -10,6 +10,7 @@ use tokio::time::{Instant, sleep_until};
 use super::crew::Crew;
 use super::dismissal::dismiss;
 use super::learner::{LearnerProcess, News};
+use super::memory::MemoryWatch;
 use super::process::{Exit, ProcessOrder};
 use super::stop::Stop;
 use super::work::WorkDone;
@@ -31,11 +32,18 @@ pub async fn run(
     watcher: &mut impl Watcher,
 ) -> Result<Ended, SupervisorError> {
     let (events, mut inbox) = mpsc::channel(EVENTS);
+    let memory = MemoryWatch::new();
     let mut supervision = Supervision {
         plan,
         watcher,
-        learner: LearnerProcess::start(plan, events.clone())?,
-        crew: Crew::new(&plan.run, &plan.programs.actor, &plan.actors, events),
+        learner: LearnerProcess::start(plan, events.clone(), memory.clone())?,
+        crew: Crew::new(
+            &plan.run,
+            &plan.programs.actor,
+            &plan.actors,
+            events,
+            memory,
+        ),
         stop: Stop::NotYet,
         failure: None,
         stall: Stall::None,
@@ -240,7 +248,10 @@ impl<W: Watcher> Supervision<'_, W> {
             && !self.crew.is_alive()
             && let Some(reason) = self.crew.last_failure()
         {
-            self.failure = Some(SupervisorError::NoActors(reason.to_string()));
+            self.failure = Some(match self.learner.is_directory_gone() {
+                true => SupervisorError::DirectoryGone(self.plan.run.root().to_owned()),
+                false => SupervisorError::NoActors(reason.to_string()),
+            });
             self.stop = self.stop.interrupted(self.plan.deadlines.learner_stop);
             self.learner.order(ProcessOrder::Terminate);
         }

@@ -197,10 +197,14 @@ impl CheckpointStore {
     fn load_from(&self, place: &StoredCheckpoint) -> Result<CheckpointState, CheckpointError> {
         let manifest = Manifest::read(&place.path)?;
         let config = manifest.read_file(&place.path, files::CONFIG)?;
-        if !manifest.is_of(self.config.digest()) {
-            return Err(self.other_configuration(&place.path, &config));
-        }
+        let shorter = match manifest.is_of(self.config.digest()) {
+            true => None,
+            false => Some(self.before_lengthening(&place.path, &config)?),
+        };
         let state = files::read(&place.path, &manifest)?;
+        if let Some(end) = shorter {
+            self.check_before_end(&state, end)?;
+        }
         for (what, found) in [
             ("the directory's name", place.episodes),
             ("the manifest", manifest.episodes()),
@@ -225,6 +229,32 @@ impl CheckpointStore {
             });
         }
         Ok(state)
+    }
+
+    /// Returns `run.episodes` of the checkpoint at `path` with the configuration `config`, which is
+    /// of this run before it was lengthened.
+    fn before_lengthening(&self, path: &Path, config: &[u8]) -> Result<u64, CheckpointError> {
+        self.config
+            .lengthened_from(&String::from_utf8_lossy(config))
+            .ok_or_else(|| self.other_configuration(path, config))
+    }
+
+    /// Checks that nothing in `state`, of a run of `end` episodes, would differ in a longer run. The
+    /// last epoch may be short, the last snapshot is always a candidate, and no epoch after the last
+    /// was ordered ahead.
+    fn check_before_end(&self, state: &CheckpointState, end: u64) -> Result<(), CheckpointError> {
+        let learning = &self.config.learning;
+        let epochs = end.div_ceil(learning.episodes_per_epoch);
+        if state.progress.epochs + learning.policy_lag.max(1) <= epochs {
+            return Ok(());
+        }
+        Err(CheckpointError::Unfit {
+            episodes: state.progress.episodes,
+            problem: format!(
+                "it is of the end of the run of {end} episodes, and a longer one resumes from \
+                 before that"
+            ),
+        })
     }
 
     fn other_configuration(&self, path: &Path, config: &[u8]) -> CheckpointError {

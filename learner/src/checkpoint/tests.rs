@@ -275,6 +275,49 @@ fn another_configuration_is_refused_by_key_with_both_values() {
 }
 
 #[test]
+fn a_lengthened_run_resumes_from_before_the_end_of_the_shorter_one() {
+    let (_directory, short) = store(2);
+    let mut longer = config(2);
+    (longer.run.episodes, longer.learning.episodes_per_epoch) = (500, 10);
+    let short = CheckpointStore::new(short.directory(), &longer);
+    for episodes in [400, 500] {
+        let mut state = state(episodes);
+        state.progress.epochs = episodes / 10;
+        short.save(&state, &[]).unwrap();
+    }
+    longer.run.episodes = 1000;
+    let store = CheckpointStore::new(short.directory(), &longer);
+    let mut passed_over = Vec::new();
+    let found = store
+        .load_newest(|_| Ok(()), |error| passed_over.push(error.to_string()))
+        .unwrap()
+        .unwrap();
+    assert_eq!(found.progress.episodes, 400);
+    assert!(
+        passed_over[0].contains("end of the run of 500 episodes"),
+        "{passed_over:?}"
+    );
+    // A shorter run, or one that differs in anything else, refuses it.
+    let shorter = |config: &mut Config| config.run.episodes = 499;
+    let other_seed = |config: &mut Config| {
+        (config.run.episodes, config.run.seed) = (1000, 99);
+    };
+    let changes: [fn(&mut Config); 2] = [shorter, other_seed];
+    for change in changes {
+        let mut other = config(2);
+        other.learning.episodes_per_epoch = 10;
+        change(&mut other);
+        let refused = CheckpointStore::new(short.directory(), &other)
+            .load_newest(|_| Ok(()), |_| {})
+            .unwrap_err();
+        assert!(
+            matches!(refused, CheckpointError::Configuration { .. }),
+            "{refused}"
+        );
+    }
+}
+
+#[test]
 fn another_format_is_refused_before_anything_else_is_believed() {
     let (_directory, store) = store(2);
     store.save(&state(400), &[]).unwrap();

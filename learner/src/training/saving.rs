@@ -153,6 +153,9 @@ impl<'a> Training<'a> {
             (best, self.directory.best_snapshot()),
             (latest, self.directory.latest_snapshot()),
             (None, self.directory.summary_json()),
+            (None, self.directory.evaluation_json()),
+            (None, self.directory.evaluation_trajectories_csv()),
+            (None, self.directory.reconstructions()),
         ] {
             match version {
                 Some(version) => self.save_snapshot(version, &path)?,

@@ -92,6 +92,11 @@ impl RunDirectory {
     /// Returns the committed episodes of the run's newest checkpoint, by the checkpoints' names.
     /// The checkpoint may still turn out damaged when it is read.
     pub fn newest_checkpoint(&self) -> Option<u64> {
+        self.checkpoint_names().into_iter().max()
+    }
+
+    /// Returns the committed episodes of the run's checkpoints, by their names.
+    fn checkpoint_names(&self) -> Vec<u64> {
         let episodes = |entry: fs::DirEntry| {
             entry
                 .file_name()
@@ -100,10 +105,8 @@ impl RunDirectory {
                 .parse()
                 .ok()
         };
-        fs::read_dir(self.checkpoints())
-            .ok()?
-            .filter_map(|entry| episodes(entry.ok()?))
-            .max()
+        let entries = fs::read_dir(self.checkpoints()).into_iter().flatten();
+        entries.filter_map(|entry| episodes(entry.ok()?)).collect()
     }
 
     /// Creates the directory with its folders, accessible to this user only. Writes the resolved
@@ -123,15 +126,9 @@ impl RunDirectory {
             .map_err(io(self.root.clone()))?;
         self.make_folders()?;
         fs::create_dir_all(self.checkpoints()).map_err(io(self.checkpoints()))?;
-        let text = format!(
-            "# Resolved by Skein {}.\n\n{}",
-            env!("CARGO_PKG_VERSION"),
-            config.to_toml()
-        );
         // Synced to disk: after a power cut there must be no checkpoints of a run without an
         // identity.
-        durable::replace(&self.config(), text.as_bytes()).map_err(io(self.config()))?;
-        let resolved = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
+        let resolved = self.write_config(config)?;
         let courses = courses::checksums(&self.courses()).map_err(io(self.courses()))?;
         for file in courses.keys().map(|name| self.courses().join(name)) {
             durable::sync(&file).map_err(io(file))?;
@@ -140,9 +137,24 @@ impl RunDirectory {
             durable::sync(&self.courses()).map_err(io(self.courses()))?;
         }
         let identity = RunIdentity::new(&resolved, courses);
-        let json = serde_json::to_string_pretty(&identity).expect("an identity is plain data");
-        durable::replace(&self.identity(), json.as_bytes()).map_err(io(self.identity()))?;
+        self.write_identity(&identity)?;
         Ok(identity)
+    }
+
+    /// Writes `config`, whose courses are relative to this directory; returns it as it is read.
+    fn write_config(&self, config: &Config) -> Result<Config, RunError> {
+        let (path, version) = (self.config(), env!("CARGO_PKG_VERSION"));
+        let text = format!("# Resolved by Skein {version}.\n\n{}", config.to_toml());
+        match durable::replace(&path, text.as_bytes()) {
+            Ok(()) => Config::load(&path, &[]).map_err(RunError::Config),
+            Err(source) => Err(RunError::Io { path, source }),
+        }
+    }
+
+    fn write_identity(&self, identity: &RunIdentity) -> Result<(), RunError> {
+        let path = self.identity();
+        let json = serde_json::to_string_pretty(identity).expect("an identity is plain data");
+        durable::replace(&path, json.as_bytes()).map_err(|source| RunError::Io { path, source })
     }
 
     /// Creates missing folders: a copy of a run may lack those that were empty. The checkpoint
@@ -171,6 +183,64 @@ impl RunDirectory {
     /// # Errors
     /// [`RunError`] names the file and the problem.
     pub fn open(&self) -> Result<(RunIdentity, Config), RunError> {
+        self.open_if(|identity, config| config.digest() == identity.config_digest)
+    }
+
+    /// Opens a run that is to be lengthened. Unlike [`RunDirectory::open`], also opens one whose
+    /// lengthening was cut off between two files.
+    ///
+    /// # Errors
+    /// [`RunError`] names the file and the problem.
+    pub fn open_to_lengthen(&self) -> Result<(RunIdentity, Config), RunError> {
+        self.open_if(|identity, config| {
+            let before = || config.lengthened_from(&self.started_config(identity)?);
+            config.digest() == identity.config_digest || before().is_some()
+        })
+    }
+
+    /// Sets `run.episodes` of this run, of which no process is alive, to `episodes`. Everything
+    /// else of its configuration stays.
+    ///
+    /// # Errors
+    /// [`RunError`] if the run has more episodes, or no checkpoint before its end; then nothing is
+    /// changed.
+    pub fn lengthen(&self, episodes: u64) -> Result<(RunIdentity, Config), RunError> {
+        let (mut identity, mut config) = self.open_to_lengthen()?;
+        let present = config.run.episodes;
+        if episodes < present {
+            return Err(RunError::Shortened {
+                path: self.config(),
+                present,
+                wanted: episodes,
+            });
+        }
+        let checkpoints = self.checkpoint_names();
+        let has_begun = !checkpoints.is_empty() || self.summary().is_some();
+        if episodes > present && has_begun && checkpoints.iter().all(|&flown| flown >= present) {
+            return Err(RunError::NothingBeforeEnd {
+                path: self.checkpoints(),
+                present,
+                wanted: episodes,
+            });
+        }
+        config.run.episodes = episodes;
+        config.validate().map_err(|source| {
+            let path = self.config();
+            RunError::Config(ConfigError::Invalid { path, source })
+        })?;
+        for course in config.courses.paths_mut() {
+            *course = Path::new("courses").join(course.file_name().unwrap_or_default());
+        }
+        identity.config_digest = self.write_config(&config)?.digest();
+        self.write_identity(&identity)?;
+        self.open()
+    }
+
+    /// Opens a run whose identity and configuration belong together according to `fit`.
+    fn open_if(
+        &self,
+        fit: impl Fn(&RunIdentity, &Config) -> bool,
+    ) -> Result<(RunIdentity, Config), RunError> {
         let path = self.identity();
         let text = fs::read_to_string(&path).map_err(|source| RunError::Io {
             path: path.clone(),
@@ -191,7 +261,7 @@ impl RunDirectory {
         }
         let identity: RunIdentity = serde_json::from_str(&text).map_err(not_an_identity)?;
         let config = Config::load(&self.config(), &[]).map_err(RunError::Config)?;
-        if config.digest() != identity.config_digest {
+        if !fit(&identity, &config) {
             return Err(RunError::ConfigChanged {
                 path: self.config(),
                 differences: self.differences(&identity, &config),
@@ -209,17 +279,22 @@ struct Versioned {
 }
 
 impl RunDirectory {
+    /// Returns the portable text of the configuration that belongs to `identity`, if a checkpoint
+    /// still holds a copy.
+    fn started_config(&self, identity: &RunIdentity) -> Option<String> {
+        let copies = self.checkpoint_names().into_iter().map(|episodes| {
+            let file = format!("episode-{episodes}/config.toml");
+            fs::read_to_string(self.checkpoints().join(file))
+        });
+        copies
+            .flatten()
+            .find(|text| Config::digest_of(text) == identity.config_digest)
+    }
+
     /// Returns the keys in which `config` differs from the run's configuration, if a checkpoint
     /// still holds a copy.
     fn differences(&self, identity: &RunIdentity, config: &Config) -> String {
-        let known = self.newest_checkpoint().and_then(|episodes| {
-            let copy = self
-                .checkpoints()
-                .join(format!("episode-{episodes}/config.toml"));
-            fs::read_to_string(copy).ok()
-        });
-        known
-            .filter(|text| Config::digest_of(text) == identity.config_digest)
+        self.started_config(identity)
             .and_then(|text| config.differences(&text).ok())
             .map_or_else(
                 || {
@@ -282,6 +357,30 @@ pub enum RunError {
         path: PathBuf,
         /// The differing keys with both values; without a checkpoint, both digests.
         differences: String,
+    },
+    /// A run can only be lengthened.
+    #[error("{}: run.episodes = {present} can only grow, and {wanted} is less: give more, or start \
+        a new run", path.display())]
+    Shortened {
+        /// The configuration file.
+        path: PathBuf,
+        /// Its number of episodes.
+        present: u64,
+        /// Number asked for.
+        wanted: u64,
+    },
+    /// A longer run resumes from before the end of the shorter one, and nothing is left of that.
+    #[error("{} holds no checkpoint from before the end of the run, episode {present}, and a \
+        longer run resumes from there: start a new run with run.episodes = {wanted}. \
+        With checkpoints.keep of 2 or more and checkpoints.every_episodes below run.episodes, a \
+        run can be lengthened", path.display())]
+    NothingBeforeEnd {
+        /// Folder of the checkpoints.
+        path: PathBuf,
+        /// Number of episodes of the run.
+        present: u64,
+        /// Number asked for.
+        wanted: u64,
     },
     /// A course file is not the one the run was started with.
     #[error("{} {problem}: the run would mix episodes of different courses; restore the file, or \
@@ -352,6 +451,59 @@ mod tests {
             "{}",
             refusal()
         );
+    }
+
+    #[test]
+    fn a_run_is_lengthened_in_run_episodes_alone_and_never_shortened() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let begun = run.create(&Config::default()).unwrap();
+        let (_, before) = run.open().unwrap();
+        let present = before.run.episodes;
+        let shorter = run.lengthen(present - 1).unwrap_err().to_string();
+        assert!(shorter.contains("can only grow"), "{shorter}");
+        let endless = run.lengthen(1 << 62).unwrap_err().to_string();
+        assert!(endless.contains("run.episodes"), "{endless}");
+        assert_eq!(run.open().unwrap(), (begun.clone(), before.clone()));
+
+        let (identity, after) = run.lengthen(present + 1).unwrap();
+        assert_eq!(identity.run, begun.run);
+        assert_eq!(after.lengthened_from(&before.portable()), Some(present));
+        assert_eq!(before.lengthened_from(&after.portable()), None);
+        assert_eq!(run.open().unwrap(), (identity, after));
+    }
+
+    #[test]
+    fn a_run_without_a_checkpoint_before_its_end_is_not_lengthened() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        run.create(&Config::default()).unwrap();
+        let present = run.open().unwrap().1.run.episodes;
+        fs::create_dir(run.checkpoints().join(format!("episode-{present}"))).unwrap();
+        let error = run.lengthen(present + 1).unwrap_err().to_string();
+        assert!(error.contains("no checkpoint from before"), "{error}");
+        fs::create_dir(run.checkpoints().join("episode-1")).unwrap();
+        run.lengthen(present + 1).unwrap();
+    }
+
+    #[test]
+    fn a_lengthening_cut_off_between_two_files_is_repeated() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        run.create(&Config::default()).unwrap();
+        let (identity, before) = run.open().unwrap();
+        let checkpoint = run.checkpoints().join("episode-20");
+        fs::create_dir(&checkpoint).unwrap();
+        fs::write(checkpoint.join("config.toml"), before.portable()).unwrap();
+        let longer = before.run.episodes + 10;
+        run.lengthen(longer).unwrap();
+        // As if the power had failed before the second file.
+        run.write_identity(&identity).unwrap();
+        let error = run.open().unwrap_err().to_string();
+        assert!(error.contains("run.episodes = "), "{error}");
+        let (_, config) = run.lengthen(longer).unwrap();
+        assert_eq!(config.run.episodes, longer);
+        run.open().unwrap();
     }
 
     #[test]

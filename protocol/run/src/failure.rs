@@ -3,6 +3,9 @@
 use std::error::Error;
 use std::iter::successors;
 
+/// Exit status of a program whose arguments are wrong, as clap's.
+pub const EXIT_WRONG_ARGUMENTS: u8 = 2;
+
 /// Exit status of an actor that finds no learner, or has received no heartbeat for
 /// `transport.learner_silence_secs`. Restarting it would not help.
 pub const EXIT_LEARNER_GONE: u8 = 3;

@@ -5,7 +5,7 @@
 //! supervisor, and leftovers of dead processes are swept. Other modules hold what all of Skein's
 //! programs share: atomically written files ([`durable`]), logs ([`logging`]), allocator settings
 //! ([`allocation`]), errors on one line ([`failure`]), points at which tests kill a process
-//! ([`fault`]), tables for the terminal ([`tables`]).
+//! ([`fault`]), output for the terminal ([`terminal`], [`tables`]), ignored signals ([`signals`]).
 //!
 //! Identity and announcement are here and not in the protocol, because they name this machine's
 //! folders and locks, and only processes of this machine read them.
@@ -26,8 +26,10 @@ pub mod orphans;
 mod presence;
 mod private_files;
 mod results;
+pub mod signals;
 mod sweep;
 pub mod tables;
+pub mod terminal;
 
 pub use claims::ActorClaim;
 pub use directory::{RunDirectory, RunError};

@@ -10,6 +10,8 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, fmt};
 
+use crate::terminal::BestEffort;
+
 /// Format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum LogFormat {
@@ -24,11 +26,30 @@ impl LogFormat {
     /// Returns [`LogFormat::Json`] if the environment variable `SKEIN_LOG_FORMAT` is `json`, else
     /// text.
     pub fn from_environment() -> Self {
-        match std::env::var("SKEIN_LOG_FORMAT") {
-            Ok(format) if format == "json" => Self::Json,
+        match variable("SKEIN_LOG_FORMAT").as_deref() {
+            Some("json") => Self::Json,
             _ => Self::Text,
         }
     }
+}
+
+/// Returns what is wrong with the variables `RUST_LOG` and `SKEIN_LOG_FORMAT`, for the program that
+/// starts the logging ones: nobody looks for it in a log.
+pub fn environment_faults() -> Vec<String> {
+    let (_, filter) = filter(variable("RUST_LOG").as_deref());
+    let format = format_fault(variable("SKEIN_LOG_FORMAT").as_deref());
+    filter.into_iter().chain(format).collect()
+}
+
+fn variable(name: &str) -> Option<String> {
+    std::env::var_os(name).map(|value| value.to_string_lossy().into_owned())
+}
+
+fn format_fault(wanted: Option<&str>) -> Option<String> {
+    let format = wanted.filter(|format| !["", "json", "text"].contains(format))?;
+    Some(format!(
+        "SKEIN_LOG_FORMAT={format} is unknown; logging as text. Set it to json or text"
+    ))
 }
 
 /// Appends this process's log to `path`. `RUST_LOG` filters it, `info` by default.
@@ -39,9 +60,10 @@ impl LogFormat {
 /// # Panics
 /// If called twice.
 pub fn log_to_file(path: &Path, format: LogFormat) -> std::io::Result<()> {
-    let file = Mutex::new(OpenOptions::new().create(true).append(true).open(path)?);
-    let wanted = std::env::var("RUST_LOG").ok();
-    let (filter, fault) = filter(wanted.as_deref());
+    let file = OpenOptions::new().create(true).append(true).open(path)?;
+    // A full disk loses lines of the log and must not end the process.
+    let file = Mutex::new(BestEffort(file));
+    let (filter, fault) = filter(variable("RUST_LOG").as_deref());
     let lines = fmt::layer().with_ansi(false).with_writer(file);
     let lines = match format {
         LogFormat::Text => lines.boxed(),
@@ -98,6 +120,14 @@ mod tests {
         assert_eq!(fault, None);
         assert!(asked.would_enable("skein_actor::service", &Level::DEBUG));
         assert!(!asked.would_enable("skein_learner", &Level::INFO));
+
+        assert_eq!(format_fault(None), None);
+        assert_eq!(format_fault(Some("json")), None);
+        assert!(
+            format_fault(Some("xml"))
+                .unwrap()
+                .contains("SKEIN_LOG_FORMAT=xml")
+        );
 
         let (fallen_back, fault) = filter(Some("skein_actor=loudly"));
         assert!(fault.unwrap().contains("RUST_LOG=skein_actor=loudly"));

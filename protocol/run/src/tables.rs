@@ -1,48 +1,127 @@
 //! Tables for the terminal.
 
 use comfy_table::presets::UTF8_FULL_CONDENSED;
-use comfy_table::{CellAlignment, Table};
-use skein_protocol::evaluation::{EvaluationReport, WallFailures};
+use comfy_table::{CellAlignment, ContentArrangement, Table};
+use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, WallFailures};
 use skein_protocol::stages::{StageTime, StageTimes, ThreadRole};
 
-/// Returns the evaluation of a snapshot as a table with one row per course.
-pub fn evaluation_table(report: &EvaluationReport) -> String {
+/// Returns the evaluation of a snapshot as a table with one row per course, or, where `columns` are
+/// too few for it, as two tables: results, then failures.
+pub fn evaluation_table(report: &EvaluationReport, columns: usize) -> String {
+    let whole = grid(&[&RESULTS[..], &FAILURES[..]].concat(), report);
+    let text = whole.to_string();
+    if width(&text) <= columns {
+        return text;
+    }
+    let parts = [&RESULTS[..], &[RESULTS[0]], &FAILURES[..]];
+    let (results, failures) = (parts[0].to_vec(), parts[1..].concat());
+    let fitted = |part: Vec<TableColumn>| fit(grid(&part, report), columns);
+    format!("{}\n{}", fitted(results), fitted(failures))
+}
+
+/// A column of the evaluation table: its title, and its cell for a course.
+type TableColumn = (&'static str, fn(&CourseEvaluation) -> String);
+
+/// Columns on how far the drone came.
+const RESULTS: [TableColumn; 6] = [
+    ("course", |course| course.course.clone()),
+    ("episodes", |course| course.episodes.to_string()),
+    ("R", |course| format!("{:.3}", course.r)),
+    ("completed", |course| {
+        format!("{:.1} %", 100.0 * course.completed)
+    }),
+    ("passed wall\n1, 2, …", |course| {
+        let walls: Vec<String> = course.walls_passed.iter().map(u64::to_string).collect();
+        walls.join(" ")
+    }),
+    ("return", |course| format!("{:.2}", course.mean_return)),
+];
+
+/// Columns on how the other episodes failed.
+const FAILURES: [TableColumn; 3] = [
+    ("hit wall\n1, 2, …", |course| {
+        let mut hit_wall = failed(course, |failures| failures.hit_wall);
+        // No wall follows the last one.
+        hit_wall.truncate(course.walls_passed.len());
+        counts(&hit_wall)
+    }),
+    ("hit corridor\nbefore 1, …, end", |course| {
+        counts(&failed(course, |failures| failures.hit_corridor))
+    }),
+    ("timed out\nbefore 1, …, end", |course| {
+        counts(&failed(course, |failures| failures.timed_out))
+    }),
+];
+
+fn failed(course: &CourseEvaluation, by: fn(&WallFailures) -> u64) -> Vec<u64> {
+    course.failures.iter().map(by).collect()
+}
+
+fn grid(shown: &[TableColumn], report: &EvaluationReport) -> Table {
     let mut table = Table::new();
     table.load_preset(UTF8_FULL_CONDENSED);
-    table.set_header([
-        "course",
-        "episodes",
-        "R",
-        "completed",
-        "passed wall\n1, 2, …",
-        "return",
-        "hit wall\n1, 2, …",
-        "hit corridor\nbefore 1, …, end",
-        "timed out\nbefore 1, …, end",
-    ]);
+    table.set_header(shown.iter().map(|(title, _)| *title));
     for course in &report.courses {
-        let walls: Vec<String> = course.walls_passed.iter().map(u64::to_string).collect();
-        let failed =
-            |by: fn(&WallFailures) -> u64| course.failures.iter().map(by).collect::<Vec<_>>();
-        // No wall follows the last one.
-        let mut hit_wall = failed(|failures| failures.hit_wall);
-        hit_wall.truncate(walls.len());
-        table.add_row([
-            course.course.clone(),
-            course.episodes.to_string(),
-            format!("{:.3}", course.r),
-            format!("{:.1} %", 100.0 * course.completed),
-            walls.join(" "),
-            format!("{:.2}", course.mean_return),
-            counts(&hit_wall),
-            counts(&failed(|failures| failures.hit_corridor)),
-            counts(&failed(|failures| failures.timed_out)),
-        ]);
+        table.add_row(shown.iter().map(|(_, cell)| cell(course)));
     }
     for column in table.column_iter_mut().skip(1) {
         column.set_cell_alignment(CellAlignment::Right);
     }
-    table.to_string()
+    table
+}
+
+/// Returns the text of `table` in at most `columns`: cells are broken into lines where it is wider.
+pub fn fit(mut table: Table, columns: usize) -> String {
+    let text = table.to_string();
+    if width(&text) <= columns {
+        return text;
+    }
+    let columns = u16::try_from(columns).unwrap_or(u16::MAX);
+    table.set_content_arrangement(ContentArrangement::Dynamic);
+    table.set_width(columns).to_string()
+}
+
+/// Returns `text` with those of its Markdown tables that are wider than `columns` broken to fit.
+pub fn fit_markdown(text: &str, columns: usize) -> String {
+    let mut shown = String::new();
+    let lines: Vec<&str> = text.lines().collect();
+    for block in lines.chunk_by(|one, next| one.starts_with('|') == next.starts_with('|')) {
+        let block = block.join("\n");
+        let fits = !block.starts_with('|') || width(&block) <= columns;
+        shown.push_str(&match fits {
+            true => block,
+            false => fit(from_markdown(&block), columns),
+        });
+        shown.push('\n');
+    }
+    shown.trim_end_matches('\n').to_owned()
+}
+
+/// Reads a Markdown table: a header, a rule that ends in a colon above columns aligned right, rows.
+fn from_markdown(text: &str) -> Table {
+    let mut rows = text.lines().map(|line| {
+        let cells = line.trim().trim_matches('|').split('|');
+        cells.map(str::trim).collect::<Vec<_>>()
+    });
+    let mut table = Table::new();
+    table.load_preset(UTF8_FULL_CONDENSED);
+    table.set_header(rows.next().unwrap_or_default());
+    let rule = rows.next().unwrap_or_default();
+    rows.for_each(|cells| {
+        table.add_row(cells);
+    });
+    for (column, dashes) in table.column_iter_mut().zip(rule) {
+        if dashes.ends_with(':') {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+    table
+}
+
+/// Returns the columns that `text` takes.
+fn width(text: &str) -> usize {
+    let lines = text.lines().map(|line| line.chars().count());
+    lines.max().unwrap_or(0)
 }
 
 /// Formats counts in a row, with a dot for zero; a single dot if all are zero.
@@ -60,8 +139,9 @@ fn counts(values: &[u64]) -> String {
     values.iter().map(shown).collect::<Vec<_>>().join(" ")
 }
 
-/// Returns the times of a run as a table with one row per stage, in the order of the data flow.
-pub fn stages_table(times: &StageTimes) -> String {
+/// Returns the times of a run as a table of at most `columns` with one row per stage, in the order
+/// of the data flow.
+pub fn stages_table(times: &StageTimes, columns: usize) -> String {
     let mut table = Table::new();
     table.load_preset(UTF8_FULL_CONDENSED);
     table.set_header([
@@ -95,7 +175,7 @@ pub fn stages_table(times: &StageTimes) -> String {
     for column in table.column_iter_mut().skip(2) {
         column.set_cell_alignment(CellAlignment::Right);
     }
-    table.to_string()
+    fit(table, columns)
 }
 
 /// Returns `text`, or nothing if `count` is zero.
@@ -139,6 +219,53 @@ mod tests {
         times
     }
 
+    fn report(episodes: &[EpisodeScore]) -> EvaluationReport {
+        EvaluationReport {
+            policy_version: PolicyVersion(1),
+            policy_sha256: String::new(),
+            courses: ["training", "non_rectangular"]
+                .map(|name| CourseEvaluation::of(name, 3, episodes))
+                .to_vec(),
+        }
+    }
+
+    #[test]
+    fn no_table_exceeds_the_terminal_and_only_a_wide_one_has_all_in_a_row() {
+        let score = EpisodeScore {
+            walls_passed: 2,
+            episode_return: -12.345,
+            outcome: Outcome::Collided,
+            hit_wall: None,
+        };
+        let report = report(&[score; 100]);
+        let wide = evaluation_table(&report, usize::MAX);
+        for columns in 60..160 {
+            let table = evaluation_table(&report, columns);
+            assert!(width(&table) <= columns, "{columns}:\n{table}");
+            assert_eq!(table == wide, width(&wide) <= columns);
+            let stages = stages_table(&sample(), columns);
+            assert!(width(&stages) <= columns, "{columns}:\n{stages}");
+        }
+        // At the usual width, no cell is broken.
+        let narrow = evaluation_table(&report, 80);
+        assert_eq!(narrow.matches("non_rectangular").count(), 2, "{narrow}");
+        assert!(
+            narrow.contains("100.0 %") || narrow.contains("0.0 %"),
+            "{narrow}"
+        );
+    }
+
+    #[test]
+    fn a_markdown_table_is_broken_only_where_it_is_too_wide() {
+        let text = "# Question\n\n| arm | R |\n|-----|--:|\n| one | 0.5 [0.4, 0.6] |\n\nEnd.";
+        assert_eq!(fit_markdown(text, 80), text);
+        let narrow = fit_markdown(text, 16);
+        assert!(width(&narrow) <= 16, "{narrow}");
+        for part in ["# Question\n\n", "one", "0.4,", "\n\nEnd."] {
+            assert!(narrow.contains(part), "{part:?} is missing in\n{narrow}");
+        }
+    }
+
     #[test]
     fn failures_stand_in_course_order_and_a_dot_is_none() {
         let score = |walls_passed, outcome, hit_wall| EpisodeScore {
@@ -153,11 +280,7 @@ mod tests {
             score(2, Outcome::Collided, None),
             score(3, Outcome::Collided, None),
         ];
-        let table = evaluation_table(&EvaluationReport {
-            policy_version: PolicyVersion(1),
-            policy_sha256: String::new(),
-            courses: vec![CourseEvaluation::of("training", 3, &episodes)],
-        });
+        let table = evaluation_table(&report(&episodes), usize::MAX);
         assert!(
             table.contains("┆    · 2 · ┆") && table.contains("· · 1 1"),
             "{table}"
@@ -166,7 +289,7 @@ mod tests {
 
     #[test]
     fn the_table_has_a_row_a_stage_and_the_shares_of_a_thread_sum_to_one() {
-        let table = stages_table(&sample());
+        let table = stages_table(&sample(), usize::MAX);
         let mut shares = Vec::new();
         let rows = table.lines().filter(|line| line.contains('%'));
         for (row, stage) in rows.zip(Stage::ALL) {

@@ -31,6 +31,17 @@ impl Config {
         xxh3_64(portable.as_bytes())
     }
 
+    /// Returns `run.episodes` of `other`, the portable text of another configuration, if that is
+    /// smaller than this one's and nothing else differs.
+    pub fn lengthened_from(&self, other: &str) -> Option<u64> {
+        let table: toml::Table = toml::from_str(other).ok()?;
+        let episodes = table.get("run")?.get("episodes")?.as_integer()?;
+        let mut shorter = self.clone();
+        shorter.run.episodes = episodes.try_into().ok()?;
+        (shorter.run.episodes < self.run.episodes && shorter.portable() == other)
+            .then_some(shorter.run.episodes)
+    }
+
     /// Returns the keys in which `other`, the portable text of another configuration, differs from
     /// this one: for each key `section.key = value there, value here`.
     ///

@@ -15,6 +15,8 @@ use skein_bench::machine::{Core, Machine};
 use skein_bench::table::{Judging, Table};
 use skein_reports::growth::{GrowthLine, GrowthPicture};
 use skein_run::failure::with_causes;
+use skein_run::terminal::stdout_columns;
+use skein_run::{note, show};
 
 /// Lists the benchmarks and tabulates their results.
 #[derive(Debug, Parser)]
@@ -89,7 +91,7 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("skein-bench: {}", with_causes(error.as_ref()));
+            note!("skein-bench: {}", with_causes(error.as_ref()));
             ExitCode::FAILURE
         }
     }
@@ -117,14 +119,14 @@ fn list(only: &[String], when: RunCondition) -> Result<()> {
                 BenchKind::OneCore => "one-core",
                 BenchKind::Processes => "processes",
             };
-            println!("{} {kind}", bench.name);
+            show!("{} {kind}", bench.name);
         }
     }
     Ok(())
 }
 
 fn core() -> Result<()> {
-    println!("{}", serde_json::to_string(&Core::measure())?);
+    show!("{}", serde_json::to_string(&Core::measure())?);
     Ok(())
 }
 
@@ -147,8 +149,6 @@ fn tabulate(
     let rows: Vec<BenchmarkRow> = rows.into_iter().filter(|row| wanted(&row.figure)).collect();
     let table = Table::new(&rows, &figures, machine.core.f32_flops);
     let note = note(judging, &figures);
-    println!("{machine}\n{}\n{note}", table.to_terminal(judging));
-
     let write = |name: &str, text: String| {
         let path = directory.join(name);
         fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
@@ -162,6 +162,8 @@ fn tabulate(
         table: &table,
     };
     write("table.json", serde_json::to_string_pretty(&results)?)?;
+    let shown = table.to_terminal(judging, stdout_columns());
+    show!("{machine}\n{shown}\n{note}");
     let growths: Vec<Growth> = growths
         .into_iter()
         .filter(|growth| {
@@ -199,7 +201,7 @@ fn draw(growths: &[Growth], figures: &BenchmarkFigures, folder: &Path) -> Result
     for growth in growths {
         let path = folder.join(&growth.picture).with_extension("png");
         if picture(growth, figures).draw(&path)? {
-            println!("{}", path.display());
+            show!("{}", path.display());
         }
     }
     Ok(())

@@ -1,14 +1,12 @@
 //! Table of figures with their targets and baselines.
 
 use comfy_table::presets::{ASCII_MARKDOWN, UTF8_FULL_CONDENSED};
-use comfy_table::{Cell, CellAlignment, ContentArrangement, Table as Grid};
+use comfy_table::{Cell, CellAlignment, Table as Grid};
 use serde::Serialize;
+use skein_run::tables::fit;
 
 use super::catalogue::{BenchmarkRow, Show, per_second};
 use super::figures::{BenchmarkFigures, Figure};
-
-/// Terminal columns that the table fits into.
-const WIDTH: u16 = 130;
 
 /// Rows with verdicts.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -71,13 +69,11 @@ impl Table {
         }
     }
 
-    /// Returns the table for a terminal.
-    pub fn to_terminal(&self, judging: Judging) -> String {
+    /// Returns the table for a terminal of this width, at most 130 columns.
+    pub fn to_terminal(&self, judging: Judging, columns: usize) -> String {
         let mut grid = self.grid(judging);
-        grid.load_preset(UTF8_FULL_CONDENSED)
-            .set_content_arrangement(ContentArrangement::Dynamic)
-            .set_width(WIDTH);
-        grid.to_string()
+        grid.load_preset(UTF8_FULL_CONDENSED);
+        fit(grid, columns.min(130))
     }
 
     /// Returns the table for a document.

@@ -16,6 +16,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_fuzz::mutation::mutate;
 use skein_fuzz::{TARGETS, Target, committed, word_list};
+use skein_run::{note, show};
 
 /// Target with its inputs and word list.
 struct FuzzedTarget {
@@ -30,7 +31,7 @@ fn fuzzed_target() -> &'static FuzzedTarget {
     FUZZED.get_or_init(|| {
         let name = env::var("SKEIN_FUZZ_TARGET").unwrap_or_else(|_| list());
         let Some(target) = TARGETS.iter().find(|target| target.name == name) else {
-            eprintln!(
+            note!(
                 "skein-fuzz: there is no target `{name}`; run it without SKEIN_FUZZ_TARGET for a \
                  list"
             );
@@ -57,7 +58,7 @@ fn list() -> ! {
             weight,
             ..
         } = target;
-        println!("{name}\t{longest_bytes}\t{weight}\t{reads}");
+        show!("{name}\t{longest_bytes}\t{weight}\t{reads}");
     }
     process::exit(0);
 }
@@ -73,7 +74,7 @@ fn begin() {
     };
     for (number, input) in fuzzed_target.inputs.iter().enumerate() {
         if let Err(error) = fs::write(Path::new(&folder).join(format!("sample-{number}")), input) {
-            eprintln!("skein-fuzz: {folder}: {error}");
+            note!("skein-fuzz: {folder}: {error}");
             process::exit(1);
         }
     }

@@ -151,7 +151,7 @@ fn results(bytes: &[u8]) -> ReaderDecision {
         "summary.json"
     };
     with_files(&[(name, content)], |folder| {
-        let text = conclusion(&RunDirectory::new(folder));
+        let text = conclusion(&RunDirectory::new(folder), 80);
         assert!(text.contains(name), "{text}");
         // Invalid files are left out.
         let shown = ["Best snapshot (", "Final policy ("]

@@ -91,7 +91,7 @@ fn status(record: StatusRecord, run: RunId) -> Option<()> {
     assert_eq!(StatusRecord::new(run, &status).read(run), Some(status));
     // Accepted values of 1024 actors can be added and shown.
     let ten_times = (0..10).fold(status.times, |sum, _| sum.plus(&sum));
-    assert!(stages_table(&ten_times).lines().count() >= 3);
+    assert!(stages_table(&ten_times, 80).lines().count() >= 3);
     Some(())
 }
 

@@ -5,6 +5,7 @@ use anyhow::{Context, Result};
 use skein_protocol::config::Config;
 use skein_protocol::stages::Stage;
 use skein_protocol::summary::Summary;
+use skein_run::show;
 
 use crate::stage::Recipe;
 use crate::statistics::median;
@@ -72,29 +73,29 @@ impl CheckpointCost {
             summary.stages.of(Stage::Checkpoint).secs()
         });
         let receives = cpu("receiver") / all;
-        println!(
+        show!(
             "CheckpointCost in seconds, medians of {} trainings each:",
             self.with.len()
         );
-        println!(
+        show!(
             "  {:<44} {with:8.2}",
             format!("with a checkpoint every {} episodes", self.every_episodes)
         );
-        println!("  {:<44} {without:8.2}", "without checkpoints");
-        println!("  {:<44} {:7.2} %", "slowdown", slower * 100.0);
-        println!("  {:<44} {waits:8.2}", "training waiting for checkpoints");
-        println!(
+        show!("  {:<44} {without:8.2}", "without checkpoints");
+        show!("  {:<44} {:7.2} %", "slowdown", slower * 100.0);
+        show!("  {:<44} {waits:8.2}", "training waiting for checkpoints");
+        show!(
             "  {:<44} {:8.2}",
             "processor time of writing checkpoints",
             cpu("checkpoints")
         );
-        println!(
+        show!(
             "  {:<44} {:8.2}",
             "processor time of assembling episodes",
             cpu("receiver")
         );
-        println!("  {:<44} {all:8.2}", "processor time of the learner");
-        println!(
+        show!("  {:<44} {all:8.2}", "processor time of the learner");
+        show!(
             "  {:<44} {:7.2} %",
             "share of assembling episodes",
             receives * 100.0

@@ -23,6 +23,7 @@ use skein_protocol::config::Config;
 use skein_protocol::summary::Summary;
 use skein_run::RunDirectory;
 use skein_run::failure::with_causes;
+use skein_run::note;
 
 use cost::CheckpointCost;
 use plan::{DisturbanceCounts, Subject};
@@ -58,8 +59,8 @@ struct Arguments {
     /// first.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["config", "overrides"])]
     calm: Option<PathBuf>,
-    /// Folder of all results; must be new or empty. tests/chaos.sh sets runs/chaos_<date>_<time> by
-    /// default.
+    /// Folder of all results; must be new or empty. tests/chaos.sh sets
+    /// runs/chaos_<date>_<time>_<process> by default.
     #[arg(long, value_name = "DIR", overrides_with = "run_dir")]
     run_dir: PathBuf,
     /// Seed of the disturbances and their times.
@@ -157,7 +158,7 @@ fn main() -> ExitCode {
         Ok(TestOutcome::Passed) => ExitCode::SUCCESS,
         Ok(TestOutcome::Failed) => ExitCode::FAILURE,
         Err(error) => {
-            eprintln!("skein-chaos: {}", with_causes(error.as_ref()));
+            note!("skein-chaos: {}", with_causes(error.as_ref()));
             ExitCode::FAILURE
         }
     }
@@ -189,7 +190,7 @@ fn disturb(arguments: &Arguments, folder: &Path) -> Result<TestOutcome> {
 
     let faults = arguments.points.then(|| folder.join("faults"));
     let stage = TestedRun::new(folder, "disturbed", faults.clone())?;
-    eprintln!(
+    note!(
         "skein-chaos: training with disturbances, in {}",
         stage.run.root().display()
     );
@@ -224,7 +225,7 @@ fn disturb(arguments: &Arguments, folder: &Path) -> Result<TestOutcome> {
 fn soak(arguments: &Arguments, folder: &Path, length: Duration) -> Result<TestOutcome> {
     let stage = TestedRun::new(folder, "soaked", None)?;
     let recipe = arguments.recipe(&SOAK_SETTINGS)?;
-    eprintln!(
+    note!(
         "skein-chaos: training for {:.0} minutes, in {}",
         length.as_secs_f64() / 60.0,
         stage.run.root().display()
@@ -295,7 +296,7 @@ fn train_undisturbed(
     actors: u32,
 ) -> Result<RunDirectory> {
     let stage = TestedRun::new(folder, name, None)?;
-    eprintln!(
+    note!(
         "skein-chaos: training undisturbed, in {}",
         stage.run.root().display()
     );
