@@ -10,6 +10,8 @@ pub mod courses;
 pub mod environment_loop;
 pub mod evaluate;
 pub mod evaluation;
+mod memory;
 pub mod recording;
+mod settings;
 #[cfg(test)]
 mod testing;

@@ -522,7 +522,7 @@ mod tests {
             refuse_lost_checkpoints(&directory, &config).is_err(),
             "their folder is gone"
         );
-        std::os::unix::fs::symlink("/no/such/disk", directory.checkpoints()).unwrap();
+        std::os::unix::fs::symlink(folder.path().join("missing"), directory.checkpoints()).unwrap();
         assert!(
             refuse_lost_checkpoints(&directory, &config).is_err(),
             "it leads nowhere"
