@@ -181,8 +181,8 @@ impl Config {
         Ok(config)
     }
 
-    /// Returns this configuration, read from `path`, with `overrides` as in [`Config::load`]. Course
-    /// paths stay as they are.
+    /// Returns this configuration, read from `path`, with `overrides` as in [`Config::load`].
+    /// Course paths stay as they are.
     ///
     /// # Errors
     /// [`ConfigError`] names file, key, value and remedy.
