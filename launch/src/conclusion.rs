@@ -4,6 +4,7 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
+use skein_protocol::config::EvaluationSection;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::stages::StageTimes;
 use skein_protocol::summary::{RunEnding, Summary, Trained};
@@ -32,6 +33,9 @@ pub fn conclusion(run: &RunDirectory, columns: usize) -> String {
             push(&mut text, &trained_sentence(trained));
         }
         push(&mut text, &sentence(&summary));
+        if let Some(reason) = &summary.untrained {
+            push(&mut text, &format!("{reason}\n"));
+        }
         if summary.stages != StageTimes::default() {
             push(
                 &mut text,
@@ -60,11 +64,30 @@ fn read<T: DeserializeOwned>(path: &Path) -> Option<T> {
 }
 
 fn trained_sentence(trained: &Trained) -> String {
+    let flown = trained.confirmation_episodes;
+    let (flown, remark) = match flown {
+        // Written by a version that did not record it.
+        0 => ("".to_owned(), ""),
+        1 => (
+            "1 ".to_owned(),
+            " One says little: raise evaluation.confirm_episodes.",
+        ),
+        few if few < EvaluationSection::FEW_EPISODES => (
+            format!("{few} "),
+            " So few say little: raise evaluation.confirm_episodes.",
+        ),
+        enough => (format!("{enough} "), ""),
+    };
     format!(
-        "Trained after {}: R (share of walls passed) {:.3} in evaluation episodes, \
-         after {} episodes, {} steps, {} updates.",
+        "Trained after {}: R (share of walls passed) {:.3} in {flown}evaluation episode{}, \
+         after {} episodes, {} steps, {} updates.{remark}",
         Clock(trained.wall_secs),
         trained.rate,
+        if trained.confirmation_episodes == 1 {
+            ""
+        } else {
+            "s"
+        },
         trained.episodes,
         trained.steps,
         trained.updates
@@ -172,11 +195,13 @@ mod tests {
             best_confirmed_walls_passed: None,
             trained: Some(Trained {
                 rate: 0.93,
+                confirmation_episodes: 20,
                 episodes: 90,
                 steps: 1800,
                 updates: 270,
                 wall_secs: 61.0,
             }),
+            untrained: None,
             episodes: 100,
             steps: 2000,
             updates: 300,
@@ -201,8 +226,8 @@ mod tests {
         for part in [
             "version 42",
             "training",
-            "Trained after 1:01: R (share of walls passed) 0.930 in evaluation episodes, after 90 \
-             episodes, 1800",
+            "Trained after 1:01: R (share of walls passed) 0.930 in 20 evaluation episodes, \
+             after 90 episodes, 1800",
             "Completed after 1:15: 100 episodes, 2000 steps",
             "│ actors, together    ┆ encoder ┆  2000 ┆ 1.50 s ┆ 750.00 µs ┆ 100.0 % │",
             "summary.json",
@@ -213,6 +238,30 @@ mod tests {
             !text.contains("episodes.csv"),
             "a file that does not exist is not listed:\n{text}"
         );
+    }
+
+    #[test]
+    fn the_sentence_on_success_says_on_how_many_episodes_it_rests() {
+        let sentence = |confirmation_episodes| {
+            trained_sentence(&Trained {
+                rate: 1.0,
+                confirmation_episodes,
+                episodes: 50,
+                steps: 900,
+                updates: 50,
+                wall_secs: 9.0,
+            })
+        };
+        let three = sentence(3);
+        assert!(
+            three.contains("1.000 in 3 evaluation episodes,")
+                && three.contains("evaluation.confirm_episodes"),
+            "{three}"
+        );
+        assert!(sentence(1).contains("1.000 in 1 evaluation episode,"));
+        let enough = sentence(EvaluationSection::FEW_EPISODES);
+        assert!(!enough.contains("confirm_episodes"), "{enough}");
+        assert!(sentence(0).contains("1.000 in evaluation episodes,"));
     }
 
     #[test]

@@ -23,7 +23,7 @@ use skein_launch::supervisor::{
 };
 use skein_prepare::room::{check_shared_memory_for_more, raise_file_limit, scarce_disk};
 use skein_prepare::{NewDirectory, Prepared, prepare};
-use skein_protocol::config::{Config, CoursesSection};
+use skein_protocol::config::{Config, CoursesSection, EvaluationSection};
 use skein_protocol::summary::RunEnding;
 use skein_reports::{ideal_walls_passed, load_courses};
 use skein_run::ActorClaim;
@@ -214,15 +214,19 @@ fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
     }
     note!("skein: run directory: {root}");
     if !config.courses.evaluation.contains(&config.courses.training) {
+        let names = CoursesSection::names(&config.courses.evaluation);
         note!(
             "skein: note: the training course is not in courses.evaluation; \
                  the best snapshot is chosen on {}",
-            prepared
-                .config
-                .courses
-                .evaluation
-                .first()
-                .map_or("none".to_owned(), |course| CoursesSection::name_of(course))
+            names.first().map_or("none", String::as_str)
+        );
+    }
+    let confirming = config.evaluation.confirm_episodes;
+    if confirming < EvaluationSection::FEW_EPISODES {
+        note!(
+            "skein: note: evaluation.confirm_episodes = {confirming}: \
+                 so few say little about which snapshot is the best; {} or more do",
+            EvaluationSection::FEW_EPISODES
         );
     }
 }

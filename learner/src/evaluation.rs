@@ -74,20 +74,17 @@ pub(crate) fn write_report(
     let mut trajectories = csv::Writer::from_writer(Vec::new());
     let mut rows = Ok(());
     let mut courses = Vec::new();
-    for (course, episodes) in config
-        .courses
-        .evaluation
+    for (name, episodes) in CoursesSection::names(&config.courses.evaluation)
         .iter()
         .zip(flown.chunks(config.evaluation.episodes as usize))
     {
-        let name = CoursesSection::name_of(course);
         let scores: Vec<EpisodeScore> = episodes.iter().map(score).collect();
         let walls = episodes
             .first()
             .map_or(0, |episode| episode.course_walls.into());
-        courses.push(CourseEvaluation::of(&name, walls, &scores));
+        courses.push(CourseEvaluation::of(name, walls, &scores));
         for (number, episode) in episodes.iter().take(TRAJECTORIES).enumerate() {
-            rows = rows.and_then(|()| write_trajectory(&mut trajectories, &name, number, episode));
+            rows = rows.and_then(|()| write_trajectory(&mut trajectories, name, number, episode));
         }
     }
     let trajectories = rows.map_err(io::Error::from).and_then(|()| {

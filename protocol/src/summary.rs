@@ -34,6 +34,9 @@ pub struct Summary {
     /// of walls, if one did.
     #[serde(default)]
     pub trained: Option<Trained>,
+    /// Reason why the policy is untrained and the remedy, if no update was made.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub untrained: Option<String>,
     /// Training episodes committed.
     pub episodes: u64,
     /// Environment steps of training episodes.
@@ -97,6 +100,9 @@ pub struct Trained {
     /// Share R of walls passed in its confirmation episodes (without exploration noise, from the
     /// start of level 1, on the courses of `evaluation.confirm_on`).
     pub rate: f64,
+    /// Number of these confirmation episodes; 0 where it was not recorded.
+    #[serde(default)]
+    pub confirmation_episodes: u64,
     /// Training episodes committed.
     pub episodes: u64,
     /// Environment steps of training episodes.
@@ -143,11 +149,13 @@ mod tests {
             best_confirmed_walls_passed: None,
             trained: Some(Trained {
                 rate: 0.95,
+                confirmation_episodes: 20,
                 episodes: 30,
                 steps: 300,
                 updates: 15,
                 wall_secs: 1.25,
             }),
+            untrained: None,
             episodes: 40,
             steps: 400,
             updates: 20,

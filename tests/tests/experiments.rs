@@ -163,7 +163,7 @@ fn an_experiment_is_interrupted_resumed_reported_and_published() {
         "# What for?",
         "| one part |",
         "`replay.success_share=0.0`",
-        "non_rectangular",
+        "non-rectangular",
         "The best snapshot in the suite `few.toml`",
         "| in any order |     2 |        5 |",
         "| hit wall 1, 2, … | hit the corridor before 1, …, end | timed out before 1, …, end |",

@@ -92,11 +92,11 @@ fn an_unknown_key_section_or_setting_is_refused() {
 #[test]
 fn a_missing_configuration_or_course_is_refused() {
     let attempt = Attempt::new("");
-    attempt.assert_refused(&["--config", "/nowhere/mine.toml"], &["/nowhere/mine.toml"]);
-    attempt.assert_refused(
-        &["--set", "courses.training=/nowhere/course.toml"],
-        &["/nowhere/course.toml"],
-    );
+    let missing = attempt.path().join("missing");
+    let (config, course) = (missing.join("mine.toml"), missing.join("course.toml"));
+    let (config, course) = (config.to_str().unwrap(), course.to_str().unwrap());
+    attempt.assert_refused(&["--config", config], &[config]);
+    attempt.assert_refused(&["--set", &format!("courses.training={course}")], &[course]);
 }
 
 #[test]
@@ -147,8 +147,10 @@ fn a_device_that_this_machine_does_not_have_is_refused() {
 
 #[test]
 fn an_actor_for_a_missing_or_complete_run_is_refused() {
-    run_program("skein", &["attach", "--run", "/nowhere/run"]).assert_refused(&["/nowhere/run"]);
     let empty = tempfile::tempdir().unwrap();
+    let missing = empty.path().join("missing");
+    let missing = missing.to_str().unwrap();
+    run_program("skein", &["attach", "--run", missing]).assert_refused(&[missing]);
     let directory = empty.path().to_str().unwrap();
     run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory]);
     let over = RunRecipe::small().set("run.episodes=1").finish();
@@ -231,10 +233,10 @@ fn an_impossible_resumption_is_refused() {
 
 #[test]
 fn an_evaluation_without_a_run_or_snapshot_is_refused() {
-    run_program("skein-evaluate", &["--run", "/nowhere/run"]).assert_refused(&["/nowhere/run"]);
-    run_program(
-        "skein-evaluate",
-        &["--snapshot", "/nowhere/best.safetensors"],
-    )
-    .assert_refused(&["/nowhere/best.safetensors"]);
+    let empty = tempfile::tempdir().unwrap();
+    let missing = empty.path().join("missing");
+    let missing = missing.to_str().unwrap();
+    for option in ["--run", "--snapshot"] {
+        run_program("skein-evaluate", &[option, missing]).assert_refused(&[missing]);
+    }
 }

@@ -216,7 +216,7 @@ fn the_evaluation_is_of_the_best_snapshot(run: &EndedRun) {
         .iter()
         .map(|course| course.course.as_str())
         .collect();
-    assert_eq!(names, ["training", "non_rectangular"]);
+    assert_eq!(names, ["training", "non-rectangular"]);
     for course in &evaluation.courses {
         assert_eq!(course.episodes, 3);
         assert_eq!(course.walls_passed.len(), 5);
@@ -312,7 +312,7 @@ fn every_process_has_its_log(run: &EndedRun) {
 
 fn the_conclusion_shows_the_tables_and_the_paths(run: &EndedRun) {
     for part in [
-        "non_rectangular",
+        "non-rectangular",
         &skein_run::tables::stages_table(&run.summary().stages, usize::MAX),
         "episodes.csv",
         "plots/walls_passed.png",

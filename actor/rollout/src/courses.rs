@@ -10,7 +10,7 @@ use skein_protocol::ids::EpisodeId;
 use skein_protocol::ticket::{CourseChoice, Ticket};
 use skein_simulator::course::{Course, CourseError, RangesError};
 use skein_simulator::disturbances::DisturbanceSettingsError;
-use skein_simulator::simulator::{Simulator, SimulatorError, SimulatorSettings};
+use skein_simulator::simulator::{OutOfReach, Simulator, SimulatorError, SimulatorSettings};
 use skein_simulator::suite::{EntryCourses, Suite, SuiteEntry};
 
 /// Courses that a ticket may name, with simulator settings. Shared by all threads.
@@ -60,9 +60,9 @@ impl Courses {
     /// [`CoursesError`] names the file or the key.
     pub fn of_files<P: AsRef<Path>>(config: &Config, paths: &[P]) -> Result<Self, CoursesError> {
         let settings = simulator_settings(config)?;
-        let entry = |path: &P| {
+        let entry = |(name, path): (String, &P)| {
             let entry = SuiteEntry {
-                name: CoursesSection::name_of(path.as_ref()),
+                name,
                 episodes: config.evaluation.episodes,
                 courses: EntryCourses::Listed(vec![load(path.as_ref())?]),
                 disturbances: settings.disturbances.clone(),
@@ -72,8 +72,9 @@ impl Courses {
                 settings: settings.clone(),
             })
         };
-        let evaluation = paths
-            .iter()
+        let evaluation = CoursesSection::names(paths)
+            .into_iter()
+            .zip(paths)
             .map(entry)
             .collect::<Result<_, CoursesError>>()?;
         Ok(Self {
@@ -122,6 +123,33 @@ impl Courses {
             evaluated.entry.episodes = episodes;
         }
         self
+    }
+
+    /// Checks that an episode can reach the end of each evaluation course.
+    ///
+    /// # Errors
+    /// [`CoursesError::OutOfReach`] names the entry, the distances and their keys.
+    pub fn check_reach(&self) -> Result<(), CoursesError> {
+        self.evaluation.iter().try_for_each(|evaluated| {
+            let reached = evaluated.entry.courses.check_reach(&evaluated.settings);
+            reached.map_err(|source| CoursesError::OutOfReach {
+                entry: evaluated.entry.name.clone(),
+                source,
+            })
+        })
+    }
+
+    /// Returns the largest number of records of an evaluation: of each episode its steps and a
+    /// closing record.
+    pub fn most_records(&self) -> u64 {
+        let of_entry = |evaluated: &EvaluationEntry| {
+            let steps = u64::from(evaluated.settings.max_steps);
+            evaluated.entry.episodes.saturating_mul(steps + 1)
+        };
+        self.evaluation
+            .iter()
+            .map(of_entry)
+            .fold(0, u64::saturating_add)
     }
 
     /// Returns the evaluation entries, in order.
@@ -253,6 +281,14 @@ pub enum CoursesError {
     /// The configuration's simulator section is invalid.
     #[error("[simulator] {0}")]
     Settings(String),
+    /// No episode can finish a course.
+    #[error("\"{entry}\": {source}")]
+    OutOfReach {
+        /// The course or entry.
+        entry: String,
+        /// Cause.
+        source: OutOfReach,
+    },
     /// The drone does not support the disturbances of an entry of a suite.
     #[error("entry \"{entry}\": {source}")]
     Disturbances {
@@ -321,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn evaluation_courses_are_named_after_their_files_in_order() {
+    fn evaluation_courses_are_called_by_their_names_in_order() {
         let courses = Courses::of_run(&config("")).unwrap();
         let names: Vec<_> = courses
             .evaluation()
@@ -331,9 +367,9 @@ mod tests {
             names,
             [
                 "training",
-                "rearranged_34125",
-                "rearranged_53412",
-                "non_rectangular"
+                "rearranged 34125",
+                "rearranged 53412",
+                "non-rectangular"
             ]
         );
     }

@@ -271,7 +271,7 @@ pub fn check_recordable(path: &Path) -> Result<(), RecordingError> {
 }
 
 /// Returns the temporary path of a recording.
-fn temporary_path(path: &Path) -> PathBuf {
+pub fn temporary_path(path: &Path) -> PathBuf {
     path.with_extension("npz.tmp")
 }
 
@@ -506,14 +506,14 @@ mod tests {
 
     #[test]
     fn a_file_that_cannot_be_written_is_named() {
-        let file = Path::new("/nonexistent/episodes.npz");
-        for error in [write_recording(file, &[], 32, &[]), check_recordable(file)] {
-            assert!(
-                error
-                    .unwrap_err()
-                    .to_string()
-                    .contains("/nonexistent/episodes.npz")
-            );
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("missing/episodes.npz");
+        for error in [
+            write_recording(&file, &[], 32, &[]),
+            check_recordable(&file),
+        ] {
+            let error = error.unwrap_err().to_string();
+            assert!(error.contains(file.to_str().unwrap()), "{error}");
         }
     }
 
@@ -532,11 +532,12 @@ mod tests {
         fs::create_dir(at("folder")).unwrap();
         fs::write(at("earlier.npz"), b"earlier").unwrap();
         assert!(check_recordable(&at("folder")).is_err());
-        assert!(check_recordable(Path::new("/dev/null")).is_err());
+        let _socket = std::os::unix::net::UnixListener::bind(at("socket")).unwrap();
+        assert!(check_recordable(&at("socket")).is_err());
         write_recording(&at("folder"), &["near"], 32, &[vec![episode(0, 1)]]).unwrap_err();
         check_recordable(&at("earlier.npz")).unwrap();
         check_recordable(&at("new.npz")).unwrap();
-        assert_eq!(names(), ["earlier.npz", "folder"]);
+        assert_eq!(names(), ["earlier.npz", "folder", "socket"]);
         assert_eq!(fs::read(at("earlier.npz")).unwrap(), b"earlier");
     }
 }

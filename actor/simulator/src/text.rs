@@ -4,6 +4,9 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
+use serde::de::{DeserializeOwned, Error};
+use serde::{Deserialize, Deserializer};
+
 /// Most bytes of a file: far more than any course or suite needs.
 const MOST_BYTES: u64 = 1 << 20;
 
@@ -20,4 +23,38 @@ pub(crate) fn read_text(path: &Path) -> io::Result<String> {
         )));
     }
     fs::read_to_string(path)
+}
+
+/// Parses TOML of which every part is used.
+///
+/// # Errors
+/// The parser's error. A list that is too long for the table it stands for is refused too; the
+/// parser alone ignores its end.
+pub(crate) fn parse_whole<T: DeserializeOwned>(text: &str) -> Result<T, toml::de::Error> {
+    let parsed = toml::from_str(text)?;
+    let table: toml::Table = toml::from_str(text)?;
+    table.try_into::<T>()?;
+    Ok(parsed)
+}
+
+/// Returns the parser's error on one line, with the key if the error has no place in the text.
+pub(crate) fn message_of(error: &toml::de::Error) -> String {
+    let text = match error.span() {
+        Some(_) => error.message().to_owned(),
+        None => error.to_string(),
+    };
+    text.trim_end().replace('\n', " ")
+}
+
+/// Deserializes exactly `N` numbers. The parser alone ignores further ones.
+pub(crate) fn exactly<'de, D: Deserializer<'de>, const N: usize>(
+    deserializer: D,
+) -> Result<[f32; N], D::Error> {
+    let numbers = Vec::<f32>::deserialize(deserializer)?;
+    numbers.try_into().map_err(|numbers: Vec<f32>| {
+        D::Error::custom(format!(
+            "has {} numbers: give {N} (a decimal point is a dot)",
+            numbers.len()
+        ))
+    })
 }

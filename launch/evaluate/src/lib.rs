@@ -2,15 +2,21 @@
 //!
 //! `skein-evaluate` and `skein evaluate` share this module.
 
+mod memory;
 mod plot;
+mod settings;
 
 use std::fs::{self, File, OpenOptions};
 use std::num::NonZeroUsize;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use crate::memory::{check_recording, free_memory};
+use crate::settings::with_overrides;
 use anyhow::{Context, bail};
 use clap::{Args, Parser};
+use serde::Serialize;
 use skein_kernels::Isa;
 use skein_protocol::config::Config;
 use skein_protocol::evaluation::EvaluationReport;
@@ -18,7 +24,9 @@ use skein_protocol::snapshot::Snapshot;
 use skein_reports::MOST_DRAWN;
 use skein_rollout::courses::Courses;
 use skein_rollout::evaluation::{Evaluation, Keep, MAX_THREADS};
-use skein_rollout::recording::{COLUMNS, NAME_LISTS, check_recordable, write_recording};
+use skein_rollout::recording::{
+    COLUMNS, NAME_LISTS, check_recordable, temporary_path, write_recording,
+};
 use skein_run::RunDirectory;
 use skein_run::tables::evaluation_table;
 use skein_run::terminal::stdout_columns;
@@ -53,6 +61,12 @@ pub struct Arguments {
     /// or the suite's number.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=MOST_EPISODES))]
     episodes: Option<u64>,
+    /// Change one setting that the snapshot was trained with, for example
+    /// --set simulator.vehicle.preset=hummingbird; may be repeated.
+    ///
+    /// Keys in [simulator] can be changed, and run.seed, from which the episodes' seeds derive.
+    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+    overrides: Vec<String>,
     /// Also write the result to this file, as JSON.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -87,6 +101,8 @@ struct Subject {
 /// # Errors
 /// An error names the file or option at fault.
 pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let path = snapshot_path(&arguments.subject)?;
+    check_distinct_files(arguments, &path)?;
     if let Some(file) = &arguments.json {
         check_writable(file)?;
     }
@@ -96,18 +112,23 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     if let Some(file) = &arguments.plot {
         check_plottable(file)?;
-        for (option, other) in [("--json", &arguments.json), ("--record", &arguments.record)] {
-            if other.as_ref().is_some_and(|other| is_same(other, file)) {
-                bail!(
-                    "--plot and {option} name the same file, {}: name two",
-                    file.display()
-                );
-            }
-        }
     }
-    let path = snapshot_path(&arguments.subject)?;
-    let (snapshot, config) = Snapshot::load(&path)?;
-    let courses = Arc::new(courses(arguments, &config, &path)?);
+    let (snapshot, trained) = Snapshot::load(&path)?;
+    let in_suite = arguments.suite.is_some();
+    let config = with_overrides(&trained, &path, &arguments.overrides, in_suite)?;
+    let courses = courses(arguments, &config, &path).and_then(|courses| {
+        courses.check_reach()?;
+        Ok(courses)
+    });
+    let courses = match arguments.overrides.join(" --set ") {
+        none if none.is_empty() => courses?,
+        overrides => courses.with_context(|| format!("with --set {overrides}"))?,
+    };
+    if arguments.record.is_some() {
+        let episodes = courses.evaluation().map(|entry| entry.episodes).sum();
+        check_recording(episodes, courses.most_records(), free_memory())?;
+    }
+    let courses = Arc::new(courses);
     let threads = arguments
         .threads
         .map_or_else(std::thread::available_parallelism, Ok)
@@ -139,6 +160,9 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Isa::best(),
         InstructionSet::best()
     );
+    if !arguments.overrides.is_empty() {
+        note!("changed settings: {}", arguments.overrides.join(", "));
+    }
     for note in shapes_trained_on(&config, &courses) {
         note!("{note}");
     }
@@ -146,7 +170,13 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
     // Files first: the terminal may be gone. A file that cannot be written costs no other result.
     let json = arguments.json.as_deref();
-    let written = json.map_or(Ok(()), |file| write_json(file, &evaluated.report));
+    let written = json.map_or(Ok(()), |file| {
+        let report = WrittenReport {
+            report: &evaluated.report,
+            changed_settings: &arguments.overrides,
+        };
+        write_json(file, &report)
+    });
     let recorded = arguments.record.as_ref().map_or(Ok(()), |file| {
         let names: Vec<_> = courses
             .evaluation()
@@ -163,24 +193,9 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(drawn?)
 }
 
-fn write_json(file: &Path, report: &EvaluationReport) -> anyhow::Result<()> {
+fn write_json(file: &Path, report: &WrittenReport<'_>) -> anyhow::Result<()> {
     let json = serde_json::to_string_pretty(report).context("cannot write the result as JSON")?;
     fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))
-}
-
-/// `true` if two paths name one file, whether or not it exists.
-fn is_same(one: &Path, other: &Path) -> bool {
-    let resolved = |file: &Path| {
-        fs::canonicalize(file).ok().or_else(|| {
-            let folder = std::path::absolute(file)
-                .ok()?
-                .parent()?
-                .canonicalize()
-                .ok()?;
-            Some(folder.join(file.file_name()?))
-        })
-    };
-    one == other || resolved(one).is_some_and(|one| resolved(other) == Some(one))
 }
 
 /// Checks that a picture can be written to `file`. A picture replaces the file, so nothing but a
@@ -194,6 +209,76 @@ fn check_plottable(file: &Path) -> anyhow::Result<()> {
         );
     }
     check_writable(file)
+}
+
+/// Result as JSON, with the settings in which it differs from the training.
+#[derive(Serialize)]
+struct WrittenReport<'a> {
+    #[serde(flatten)]
+    report: &'a EvaluationReport,
+    #[serde(skip_serializing_if = "<[String]>::is_empty")]
+    changed_settings: &'a [String],
+}
+
+/// Refuses an output file that is also another output or an input: one would be lost.
+fn check_distinct_files(arguments: &Arguments, snapshot: &Path) -> anyhow::Result<()> {
+    let outputs = [
+        ("--json", arguments.json.clone()),
+        ("--record", arguments.record.clone()),
+        ("--plot", arguments.plot.clone()),
+        (
+            "the unfinished file of --record",
+            arguments.record.as_deref().map(temporary_path),
+        ),
+    ];
+    let outputs: Vec<_> = outputs
+        .into_iter()
+        .filter_map(|(option, file)| Some((option, file?)))
+        .collect();
+    let inputs = [("the snapshot", snapshot.to_owned())]
+        .into_iter()
+        .chain(
+            arguments
+                .course
+                .iter()
+                .map(|file| ("--course", file.clone())),
+        )
+        .chain(arguments.suite.iter().map(|file| ("--suite", file.clone())));
+    let all: Vec<_> = outputs.iter().cloned().chain(inputs).collect();
+    for (number, (option, file)) in outputs.iter().enumerate() {
+        let same = all[number + 1..]
+            .iter()
+            .find(|(_, other)| is_same_file(file, other));
+        if let Some((other, _)) = same {
+            bail!(
+                "{option} and {other} are the same file, {}, of which one would be lost; name \
+                another",
+                file.display()
+            );
+        }
+    }
+    Ok(())
+}
+
+/// `true` if both paths lead to one regular file, or to one that does not exist yet.
+fn is_same_file(one: &Path, other: &Path) -> bool {
+    match (fs::metadata(one), fs::metadata(other)) {
+        (Ok(one), Ok(other)) => {
+            one.is_file() && (one.dev(), one.ino()) == (other.dev(), other.ino())
+        }
+        (Err(_), Err(_)) => {
+            let place = |path: &Path| {
+                let folder = std::path::absolute(path)
+                    .ok()?
+                    .parent()?
+                    .canonicalize()
+                    .ok()?;
+                Some(folder.join(path.file_name()?))
+            };
+            place(one).is_some_and(|place_of_one| Some(place_of_one) == place(other))
+        }
+        _ => false,
+    }
 }
 
 /// Checks that `file` can be written, so that a long evaluation is not lost. Leaves no file behind

@@ -90,7 +90,7 @@ fn a_run_is_evaluated_on_its_own_courses_with_the_same_result_on_any_number_of_t
         assert!(output.status.success(), "{output:?}");
         let table = String::from_utf8(output.stdout).unwrap();
         assert!(
-            table.contains("training") && table.contains("non_rectangular"),
+            table.contains("training") && table.contains("non-rectangular"),
             "{table}"
         );
     }
@@ -303,12 +303,114 @@ fn a_suite_that_cannot_be_flown_is_refused_by_file_and_entry() {
 fn files_that_cannot_be_written_are_refused_before_anything_is_flown() {
     let folder = run_folder();
     let at = folder.path();
-    for option in ["--json", "--record", "--plot"] {
-        for file in ["/proc/result", "none/result", "courses"] {
-            let error = error_of(at, &["--run", ".", option, file]);
-            assert!(error.contains(&format!("{file}: ")), "{error}");
-            assert!(!error.contains("episodes on each of"), "{error}");
-        }
+    // Neither can be written, not even by root.
+    std::os::unix::fs::symlink("none/result", at.join("link.json")).unwrap();
+    std::fs::create_dir(at.join("blocked.npz.tmp")).unwrap();
+    for (option, file) in [
+        ("--json", "link.json"),
+        ("--record", "blocked.npz"),
+        ("--json", "none/result"),
+        ("--record", "none/result"),
+        ("--json", "courses"),
+        ("--record", "courses"),
+        ("--plot", "none/result"),
+        ("--plot", "courses"),
+    ] {
+        let error = error_of(at, &["--run", ".", option, file]);
+        assert!(error.contains(&format!("{file}: ")), "{error}");
+        assert!(!error.contains("episodes on each of"), "{error}");
+    }
+}
+
+#[test]
+fn an_output_that_is_another_output_or_an_input_is_refused() {
+    let folder = run_folder();
+    let at = folder.path();
+    let snapshot = "snapshots/latest.safetensors";
+    let content = std::fs::read(at.join(snapshot)).unwrap();
+    std::fs::hard_link(at.join(snapshot), at.join("linked")).unwrap();
+    std::fs::create_dir(at.join("folder")).unwrap();
+    for (outputs, other) in [
+        (
+            vec!["--json", "a.npz", "--record", "folder/../a.npz"],
+            "--record",
+        ),
+        (
+            vec!["--json", "a.npz.tmp", "--record", "a.npz"],
+            "unfinished",
+        ),
+        (vec!["--json", snapshot], "the snapshot"),
+        (vec!["--record", "linked"], "the snapshot"),
+        (
+            vec![
+                "--course",
+                "courses/training.toml",
+                "--json",
+                "courses/training.toml",
+            ],
+            "--course",
+        ),
+    ] {
+        let error = error_of(at, &[["--run", "."].as_slice(), &outputs].concat());
+        assert!(
+            error.contains("the same file") && error.contains(other),
+            "{error}"
+        );
+    }
+    assert_eq!(std::fs::read(at.join(snapshot)).unwrap(), content);
+}
+
+#[test]
+fn a_recording_that_does_not_fit_into_memory_is_refused() {
+    let folder = run_folder();
+    let more = ["--run", ".", "--episodes", "1000000", "--record", "all.npz"];
+    let error = error_of(folder.path(), &more);
+    for part in ["--record", "2000000 episodes", "GiB are free", "--episodes"] {
+        assert!(error.contains(part), "{error}");
+    }
+}
+
+#[test]
+fn settings_of_the_simulator_can_be_changed_and_others_are_refused() {
+    let folder = run_folder();
+    let at = folder.path();
+    let flown = |settings: &[&str], json: &str| {
+        let mut arguments = vec!["--run", ".", "--episodes", "2", "--json", json];
+        settings
+            .iter()
+            .for_each(|set| arguments.extend(["--set", set]));
+        let output = evaluate(at, &arguments);
+        assert!(output.status.success(), "{output:?}");
+        std::fs::read_to_string(at.join(json)).unwrap()
+    };
+    let (as_trained, changed) = (
+        flown(&[], "a.json"),
+        flown(&["simulator.vehicle.preset=point"], "b.json"),
+    );
+    assert!(!as_trained.contains("changed_settings"), "{as_trained}");
+    assert!(
+        changed.contains("simulator.vehicle.preset=point"),
+        "{changed}"
+    );
+    let report = |text: &str| {
+        serde_json::from_str::<EvaluationReport>(text)
+            .unwrap()
+            .courses
+    };
+    assert_ne!(report(&as_trained), report(&changed));
+    for (set, part) in [
+        (
+            "learning.observation=latent+velocity",
+            "would change the networks",
+        ),
+        ("simulator.max_step=200", "max_step"),
+        ("simulator.max_steps=0", "max_steps = 0"),
+        ("simulator.max_steps=50", "58.0 m from the start"),
+        ("simulator.vehicle.forward_speed_mps=0.3", "at most 24.0 m"),
+        ("simulator.vehicle.preset=rocket", "rocket"),
+    ] {
+        let error = error_of(at, &["--run", ".", "--set", set]);
+        assert!(error.contains("--set") && error.contains(part), "{error}");
     }
 }
 

@@ -37,10 +37,18 @@ pub fn check(
         .chain([&config.courses.training])
     {
         let course = Arc::new(Course::load(path)?);
+        let (corridor, start) = (course.corridor(), course.start());
         Simulator::new(course, &settings).map_err(|source| PrepareError::Settings {
             config: in_file(),
             source,
         })?;
+        settings
+            .check_reach(corridor, start)
+            .map_err(|source| PrepareError::OutOfReach {
+                config: in_file(),
+                course: path.display().to_string(),
+                source,
+            })?;
     }
     check_level_count(
         config_file,
@@ -55,6 +63,13 @@ pub fn check(
                 config: in_file(),
                 source,
             })?;
+        settings
+            .check_reach(course.corridor(), course.start())
+            .map_err(|source| PrepareError::OutOfReach {
+                config: in_file(),
+                course: "[simulator.generator]".to_owned(),
+                source,
+            })?;
         if trains_on_generated {
             check_level_count(
                 config_file,
@@ -64,6 +79,7 @@ pub fn check(
             )?;
         }
     }
+    check_warmup(config_file, config, settings.max_steps)?;
     let records = config.transport.max_records_per_episode;
     if settings.max_steps as usize + 1 > records {
         return Err(PrepareError::EpisodeTooLong {
@@ -78,6 +94,23 @@ pub fn check(
         });
     }
     Ok(settings)
+}
+
+/// Checks that the longest episodes that `max_steps` allows outlast the warm-up, so that something
+/// is learned.
+fn check_warmup(config_file: &Path, config: &Config, max_steps: u32) -> Result<(), PrepareError> {
+    let (episodes, warmup_steps) = (config.run.episodes, config.learning.warmup_steps);
+    let most_steps = episodes.saturating_mul(max_steps.into());
+    if most_steps > warmup_steps as u64 || config.learning.updates_per_step == 0.0 {
+        return Ok(());
+    }
+    Err(PrepareError::OnlyWarmup {
+        config: config_file.to_owned(),
+        episodes,
+        max_steps,
+        most_steps,
+        warmup_steps,
+    })
 }
 
 /// Checks that `course`, called `name` in messages, has all start levels of the training.

@@ -92,7 +92,7 @@ pub(super) fn copy_courses(root: &Path, config: &mut Config) -> Result<(), Prepa
     let folder = RunDirectory::new(root).courses();
     let mut copies: BTreeMap<OsString, PathBuf> = BTreeMap::new();
     for path in config.courses.paths_mut() {
-        let stem = CoursesSection::name_of(path);
+        let stem = CoursesSection::stem_of(path);
         let mut name = OsString::from(format!("{stem}.toml"));
         for number in 2.. {
             if copies.get(&name).is_none_or(|original| original == path) {

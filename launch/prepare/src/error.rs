@@ -7,7 +7,7 @@ use skein_protocol::config::ConfigError;
 use skein_run::RunError;
 use skein_run::terminal::quoted;
 use skein_simulator::course::{CourseError, RangesError};
-use skein_simulator::simulator::SimulatorError;
+use skein_simulator::simulator::{OutOfReach, SimulatorError};
 
 use super::room::{FoldersTooSmall, SharedMemoryTooSmall};
 
@@ -45,6 +45,37 @@ pub enum PrepareError {
         /// Problem of the ranges.
         #[source]
         source: RangesError,
+    },
+    /// No episode can finish a course.
+    #[error("{}: {course}: {source}", config.display())]
+    OutOfReach {
+        /// The configuration file.
+        config: PathBuf,
+        /// Name of the course, or of the ranges of generated courses.
+        course: String,
+        /// Distances, their keys and the remedy.
+        #[source]
+        source: OutOfReach,
+    },
+    /// The run would end within its warm-up.
+    #[error(
+        "{}: run.episodes = {episodes} of at most [simulator] max_steps = {max_steps} are \
+         {most_steps} steps, which learning.warmup_steps = {warmup_steps} takes up, so nothing \
+         would be learned; raise run.episodes, lower learning.warmup_steps, or set \
+         learning.updates_per_step to 0 if nothing is to be learned",
+        config.display()
+    )]
+    OnlyWarmup {
+        /// The configuration file.
+        config: PathBuf,
+        /// Training episodes.
+        episodes: u64,
+        /// Largest number of steps of an episode.
+        max_steps: u32,
+        /// Largest number of steps of the run.
+        most_steps: u64,
+        /// Steps without updates.
+        warmup_steps: usize,
     },
     /// An episode may become longer than an actor can send.
     #[error(

@@ -259,8 +259,10 @@ mod tests {
 
     #[test]
     fn unknown_free_space_passes() {
-        assert_eq!(check_memory_in(Path::new("/nowhere"), 1, u64::MAX), Ok(()));
-        assert_eq!(scarce_disk(&Config::default(), Path::new("/nowhere")), None);
+        let folder = tempfile::tempdir().unwrap();
+        let missing = folder.path().join("missing");
+        assert_eq!(check_memory_in(&missing, 1, u64::MAX), Ok(()));
+        assert_eq!(scarce_disk(&Config::default(), &missing), None);
     }
 
     #[test]

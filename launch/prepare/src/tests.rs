@@ -106,9 +106,9 @@ fn an_impossible_run_is_refused_before_anything_is_created() {
         ),
         (
             "",
-            "courses.training=\"/nowhere.toml\"",
+            "courses.training=\"missing/course.toml\"",
             1,
-            vec!["with --set courses.training=", "/nowhere.toml"],
+            vec!["with --set courses.training=", "missing/course.toml"],
         ),
         (
             "",
@@ -151,6 +151,43 @@ fn an_impossible_run_is_refused_before_anything_is_created() {
             "evaluation.confirm_on=generated",
             1,
             vec!["generator", "no opening drawn for wall 1"],
+        ),
+        (
+            "[run]\nepisodes = 12",
+            "",
+            1,
+            vec![
+                "test.toml: run.episodes = 12",
+                "max_steps = 160",
+                "1920 steps",
+                "learning.warmup_steps = 2000",
+                "raise run.episodes",
+            ],
+        ),
+        (
+            "",
+            "simulator.vehicle.control_period_secs=0.1",
+            1,
+            vec![
+                "with --set simulator.vehicle.control_period_secs=0.1, ",
+                "training.toml",
+                "58.0 m from the start",
+                "at most 16.0 m",
+                "max_steps to 581 or more",
+            ],
+        ),
+        (
+            "[simulator.vehicle]\nforward_speed_mps = 0.3",
+            "",
+            1,
+            vec!["training.toml", "at most 24.0 m", "forward_speed_mps = 0.3"],
+        ),
+        (
+            "[simulator.generator]\n\
+             corridor = { length_m = 100.0, width_m = 6.0, height_m = 7.0 }",
+            "courses.generated_share=0.5",
+            1,
+            vec!["[simulator.generator]", "corridor.length_m = 100"],
         ),
         (
             "[transport]\nmax_actors = 3",

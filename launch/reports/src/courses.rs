@@ -8,7 +8,7 @@ use skein_simulator::course::{Course, CourseError};
 /// A course of the final evaluation, with its name in the run's reports.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NamedCourse {
-    /// Name of the course: [`CoursesSection::name_of`] its file.
+    /// Name of the course: see [`CoursesSection::names`].
     pub name: String,
     /// The course.
     pub course: Course,
@@ -19,13 +19,18 @@ pub struct NamedCourse {
 /// # Errors
 /// [`CourseError`] names the file, the wall and the key.
 pub fn load_courses(config: &Config) -> Result<Vec<NamedCourse>, CourseError> {
-    let load = |path: &PathBuf| {
+    let load = |(name, path): (String, &PathBuf)| {
         Ok(NamedCourse {
-            name: CoursesSection::name_of(path),
+            name,
             course: Course::load(path)?,
         })
     };
-    config.courses.evaluation.iter().map(load).collect()
+    let files = &config.courses.evaluation;
+    CoursesSection::names(files)
+        .into_iter()
+        .zip(files)
+        .map(load)
+        .collect()
 }
 
 /// Returns the walls per episode that an agent would pass on average if it passed every wall of the

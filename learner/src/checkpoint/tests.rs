@@ -66,6 +66,7 @@ fn state(episodes: u64) -> CheckpointState {
             }),
             trained: Some(skein_protocol::summary::Trained {
                 rate: 0.92,
+                confirmation_episodes: 20,
                 episodes: 60,
                 steps: 11,
                 updates: 2,

@@ -91,6 +91,7 @@ impl Training<'_> {
         }
         let trained = Trained {
             rate,
+            confirmation_episodes: flown.len() as u64,
             episodes: self.progress.episodes,
             steps: self.trainer.steps(),
             updates: self.trainer.updates(),
@@ -98,6 +99,7 @@ impl Training<'_> {
         };
         tracing::info!(
             rate,
+            confirmation_episodes = trained.confirmation_episodes,
             episodes = trained.episodes,
             steps = trained.steps,
             secs = trained.wall_secs,

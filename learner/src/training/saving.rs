@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 use std::{fs, io};
 
-use skein_protocol::config::Config;
+use skein_protocol::config::{Config, LearningSection};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::progress::{self, LearnerPhase};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
@@ -427,6 +427,11 @@ fn summary(
         best_version: best.map(|best| PolicyVersion(best.policy_version)),
         best_confirmed_walls_passed: best.map(|best| best.confirmed_walls_passed),
         trained: progress.trained,
+        untrained: untrained(
+            &config.learning,
+            progress.environment_steps,
+            progress.policy_updates,
+        ),
         episodes: progress.episodes,
         steps: progress.environment_steps,
         updates: progress.policy_updates,
@@ -441,6 +446,27 @@ fn summary(
         stages: progress.spent.stages,
         thread_cpu_secs: BTreeMap::new(),
     }
+}
+
+/// Returns the reason why a policy is untrained after `steps`, and the remedy, if there was no
+/// update.
+fn untrained(learning: &LearningSection, steps: u64, updates: u64) -> Option<String> {
+    let (warmup, per_step) = (learning.warmup_steps, learning.updates_per_step);
+    let reason = if updates > 0 {
+        return None;
+    } else if per_step == 0.0 {
+        "learning.updates_per_step = 0 allows none; raise it".to_owned()
+    } else if steps <= warmup as u64 {
+        format!(
+            "the warm-up of learning.warmup_steps = {warmup} was not over after {steps} steps; \
+            raise run.episodes, or lower learning.warmup_steps"
+        )
+    } else {
+        "the run ended before the first one was due; raise run.episodes".to_owned()
+    };
+    Some(format!(
+        "The policy is untrained, because there was no update: {reason}."
+    ))
 }
 
 fn remove(path: &Path) -> io::Result<()> {
@@ -458,6 +484,28 @@ fn file_error(path: &Path) -> impl FnOnce(io::Error) -> TrainingError {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_untrained_policy_is_called_so_with_the_reason_and_the_remedy() {
+        let mut learning = Config::default().learning;
+        learning.warmup_steps = 800;
+        assert_eq!(untrained(&learning, 900, 1), None);
+        let says = |learning: &LearningSection, steps, part: &str| {
+            let reason = untrained(learning, steps, 0).unwrap();
+            assert!(
+                reason.starts_with("The policy is untrained") && reason.contains(part),
+                "{reason}"
+            );
+        };
+        says(
+            &learning,
+            305,
+            "learning.warmup_steps = 800 was not over after 305 steps",
+        );
+        says(&learning, 801, "raise run.episodes");
+        learning.updates_per_step = 0.0;
+        says(&learning, 9000, "learning.updates_per_step = 0");
+    }
 
     #[test]
     fn a_run_that_lost_its_checkpoints_is_not_silently_started_again() {
@@ -483,7 +531,7 @@ mod tests {
             refuse_lost_checkpoints(&directory, &config).is_err(),
             "their folder is gone"
         );
-        std::os::unix::fs::symlink("/no/such/disk", directory.checkpoints()).unwrap();
+        std::os::unix::fs::symlink(folder.path().join("missing"), directory.checkpoints()).unwrap();
         assert!(
             refuse_lost_checkpoints(&directory, &config).is_err(),
             "it leads nowhere"

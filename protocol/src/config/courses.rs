@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::file::read_text;
 use super::{InvalidValue, require};
 
 /// The `[courses]` section: the courses of training and evaluation.
@@ -43,13 +44,44 @@ impl Default for CoursesSection {
 }
 
 impl CoursesSection {
-    /// Name of a course in reports: its file name without the extension.
-    pub fn name_of(course: &Path) -> String {
+    /// Returns the file name of a course without the extension.
+    pub fn stem_of(course: &Path) -> String {
         course
             .file_stem()
             .unwrap_or_default()
             .to_string_lossy()
             .into_owned()
+    }
+
+    /// Returns the names of `courses` in reports: the key `name` of each file. Equal names get the
+    /// file's stem in brackets. A file without a name, or that cannot be read, is named by its
+    /// stem.
+    pub fn names<P: AsRef<Path>>(courses: &[P]) -> Vec<String> {
+        let own: Vec<_> = courses
+            .iter()
+            .map(|course| {
+                let stem = Self::stem_of(course.as_ref());
+                (
+                    name_in(course.as_ref()).unwrap_or_else(|| stem.clone()),
+                    stem,
+                )
+            })
+            .collect();
+        let mut names: Vec<String> = Vec::with_capacity(own.len());
+        for (name, stem) in &own {
+            let is_shared = own.iter().filter(|(other, _)| other == name).count() > 1;
+            let base = match is_shared {
+                true => format!("{name} ({stem})"),
+                false => name.clone(),
+            };
+            let mut numbered = (2..).map(|number| format!("{base} {number}"));
+            let mut unused = base.clone();
+            while names.contains(&unused) {
+                unused = numbered.next().expect("there is always a next number");
+            }
+            names.push(unused);
+        }
+        names
     }
 
     /// Returns every course file.
@@ -81,5 +113,47 @@ impl CoursesSection {
             self.evaluation.len(),
             "lists more than 64 courses: tickets could not number them",
         )
+    }
+}
+
+/// Returns the key `name` of the course file at `path`, unless it is blank.
+fn name_in(path: &Path) -> Option<String> {
+    let course: toml::Table = toml::from_str(&read_text(path).ok()?).ok()?;
+    let name = course.get("name")?.as_str()?.trim();
+    (!name.is_empty()).then(|| name.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_course_is_shown_by_its_name_and_equal_names_are_told_apart() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |file: &str, text: &str| {
+            let path = folder.path().join(file);
+            std::fs::write(&path, text).unwrap();
+            path
+        };
+        let courses = [
+            write("gates.toml", "name = \"two gates\""),
+            write("hall.toml", "name = \"hall\""),
+            write("hall_2.toml", "name = \" hall \""),
+            write("blank.toml", "name = \"\""),
+            folder.path().join("missing.toml"),
+        ];
+        let names = CoursesSection::names(&courses);
+        assert_eq!(
+            names,
+            [
+                "two gates",
+                "hall (hall)",
+                "hall (hall_2)",
+                "blank",
+                "missing"
+            ]
+        );
+        let twice = CoursesSection::names(&[&courses[0], &courses[0]]);
+        assert_eq!(twice, ["two gates (gates)", "two gates (gates) 2"]);
     }
 }

@@ -139,10 +139,8 @@ impl Config {
         overrides: &[String],
         shipped: Option<&Path>,
     ) -> Result<Self, ConfigError> {
-        let mut table: Table = toml::from_str(text).map_err(|source| ConfigError::Syntax {
-            path: path.to_owned(),
-            source: Box::new(source),
-        })?;
+        let mut table: Table =
+            toml::from_str(text).map_err(|error| syntax_error(path, text, error))?;
         for text in overrides {
             apply_override(&mut table, text)?;
         }
@@ -183,10 +181,42 @@ impl Config {
         Ok(config)
     }
 
+    /// Returns this configuration, read from `path`, with `overrides` as in [`Config::load`].
+    /// Course paths stay as they are.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names file, key, value and remedy.
+    pub fn overridden(&self, path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let changed = Self::parse_with(&self.to_toml(), path, overrides, None)?;
+        Ok(Self {
+            courses: self.courses.clone(),
+            ..changed
+        })
+    }
+
     /// Returns the whole configuration as TOML, defaults included.
     pub fn to_toml(&self) -> String {
         toml::to_string_pretty(self)
             .expect("every field of the configuration is representable in TOML")
+    }
+}
+
+/// Converts the parser's error; of an integer that is too large it knows only the type.
+fn syntax_error(path: &Path, text: &str, error: toml::de::Error) -> ConfigError {
+    let place = error.span().unwrap_or_default();
+    let path = path.to_owned();
+    match text.get(place.clone()).filter(|value| is_integer(value)) {
+        Some(value) => ConfigError::Key {
+            path,
+            message: format!(
+                "line {}: {value} {INTEGER_TOO_LARGE}",
+                1 + text[..place.start].matches('\n').count()
+            ),
+        },
+        None => ConfigError::Syntax {
+            path,
+            source: Box::new(error),
+        },
     }
 }
 
@@ -250,7 +280,7 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
             .as_table_mut()
             .ok_or_else(|| fail("names a value where a section is expected"))?;
     }
-    let mut value = parse_value(value.trim());
+    let mut value = parse_value(value.trim()).map_err(fail)?;
     if matches!((sections, key), ("courses", "training" | "evaluation")) {
         make_absolute(&mut value)
             .map_err(|error| fail(&format!("is not a usable path ({error})")))?;
@@ -274,15 +304,49 @@ fn make_absolute(value: &mut Value) -> io::Result<()> {
 
 /// Parses a value in TOML's notation, or else takes the text itself: `--set run.device=cpu` needs
 /// no quotes.
-fn parse_value(text: &str) -> Value {
-    toml::from_str::<Table>(&format!("value = {text}"))
-        .ok()
-        .and_then(|mut table| table.remove("value"))
-        .unwrap_or_else(|| Value::String(text.to_owned()))
+///
+/// # Errors
+/// The problem, if a part of the text would be ignored or the number does not fit.
+fn parse_value(text: &str) -> Result<Value, &'static str> {
+    let Ok(mut table) = toml::from_str::<Table>(&format!("value = {text}")) else {
+        return if text.contains(['\n', '\r']) {
+            Err("holds a line break: give each setting a --set with one value")
+        } else if is_integer(text) {
+            Err(INTEGER_TOO_LARGE)
+        } else {
+            Ok(Value::String(text.to_owned()))
+        };
+    };
+    // A further key on the next line and a comment are TOML, but no part of the value. In brackets,
+    // neither is possible.
+    let bracketed = toml::from_str::<Table>(&format!("value = [{text}]"));
+    let is_one_value = bracketed.is_ok_and(
+        |table| matches!(table.get("value"), Some(Value::Array(values)) if values.len() == 1),
+    );
+    match table.remove("value") {
+        Some(value) if is_one_value && table.is_empty() => Ok(value),
+        _ => Err(
+            "holds more than one value, and the rest would be ignored: give each setting a \
+            --set with one value",
+        ),
+    }
+}
+
+/// Problem of an integer that TOML does not hold.
+const INTEGER_TOO_LARGE: &str = "is an integer outside -9223372036854775808 to \
+    9223372036854775807 (64 bits with a sign), which TOML does not hold: choose one within";
+
+/// `true` for the digits of a decimal integer, with or without a sign.
+fn is_integer(text: &str) -> bool {
+    let digits = text.strip_prefix(['+', '-']).unwrap_or(text);
+    digits.starts_with(|first: char| first.is_ascii_digit())
+        && digits
+            .chars()
+            .all(|digit| digit.is_ascii_digit() || digit == '_')
 }
 
 /// Reads a text file of ordinary size. Reading a pipe or a device might never end.
-fn read_text(path: &Path) -> io::Result<String> {
+pub(super) fn read_text(path: &Path) -> io::Result<String> {
     /// Many times the size of a configuration with every key and a comment on each.
     const MAX_BYTES: u64 = 1 << 20;
     let about = fs::metadata(path)?;
@@ -471,6 +535,68 @@ mod tests {
             config.simulator["vehicle"]["preset"].as_str(),
             Some("point")
         );
+    }
+
+    #[test]
+    fn an_override_is_used_whole_or_refused() {
+        let refused = |text: &str, parts: &[&str]| {
+            let error = load("", &[text]).unwrap_err();
+            assert!(error.contains("--set "), "{error}");
+            for part in parts {
+                assert!(error.contains(part), "`{error}` does not mention `{part}`");
+            }
+        };
+        for text in [
+            "run.seed=7\n[sac]",
+            "run.seed=7\nepisodes=3",
+            "run.seed=7 # the best",
+            "run.seed=7#8",
+            "learning.history_steps=[2] # [4]",
+        ] {
+            refused(text, &["more than one value", "would be ignored"]);
+        }
+        refused("run.device=cpu\nrun.seed=3", &["a line break"]);
+        refused("run.seed=7\nvalue=3", &["a line break"]);
+        let lines = "learning.history_steps=[\n  2, # half a second\n  4,\n]";
+        assert_eq!(load("", &[lines]).unwrap().learning.history_steps, [2, 4]);
+        let path = load("", &["courses.training=a#b.toml"])
+            .unwrap()
+            .courses
+            .training;
+        assert!(path.ends_with("a#b.toml"), "{}", path.display());
+    }
+
+    #[test]
+    fn an_integer_that_toml_does_not_hold_is_named_as_such() {
+        for seed in [
+            "9223372036854775808",
+            "18446744073709551616",
+            "-9223372036854775809",
+        ] {
+            let set = load("", &[&format!("run.seed={seed}")]).unwrap_err();
+            assert!(
+                set.contains(&format!("--set run.seed={seed}: is an integer")),
+                "{set}"
+            );
+            let file = load(&format!("[run]\nepisodes = 9\nseed = {seed} # x"), &[]).unwrap_err();
+            assert!(
+                file.contains(&format!("test.toml: line 3: {seed} is an integer outside")),
+                "{file}"
+            );
+        }
+        let largest = load("", &["run.seed=9223372036854775807"]).unwrap();
+        assert_eq!(largest.run.seed, i64::MAX as u64);
+    }
+
+    #[test]
+    fn a_configuration_with_overrides_keeps_its_courses() {
+        let here = Config::default();
+        let there = Path::new("best.safetensors");
+        let other = here
+            .overridden(there, &["simulator.max_steps=200".to_owned()])
+            .unwrap();
+        assert_eq!(other.courses, here.courses);
+        assert_eq!(other.simulator["max_steps"].as_integer(), Some(200));
     }
 
     #[test]

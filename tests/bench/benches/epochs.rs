@@ -13,9 +13,10 @@ use skein_protocol::summary::Summary;
 use skein_run::RunDirectory;
 
 /// Settings of every run: nothing is learned, and hardly anything evaluated.
-const SETTINGS: [&str; 10] = [
+const SETTINGS: [&str; 11] = [
     "simulator.vehicle.preset=airsim",
     "learning.warmup_steps=100000",
+    "learning.updates_per_step=0",
     "vae.train_steps=1",
     "vae.updates_per_step=1e-9",
     "sac.hidden_width=256",

@@ -4,6 +4,7 @@ use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::{IMAGE_HEIGHT, IMAGE_WIDTH};
+use crate::text::exactly;
 
 /// The depth camera's optics and mounting: section `[simulator.camera]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -20,6 +21,7 @@ pub struct CameraSettings {
     pub near_m: f32,
     /// Position of the lens in the body frame (forward, left, up), metres. The default
     /// `[0.2, 0, 0]` lies inside the body of every vehicle preset.
+    #[serde(deserialize_with = "exactly")]
     pub mount_m: [f32; 3],
     /// Angle of the optical axis above the body's forward axis, degrees. Default 0.
     pub mount_pitch_deg: f32,

@@ -146,10 +146,16 @@ fn sizes(wall: WallLabel, candidate: &WallLayout) -> Result<(), CourseFault> {
                     count: points_m.len(),
                 });
             }
-            points_m
-                .iter()
-                .flatten()
-                .try_for_each(|&value| in_range(location, "points_m", value, -LARGEST_M, LARGEST_M))
+            points_m.iter().flatten().try_for_each(|&value| {
+                in_range(location, "points_m", value, -LARGEST_M, LARGEST_M)
+            })?;
+            match polygon::edges(points_m).position(|(from, to)| from == to) {
+                Some(place) => Err(CourseFault::RepeatedCorner {
+                    wall,
+                    corner: place + 1,
+                }),
+                None => Ok(()),
+            }
         }
         _ => Ok(()),
     }

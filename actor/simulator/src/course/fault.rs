@@ -25,6 +25,12 @@ impl fmt::Display for FaultLocation {
 /// Reason why a course is refused: the wall, the key and the remedy.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CourseFault {
+    /// A name that breaks a table.
+    #[error("course: key name = {name:?} cannot be shown in a table: give one line without |")]
+    Name {
+        /// The name found.
+        name: String,
+    },
     /// A number out of bounds, or NaN.
     #[error("{location}: key {key} = {value} must lie between {least} and {most}")]
     OutOfRange {
@@ -96,6 +102,14 @@ pub enum CourseFault {
         wall: WallLabel,
         /// Corners found.
         count: usize,
+    },
+    /// A polygon with a corner that follows itself.
+    #[error("wall {wall}: key points_m has corner {corner} twice in a row: remove one")]
+    RepeatedCorner {
+        /// The wall.
+        wall: WallLabel,
+        /// The first of the two corners, from 1.
+        corner: usize,
     },
     /// A polygon that crosses or touches itself, or has no area.
     #[error(

@@ -13,7 +13,7 @@ use super::{
     Corridor, Course, CourseFault, CourseLayout, FaultLocation, Opening, Shape, StartArea,
     WallLabel, WallLayout,
 };
-use crate::text::read_text;
+use crate::text::{exactly, message_of, parse_whole, read_text};
 
 /// Reason why a course file cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -69,7 +69,7 @@ impl Course {
     pub fn parse(text: &str, path: impl AsRef<Path>) -> Result<Self, CourseError> {
         let path = path.as_ref();
         let file: CourseFile =
-            toml::from_str(text).map_err(|error| syntax_error(path, text, &error))?;
+            parse_whole(text).map_err(|error| syntax_error(path, text, &error))?;
         file.layout()
             .and_then(Self::new)
             .map_err(|source| CourseError::Fault {
@@ -86,7 +86,7 @@ fn syntax_error(path: &Path, text: &str, error: &toml::de::Error) -> CourseError
         location,
         key,
     } = SourceLocation::of(error.span().unwrap_or_default(), text);
-    let problem = error.message().trim_end().replace('\n', " ");
+    let problem = message_of(error);
     let message = match key {
         Some(key) if !problem.contains(&format!("`{key}`")) => format!("key {key}: {problem}"),
         _ => problem,
@@ -118,6 +118,7 @@ struct CourseFile {
 struct WallTable {
     label: WallLabel,
     shape: ShapeName,
+    #[serde(deserialize_with = "exactly")]
     centre_m: [f32; 2],
     #[serde(default)]
     rotation_deg: f32,
@@ -125,8 +126,12 @@ struct WallTable {
     height_m: Option<f32>,
     diameter_m: Option<f32>,
     arm_m: Option<f32>,
-    points_m: Option<Vec<[f32; 2]>>,
+    points_m: Option<Vec<Corner>>,
 }
+
+/// Corner `[y, z]` of a polygon.
+#[derive(Deserialize)]
+struct Corner(#[serde(deserialize_with = "exactly")] [f32; 2]);
 
 #[derive(Clone, Copy, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -142,6 +147,12 @@ enum ShapeName {
 
 impl CourseFile {
     fn layout(self) -> Result<CourseLayout, CourseFault> {
+        if self
+            .name
+            .contains(|sign: char| sign.is_control() || sign == '|')
+        {
+            return Err(CourseFault::Name { name: self.name });
+        }
         if self.order.len() != self.wall_x_m.len() {
             let (order, places) = (self.order.len(), self.wall_x_m.len());
             return Err(CourseFault::OrderLength { order, places });
@@ -210,6 +221,9 @@ impl WallTable {
             points_m,
             ..
         } = self;
+        let points_m = points_m
+            .take()
+            .map(|corners| corners.into_iter().map(|Corner(place)| place).collect());
         Ok(match shape {
             ShapeName::Rectangle => Shape::Rectangle {
                 width_m: need("width_m", width_m.take())?,
@@ -237,12 +251,14 @@ impl WallTable {
                 diameter_m: need("diameter_m", diameter_m.take())?,
             },
             ShapeName::Polygon => Shape::Polygon {
-                points_m: points_m.take().ok_or(CourseFault::MissingKey {
-                    wall,
-                    key: "points_m",
-                    shape: shape.name(),
-                    needed: shape.keys(),
-                })?,
+                points_m: points_m
+                    .map(without_closing_corner)
+                    .ok_or(CourseFault::MissingKey {
+                        wall,
+                        key: "points_m",
+                        shape: shape.name(),
+                        needed: shape.keys(),
+                    })?,
             },
         })
     }
@@ -265,6 +281,15 @@ impl WallTable {
             None => Ok(()),
         }
     }
+}
+
+/// Returns the corners of a polygon without a last one that repeats the first: other programs write
+/// polygons as closed rings.
+fn without_closing_corner(mut points_m: Vec<[f32; 2]>) -> Vec<[f32; 2]> {
+    if points_m.len() > 3 && points_m.first() == points_m.last() {
+        points_m.pop();
+    }
+    points_m
 }
 
 impl ShapeName {

@@ -14,6 +14,7 @@ use super::{
     BODY_CLEARANCE_M, Corridor, Course, CourseFault, Opening, Shape, StartArea, WallLabel,
     WallLayout, check, polygon,
 };
+use crate::text::exactly;
 
 /// Ranges for random courses: section `[simulator.generator]`. A pair holds the least and the
 /// largest value, drawn uniformly.
@@ -34,8 +35,10 @@ pub struct GeneratorRanges {
     pub shapes: Vec<GeneratedShape>,
     /// Radius of the widest circle inside an opening, metres: at least [`BODY_CLEARANCE_M`].
     /// Default 0.9 to 1.15.
+    #[serde(deserialize_with = "exactly")]
     pub clearance_m: [f32; 2],
     /// Rotation of an opening, degrees. Default −180 to 180.
+    #[serde(deserialize_with = "exactly")]
     pub rotation_deg: [f32; 2],
 }
 

@@ -7,6 +7,7 @@
 
 mod error;
 mod ground_truth;
+mod reach;
 mod settings;
 #[cfg(test)]
 mod tests;
@@ -19,6 +20,7 @@ use rand::Rng;
 pub use error::{SimulationError, SimulatorError};
 pub(crate) use ground_truth::walls_ahead;
 pub use ground_truth::{GroundTruth, OpeningAhead};
+pub use reach::OutOfReach;
 pub use settings::SimulatorSettings;
 
 pub use crate::step_report::{EpisodeOutcome, LevelUp, Obstacle, StepReport};

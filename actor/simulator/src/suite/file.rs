@@ -8,7 +8,7 @@ use serde::Deserialize;
 use super::{EntryCourses, MOST_EPISODES, MOST_WALLS_TO_ORDER, Suite, SuiteEntry, orders};
 use crate::course::{Course, CourseError, CourseFault, GeneratorRanges, RangesError};
 use crate::disturbances::DisturbanceSettings;
-use crate::text::read_text;
+use crate::text::{message_of, parse_whole, read_text};
 
 /// Most entries of a suite.
 const MOST_ENTRIES: usize = 64;
@@ -148,7 +148,7 @@ impl Suite {
     /// Like [`Suite::load`].
     pub fn parse(text: &str, path: impl AsRef<Path>) -> Result<Self, SuiteError> {
         let path = path.as_ref();
-        let file: SuiteFile = toml::from_str(text).map_err(|error| SuiteError::Syntax {
+        let file: SuiteFile = parse_whole(text).map_err(|error| SuiteError::Syntax {
             path: path.to_owned(),
             message: syntax_message(text, &error),
         })?;
@@ -254,12 +254,11 @@ fn all_orders(path: &Path) -> Result<Vec<Arc<Course>>, SuiteEntryError> {
 
 /// Returns the parser's error on one line; its own text takes several.
 fn syntax_message(text: &str, error: &toml::de::Error) -> String {
-    let before = text
-        .get(..error.span().unwrap_or_default().start)
-        .unwrap_or("");
+    let message = message_of(error);
+    let Some(place) = error.span() else {
+        return message;
+    };
+    let before = text.get(..place.start).unwrap_or("");
     let line = before.matches('\n').count() + 1;
-    format!(
-        "line {line}: {}",
-        error.message().trim_end().replace('\n', " ")
-    )
+    format!("line {line}: {message}")
 }

@@ -14,6 +14,7 @@ pub use file::{SuiteEntryError, SuiteError};
 
 use crate::course::{Course, GeneratorRanges, RangesError};
 use crate::disturbances::DisturbanceSettings;
+use crate::simulator::{OutOfReach, SimulatorSettings};
 
 /// Most episodes of an entry.
 pub const MOST_EPISODES: u64 = 1_000_000;
@@ -64,6 +65,19 @@ impl EntryCourses {
         match self {
             Self::Listed(courses) => episode % courses.len() as u64,
             Self::Generated { .. } => episode,
+        }
+    }
+
+    /// Checks that an episode with `settings` can reach the end of each course.
+    ///
+    /// # Errors
+    /// [`OutOfReach`] of the first course whose end lies too far.
+    pub fn check_reach(&self, settings: &SimulatorSettings) -> Result<(), OutOfReach> {
+        match self {
+            Self::Listed(courses) => courses
+                .iter()
+                .try_for_each(|course| settings.check_reach(course.corridor(), course.start())),
+            Self::Generated { ranges, .. } => settings.check_reach(ranges.corridor, ranges.start),
         }
     }
 

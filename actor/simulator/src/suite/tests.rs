@@ -27,6 +27,26 @@ fn labels(course: &Course) -> Vec<u32> {
 }
 
 #[test]
+fn a_suite_is_used_whole_or_refused() {
+    let refused = |entry: &str, parts: &[&str]| {
+        let text = format!("name = \"x\"\nepisodes = 1\n[[entry]]\nname = \"one\"\n{entry}");
+        let message = Suite::parse(&text, "x.toml").unwrap_err().to_string();
+        assert!(!message.contains('\n'), "{message:?}");
+        for part in parts {
+            assert!(message.contains(part), "`{part}` is missing in {message}");
+        }
+    };
+    let corridor = "[entry.generated]\ncorridor = [60.0, 6.0, 7.0, 9.0]";
+    refused(corridor, &["x.toml", "corridor"]);
+    for (key, count) in [("clearance_m", 3), ("rotation_deg", 1)] {
+        let numbers = &"0.9, 1.0, 1.1"[..5 * count - 2];
+        let entry = format!("[entry.generated]\n{key} = [{numbers}]");
+        let problem = format!("has {count} numbers: give 2");
+        refused(&entry, &["x.toml", "line 6", &problem]);
+    }
+}
+
+#[test]
 fn the_generalist_suite_has_six_thousand_episodes() {
     let suite = generalist();
     assert_eq!(suite.entries.len(), 6);

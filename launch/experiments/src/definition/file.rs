@@ -119,10 +119,19 @@ pub(super) fn read(path: &Path) -> Result<ExperimentFile, DefinitionError> {
         path: path.to_owned(),
         source,
     })?;
-    toml::from_str(&text).map_err(|source| DefinitionError::Syntax {
+    parse_whole(&text).map_err(|source| DefinitionError::Syntax {
         path: path.to_owned(),
         source: Box::new(source),
     })
+}
+
+/// Parses TOML of which every part is used: the parser alone ignores the end of a list that is too
+/// long for the table it stands for.
+fn parse_whole(text: &str) -> Result<ExperimentFile, toml::de::Error> {
+    let parsed = toml::from_str(text)?;
+    let table: Table = toml::from_str(text)?;
+    table.try_into::<ExperimentFile>()?;
+    Ok(parsed)
 }
 
 /// Returns `settings` as overrides, `section.key=value`. Paths of course files are relative to
@@ -151,6 +160,12 @@ fn flatten(
         ));
     }
     for (name, value) in table {
+        let is_plain = |sign: char| sign.is_ascii_alphanumeric() || "_-.".contains(sign);
+        if name.is_empty() || !name.chars().all(is_plain) {
+            return Err(format!(
+                "{name:?} is no key of a setting: write section.key = value, without quotes"
+            ));
+        }
         let key = match section {
             "" => name.clone(),
             section => format!("{section}.{name}"),

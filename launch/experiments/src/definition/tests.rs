@@ -370,6 +370,20 @@ fn an_invalid_experiment_is_refused_with_file_key_value_and_remedy() {
             vec!["arm a: run holds no setting"],
         ),
         (
+            with_arm("settings.run.\"seed \" = 4"),
+            None,
+            vec!["arm a", "\"seed \" is no key", "without quotes"],
+        ),
+        (
+            with_arm("").replacen(
+                "{ measure = \"return\", over = \"steps\" }",
+                "[\"return\", \"steps\", 3]",
+                1,
+            ),
+            None,
+            vec!["is not an experiment", "curves"],
+        ),
+        (
             with_arm("settings.seed = 4"),
             None,
             vec!["arm a", "seed=4", "section.key=value"],

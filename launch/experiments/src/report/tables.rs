@@ -228,7 +228,10 @@ impl Findings<'_> {
             "arm".to_owned(),
             "seeds".to_owned(),
             "episodes to one wall".to_owned(),
-            format!("R ≥ {} reached", evaluation.trained_rate),
+            format!(
+                "R ≥ {} reached in {} episodes",
+                evaluation.trained_rate, evaluation.confirm_episodes
+            ),
             "after episodes".to_owned(),
             "steps".to_owned(),
             "updates".to_owned(),

@@ -257,7 +257,8 @@ fn the_second_interruption_stops_at_once() {
 #[test]
 fn a_program_that_cannot_be_started_leaves_nothing_behind() {
     let mut scripted = ScriptedRun::new(ENDLESS_LEARNER, "");
-    scripted.plan.programs.actor = PathBuf::from("/nowhere/skein-actor");
+    let missing = tempfile::tempdir().unwrap().path().join("skein-actor");
+    scripted.plan.programs.actor = missing.clone();
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -267,7 +268,7 @@ fn a_program_that_cannot_be_started_leaves_nothing_behind() {
         .block_on(run(&scripted.plan, &mut interrupts, &mut Seen::default()))
         .unwrap_err();
     assert!(
-        error.to_string().contains("/nowhere/skein-actor"),
+        error.to_string().contains(missing.to_str().unwrap()),
         "{error}"
     );
     if scripted.has("pids") {

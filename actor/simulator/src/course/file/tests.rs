@@ -62,6 +62,56 @@ fn order_puts_walls_into_the_corridor() {
 }
 
 #[test]
+fn a_list_with_too_many_or_too_few_numbers_is_refused() {
+    for (centre, count) in [("[1,5, 4,6]", 4), ("[0, 3.5, 99]", 3), ("[1.5]", 1)] {
+        let message = refusal("centre_m = [-1.0, 4.0]", &format!("centre_m = {centre}"));
+        let problem = format!("has {count} numbers: give 2");
+        assert_says(&message, &["wall 7", "line 23", "key centre_m", &problem]);
+    }
+    let polygon = |points: &str| {
+        let keys = format!("shape = \"polygon\"\npoints_m = {points}");
+        let text = GOOD.replacen("diameter_m = 2.2", "", 1);
+        let text = text.replacen("shape = \"circle\"", &keys, 1);
+        Course::parse(&text, "configs/courses/x.toml")
+    };
+    let error = polygon("[[-1, -1], [1, -1, 5], [0, 1]]").unwrap_err();
+    let parts = ["wall 7", "key points_m", "has 3 numbers"];
+    assert_says(&error.to_string(), &parts);
+    // Tables written as lists, whose further values the parser alone would ignore.
+    let walls = GOOD.find("[[wall]]").unwrap();
+    let text = GOOD[..walls].replace(
+        "[corridor]\nlength_m = 30.0\nwidth_m = 6.0\nheight_m = 7.0\n",
+        "corridor = [30.0, 6.0, 7.0, 9.0]\n",
+    ) + &GOOD[walls..];
+    let error = Course::parse(&text, "configs/courses/x.toml").unwrap_err();
+    assert_says(&error.to_string(), &["corridor"]);
+}
+
+#[test]
+fn a_closed_ring_is_a_polygon_and_a_repeated_corner_is_named() {
+    let with = |points: &str| {
+        let keys = format!("shape = \"polygon\"\npoints_m = {points}");
+        let text = GOOD.replacen("diameter_m = 2.2", "", 1);
+        let text = text.replacen("shape = \"circle\"", &keys, 1);
+        Course::parse(&text, "configs/courses/x.toml")
+    };
+    let open = with("[[-1.2, -1.2], [1.2, -1.2], [1.2, 1.2], [-1.2, 1.2]]").unwrap();
+    let closed = "[[-1.2, -1.2], [1.2, -1.2], [1.2, 1.2], [-1.2, 1.2], [-1.2, -1.2]]";
+    assert_eq!(with(closed).unwrap(), open);
+    let twice = "[[-1.2, -1.2], [1.2, -1.2], [1.2, -1.2], [1.2, 1.2], [-1.2, 1.2]]";
+    let error = with(twice).unwrap_err().to_string();
+    assert_says(&error, &["wall 7", "points_m", "corner 2 twice"]);
+}
+
+#[test]
+fn a_name_that_breaks_a_table_is_refused() {
+    for name in ["two\\nlines", "two | columns"] {
+        let message = refusal("two walls", name);
+        assert_says(&message, &["course: key name", "one line"]);
+    }
+}
+
+#[test]
 fn an_unknown_key_is_named_with_its_wall_and_line() {
     let message = refusal("diameter_m = 2.2", "diameter_m = 2.2\nradius_m = 1.1");
     assert_says(
