@@ -37,9 +37,12 @@ pub fn read_episodes(path: &Path) -> Result<Vec<EpisodeRow>, ReportError> {
         path: path.to_owned(),
         problem,
     };
-    let mut rows = csv::Reader::from_path(path)
-        .map_err(|error| malformed(error.to_string()))?
-        .into_deserialize();
+    let mut reader = csv::Reader::from_path(path).map_err(|error| malformed(error.to_string()))?;
+    // Otherwise an unreadable header would pass for a file without rows.
+    reader
+        .headers()
+        .map_err(|error| malformed(error.to_string()))?;
+    let mut rows = reader.into_deserialize();
     let mut episodes = Vec::new();
     while let Some(row) = rows.next() {
         let row: EpisodeRow = row.map_err(|error| malformed(error.to_string()))?;

@@ -135,6 +135,11 @@ pub fn draw_all(
     let flown = trajectories::flown(courses, &trajectories);
     if !flown.is_empty() {
         picture("trajectories.png", &|path| draw_trajectories(&flown, path));
+    } else if let Some(name) = trajectories.keys().next().filter(|_| !courses.is_empty()) {
+        plots.failures.push(ReportError::Malformed {
+            path: run.evaluation_trajectories_csv(),
+            problem: format!("{name:?}, like its other courses, is not one of this run's"),
+        });
     }
     plots
 }
@@ -263,6 +268,19 @@ mod tests {
             assert_eq!(plots.pictures.len(), pictures, "{rows}");
             assert!(plots.failures.is_empty(), "{rows}");
         }
+        fs::remove_file(run.episodes_csv()).unwrap();
+        fs::create_dir(run.episodes_csv()).unwrap();
+        let rows = "course,episode,step,x_m,y_m,z_m,outcome\nother,0,0,1.5,0,3,collided\n";
+        fs::write(run.evaluation_trajectories_csv(), rows).unwrap();
+        let plots = draw_all(&run, &[training()], 50, Some(3.0));
+        let failures: Vec<_> = plots.failures.iter().map(ToString::to_string).collect();
+        assert!(failures[0].contains("episodes.csv"), "{failures:?}");
+        assert!(
+            failures[1].contains("\"other\", like its other"),
+            "{failures:?}"
+        );
+        fs::remove_file(run.evaluation_trajectories_csv()).unwrap();
+        fs::remove_dir(run.episodes_csv()).unwrap();
         for rows in ["4,2\n", "4,2,inf\n", "4,-1,1\n", "4,2,1.0\n4,2,", "\0\0\0"] {
             fs::write(run.episodes_csv(), format!("{header}{rows}")).unwrap();
             let plots = draw_all(&run, &[training()], 50, Some(3.0));

@@ -83,9 +83,12 @@ pub(super) fn read_trajectories(path: &Path) -> Result<TrajectoriesByCourse, Rep
     };
     let mut courses = TrajectoriesByCourse::new();
     let mut current = None;
-    let mut rows = csv::Reader::from_path(path)
-        .map_err(|error| malformed(error.to_string()))?
-        .into_deserialize();
+    let mut reader = csv::Reader::from_path(path).map_err(|error| malformed(error.to_string()))?;
+    // Otherwise an unreadable header would pass for a file without rows.
+    reader
+        .headers()
+        .map_err(|error| malformed(error.to_string()))?;
+    let mut rows = reader.into_deserialize();
     while let Some(row) = rows.next() {
         let row: TrajectoryRow = row.map_err(|error| malformed(error.to_string()))?;
         let at_m = [row.x_m, row.y_m, row.z_m];
