@@ -522,9 +522,14 @@ mod tests {
                     { offset_m = 1.5, jitter_y_m = 0.0, jitter_z_m = 0.0 }\n[[wall]]\nlabel = 1\n\
                     shape = \"circle\"\ncentre_m = [0.0, 50.0]\ndiameter_m = 2.2\n";
         let hall = Course::parse(text, "hall.toml").unwrap();
+        let fronts = FrontViews::of(&hall, pixels_per_metre(&hall)).height();
+        assert!(
+            (100..200).contains(&fronts),
+            "one row, {fronts} pixels high"
+        );
         assert_eq!(
             block_height(&hall),
-            CAPTION + 2 * HIGHEST_PANEL + PANEL_GAP + AXIS
+            CAPTION + 2 * HIGHEST_PANEL + PANEL_GAP + AXIS + fronts
         );
     }
 
