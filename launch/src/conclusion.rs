@@ -14,8 +14,8 @@ use skein_run::tables::{evaluation_table, stages_table};
 use skein_reports::Clock;
 
 /// Returns the evaluation table, a sentence on the run, the table of times per stage, and the paths
-/// of all files the run left, for standard output of `columns`. Parts that the run did not write are
-/// left out.
+/// of all files the run left, for standard output of `columns`. Parts that the run did not write
+/// are left out.
 pub fn conclusion(run: &RunDirectory, columns: usize) -> String {
     let mut text = String::new();
     if let Some(report) = read::<EvaluationReport>(&run.evaluation_json()) {

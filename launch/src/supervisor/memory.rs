@@ -24,7 +24,7 @@ const NO_LIMIT: u64 = 1 << 60;
 /// Lack of memory that ended a process.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum MemoryShortage {
-    /// Shared memory was full. Other processes fill and empty it: a later incarnation may find room.
+    /// Shared memory was full. Other processes fill and empty it: a later start may find room.
     Shared(String),
     /// The kernel killed the process because memory ran out. A later incarnation needs as much.
     Own(String),
@@ -70,7 +70,7 @@ impl MemoryWatch {
         watch
     }
 
-    /// Returns the shortage that ended a process with `exit`; `None` if it ended for another reason.
+    /// Returns the shortage that ended a process with `exit`; `None` for another reason.
     pub(super) fn shortage(&self, exit: &Exit) -> Option<MemoryShortage> {
         match *exit {
             Exit::Signal(signal) if signal == Signal::KILL.as_raw() => self.kill_by_kernel(),
@@ -148,8 +148,8 @@ fn files_of(mount: &Path, groups: &str) -> (Vec<PathBuf>, Vec<PathBuf>) {
     (counters, limits)
 }
 
-/// Returns the shortage of a process that ended with `exit` because shared memory, with `free` bytes
-/// left, is full.
+/// Returns the shortage of a process that ended with `exit` because shared memory, with `free`
+/// bytes left, is full.
 fn shared_shortage(exit: &Exit, free: Option<u64>) -> Option<MemoryShortage> {
     let free = free.filter(|&free| free < FULL)?;
     (*exit == Exit::Signal(Signal::BUS.as_raw())).then(|| {
