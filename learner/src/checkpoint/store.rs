@@ -240,8 +240,8 @@ impl CheckpointStore {
     }
 
     /// Checks that nothing in `state`, of a run of `end` episodes, would differ in a longer run.
-    /// At the end, the last epoch may be short, the last snapshot is always a candidate, and no epoch
-    /// after the last was ordered ahead.
+    /// At its end, the last epoch may be short, the last snapshot is always a candidate, and no
+    /// epoch after the last was ordered ahead.
     fn check_before_end(&self, state: &CheckpointState, end: u64) -> Result<(), CheckpointError> {
         let learning = &self.config.learning;
         let epochs = end.div_ceil(learning.episodes_per_epoch);
