@@ -177,7 +177,7 @@ fn a_picture_replaces_no_device_and_no_other_result() {
     for option in ["--json", "--record"] {
         let same = refused(&["--plot", "one", option, "courses/../one"]);
         assert!(
-            same.contains(&format!("--plot and {option} name the same file, one")),
+            same.contains(&format!("{option} and --plot are the same file, ")),
             "{same}"
         );
     }

@@ -188,7 +188,8 @@ fn each_record_holds_the_observation_and_the_reward_of_its_step() {
         let report = StepReport {
             walls_passed: 0,
             level_up: LevelUp::No,
-            outcome: None,
+            // This episode ends at the first wall.
+            outcome: (pair[0].terminated == 1).then_some(simulator::EpisodeOutcome::Collided),
             hit: None,
         };
         let expected = RewardTerms::of(&RewardSettings::default(), &report, &pair[1].depth);
