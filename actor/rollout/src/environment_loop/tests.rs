@@ -189,7 +189,7 @@ fn each_record_holds_the_observation_and_the_reward_of_its_step() {
             walls_passed: 0,
             level_up: LevelUp::No,
             // This episode ends at the first wall.
-            outcome: (pair[0].terminated == 1).then_some(simulator::EpisodeOutcome::Collided),
+            outcome: (pair[0].terminated == 1).then_some(EpisodeOutcome::Collided),
             hit: None,
         };
         let expected = RewardTerms::of(&RewardSettings::default(), &report, &pair[1].depth);
